@@ -1,0 +1,107 @@
+"""What every part of a scene is: a name, the bodies it touches, and a pure residual or law of those bodies alone.
+
+Numbers are array fields (the parameters, addressed as `"name.field"`), everything else is static. Parts of one type are
+stacked and `vmap`ped, so a kernel here is written for a single part and for the poses of its own bodies, shape
+`(len(bodies), pose size)`.
+"""
+
+import abc
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._space import AbstractSpace
+from ._types import Scalar
+
+Poses = Float[Array, "k p"]
+Velocities = Float[Array, "k v"]
+Wrenches = Float[Array, "k v"]
+
+GROUND = "ground"
+
+
+def number(value: Any) -> Array:
+    """A strongly typed float array."""
+    array = np.asarray(value) if not isinstance(value, Array) else value
+    if not (np.issubdtype(array.dtype, np.number) or np.issubdtype(array.dtype, np.bool_)):
+        raise ValueError(f"expected a number or an array of numbers, got {value!r}")
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def optional_number(value: Any) -> Array | None:
+    """A strongly typed float array, or None where the value is to be worked out later."""
+    return None if value is None else number(value)
+
+
+class AbstractPart(eqx.Module):
+    """Anything with a name in a scene."""
+
+    name: eqx.AbstractVar[str]
+
+
+class AbstractLink(AbstractPart):
+    """A part that acts between bodies."""
+
+    bodies: eqx.AbstractVar[tuple[str, ...]]
+
+    def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
+        """The same part with every number filled in: world points and axes turned into body-fixed ones at the given poses."""
+        del space, poses
+        return self
+
+    def components(self) -> "tuple[AbstractLink, ...]":
+        """The elementary parts it is made of, under the same name; called after `resolve`."""
+        return (self,)
+
+
+class AbstractConstraint(AbstractLink):
+    """A constraint between positions, `residual = 0`.
+
+    `rows` is the static number of scalar equations; `rheonomic` says whether the residual depends on time.
+    """
+
+    rows: eqx.AbstractVar[int]
+    rheonomic: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
+        """Φ(poses, t) of this part."""
+
+
+class AbstractVelocityConstraint(AbstractLink):
+    """A constraint between velocities that is not the derivative of one between positions, `residual = 0`.
+
+    `linear` says whether the residual is linear in the velocities (perhaps with a constant term), `homogeneous` whether it
+    vanishes at rest.
+    """
+
+    rows: eqx.AbstractVar[int]
+    linear: eqx.AbstractVar[bool]
+    homogeneous: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def residual(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
+    ) -> Float[Array, "rows"]:
+        """ψ(poses, velocities, t) of this part."""
+
+
+class AbstractForce(AbstractLink):
+    """A force law.
+
+    `conservative` says whether `energy` holds a potential energy of this part; the rest of its power is dissipated or supplied.
+    """
+
+    conservative: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:
+        """The wrench on each of its bodies."""
+
+    def energy(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, ""]:
+        """Potential energy [J]; zero for a part without one."""
+        del space, t
+        return jnp.zeros((), poses.dtype)

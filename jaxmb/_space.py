@@ -1,0 +1,64 @@
+"""What the plane and space have in common: poses, velocities and wrenches of one body.
+
+A `pose` is what positions a body, a `velocity` what moves it, a `wrench` what does work on a velocity:
+
+| | pose | velocity | wrench |
+|---|---|---|---|
+| plane | x, y [m], angle [rad] | ẋ, ẏ [m/s], angular rate [rad/s] | force [N], moment [N m] |
+| space | r [m], Euler parameters | ṙ [m/s] world, ω′ [rad/s] body | force [N] world, moment [N m] body |
+"""
+
+import abc
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+Pose = Float[Array, "p"]
+Velocity = Float[Array, "v"]
+Wrench = Float[Array, "v"]
+Point = Float[Array, "d"]
+
+
+class AbstractSpace(eqx.Module):
+    """Kinematics of one rigid body in the plane or in space; without data."""
+
+    dimension: eqx.AbstractClassVar[int]
+    pose_size: eqx.AbstractClassVar[int]
+    velocity_size: eqx.AbstractClassVar[int]
+    ground: eqx.AbstractClassVar[tuple[float, ...]]
+
+    @abc.abstractmethod
+    def point(self, pose: Pose, s: Point) -> Point:
+        """World position [m] of the body-fixed point `s` [m]."""
+
+    @abc.abstractmethod
+    def point_velocity(self, pose: Pose, velocity: Velocity, s: Point) -> Point:
+        """World velocity [m/s] of the body-fixed point `s` [m]."""
+
+    @abc.abstractmethod
+    def point_force(self, pose: Pose, s: Point, force_W: Point) -> Wrench:
+        """Wrench of a force [N], in world axes, at the body-fixed point `s` [m]."""
+
+    @abc.abstractmethod
+    def direction(self, pose: Pose, v: Point) -> Point:
+        """World components of a body-fixed direction."""
+
+    @abc.abstractmethod
+    def body_point(self, pose: Pose, point_W: Point) -> Point:
+        """The body-fixed point [m] at a world position [m]."""
+
+    @abc.abstractmethod
+    def body_direction(self, pose: Pose, v_W: Point) -> Point:
+        """Body components of a world direction."""
+
+    @abc.abstractmethod
+    def rates(self, pose: Pose, velocity: Velocity) -> Pose:
+        """Rate of the pose, `N(pose) velocity`."""
+
+    @abc.abstractmethod
+    def pull_back(self, pose: Pose, gradient: Pose) -> Wrench:
+        """Wrench `Nᵀ g` that does the work of a gradient with respect to the pose."""
+
+    @abc.abstractmethod
+    def normalize(self, pose: Pose) -> Pose:
+        """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""

@@ -1,0 +1,218 @@
+"""Consistent initial states: the nearest configuration and velocities that satisfy every constraint.
+
+The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0` and to the coordinates fixed by name; then the
+velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0` and to the rates fixed by name. Derivatives are
+those of the minimisers, by the implicit function theorem.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ._types import Scalar, State
+from .elimination import full_pivot
+from .system import AbstractSystem, RigidBodySystem
+from .system.coordinates import coordinate_names, prescribe, rate_names
+
+_ITERATIONS = 100
+
+
+def assemble(
+    system: RigidBodySystem,
+    guess: State | None = None,
+    *,
+    fix: Mapping[str, ArrayLike] | None = None,
+    rates: Mapping[str, ArrayLike] | None = None,
+    t: Scalar = 0.0,
+    throw: bool = True,
+) -> State:
+    """Find a consistent state near a guess.
+
+    **Arguments:**
+
+    - `system`: a compiled scene.
+    - `guess`: where to start, default the poses and velocities given with the bodies.
+    - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}`.
+    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"` (body frame)
+        and `"body.velocity"`.
+    - `t`: the time, for driven mechanisms [s].
+    - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so that one member
+        of a batch does not spoil the others.
+
+    **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
+
+    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, or the coordinates that
+    cannot be fixed together. Under `jit` the same as a run-time error without the names.
+    """
+    guess = system.guess if guess is None else guess
+    t = jnp.asarray(t, guess.q.dtype)
+    q, fixed = prescribe("coordinate", coordinate_names(system), fix or {}, guess.q)
+    u, fixed_rates = prescribe("rate", rate_names(system), rates or {}, guess.u)
+    concrete = not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((system, q, u, t)))
+    if concrete:
+        _check_finite(q, "coordinates"), _check_finite(u, "rates")
+
+    q, ok = positions(system, t, q, fixed)
+    if concrete and throw and not bool(ok):
+        raise ValueError(_cannot_assemble(system, t, q, fixed, coordinate_names(system)))
+    u, ok_rates = velocities(system, t, q, u, fixed_rates)
+    if concrete and throw and not bool(ok_rates):
+        raise ValueError(_cannot_move(system, t, q, u, fixed_rates, rate_names(system)))
+    ok = ok & ok_rates
+    if throw and not concrete:
+        q = eqx.error_if(q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are open.")
+    state = State(q, u)
+    return state if throw else jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), state)
+
+
+def positions(
+    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], fixed: Bool[np.ndarray, "nq"]
+) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
+    """The configuration nearest to the guess; and whether every residual is at rounding level."""
+    if system.coordinate_rows == 0:
+        return guess, jnp.array(True)
+    scale = jnp.where(fixed, 0.0, system.coordinate_scale())
+    start = lax.stop_gradient(guess)
+    frozen = lax.stop_gradient(system)
+    q = nearest(frozen, lax.stop_gradient(t), start, scale)
+    q, ok = lax.stop_gradient(q), residual_size(frozen, t, q) <= tolerance(q.dtype)
+
+    # The minimiser, exactly: Newton on the optimality conditions with the independent rows.
+    rank = system.coordinate_rank
+    jacobian = frozen.coordinate_jacobian(t, q)
+    pivots = full_pivot(jacobian, scale=jnp.where(fixed, 0.0, system.coordinate_scale()))
+    ok = ok & (pivots.rank == rank)
+    rows = pivots.rows[:rank]
+    square = jnp.where(fixed, 1.0, scale) ** 2
+
+    def optimality(z, inputs):
+        system, t, guess = inputs
+        q, multipliers = z
+        residual, pull = jax.vjp(lambda q: system.coordinate_residual(t, q)[rows], q)
+        (gradient,) = pull(multipliers)
+        return (q - guess) / square + jnp.where(fixed, 0.0, gradient), residual
+
+    selected = (jacobian * scale[None, :])[rows]
+    multipliers = jnp.linalg.solve(selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square)))
+    solution = optx.root_find(
+        optimality,
+        optx.Newton(rtol=1e-10, atol=1e-10),
+        (q, multipliers),
+        (system, t, guess),
+        max_steps=16,
+        throw=False,
+    )
+    refined = solution.value[0]
+    ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined) <= tolerance(q.dtype))
+    return jnp.where(ok, refined, q), ok
+
+
+def velocities(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], fixed: Bool[np.ndarray, "nu"]
+) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
+    """The velocities nearest to the guess; and whether every residual is at rounding level."""
+    if system.velocity_rows == 0:
+        return guess, jnp.array(True)
+    scale = jnp.where(fixed, 0.0, system.velocity_scale())
+    u = guess
+    rank = system.velocity_rank
+    ok = jnp.array(True)
+    for _ in range(1 if system.linear else 8):
+        jacobian = system.jacobian(t, q, u)
+        pivots = full_pivot(jacobian, scale=scale)
+        ok = ok & (pivots.rank == rank)
+        rows = pivots.rows[:rank]
+        selected = jacobian[rows] * scale[None, :]
+        # A fixed rate that leaves too few free columns makes this singular; `ok` says so.
+        gram = selected @ selected.T + jnp.where(ok, 0.0, 1.0) * jnp.eye(rank, dtype=u.dtype)
+        u = u - scale * (selected.T @ jnp.linalg.solve(gram, system.velocity_residual(t, q, u)[rows]))
+    residual = system.velocity_residual(t, q, u)
+    size = 1.0 + jnp.max(jnp.abs(jacobian) @ jnp.abs(u))
+    return u, ok & (jnp.max(jnp.abs(residual)) <= 1e2 * tolerance(u.dtype) * size)
+
+
+def nearest(system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]) -> Float[Array, "nq"]:
+    """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
+
+    Implied rows are allowed: the normal equations are regularised at rounding level.
+    """
+
+    def size(q):
+        return jnp.sum(system.coordinate_residual(t, q) ** 2)
+
+    def body(carry):
+        q, _, k = carry
+        residual = system.coordinate_residual(t, q)
+        jacobian = system.coordinate_jacobian(t, q) * scale[None, :]
+        gram = jacobian @ jacobian.T
+        shift = 1e-13 * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
+        step = -scale * (jacobian.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), residual))
+        # Rotations by more than about a radian leave the region where the linearisation means anything.
+        longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
+        step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+        lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
+        sizes = jax.vmap(lambda a: size(q + a * step))(lengths)
+        q = q + lengths[jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))] * step
+        return q, jnp.max(jnp.abs(step)), k + 1
+
+    def proceed(carry):
+        q, step, k = carry
+        return (k < _ITERATIONS) & (step > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+
+    q, _, _ = lax.while_loop(proceed, body, (start, jnp.array(jnp.inf, start.dtype), 0))
+    return q
+
+
+def residual_size(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, ""]:
+    """Largest constraint residual, each row scaled to unit norm of its gradient times the system's size."""
+    jacobian = system.coordinate_jacobian(t, q) * system.coordinate_scale()[None, :]
+    norms = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1))
+    floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
+    return jnp.max(jnp.abs(system.coordinate_residual(t, q)) / jnp.maximum(norms, floor))
+
+
+def tolerance(dtype) -> float:
+    """What counts as zero for a scaled residual: 1e-10 in double precision."""
+    return float(jnp.finfo(dtype).eps) ** 0.64
+
+
+def _check_finite(vector, what):
+    if not np.all(np.isfinite(vector)):
+        raise ValueError(f"The guess or the fixed {what} are not finite: {np.asarray(vector)}.")
+
+
+def open_joints(system: RigidBodySystem, t: Scalar, q: Float[Array, "nq"]) -> str:
+    """The joints that a configuration leaves open, largest residual first, for messages."""
+    residual = np.abs(np.asarray(system.position_residual(t, q)))
+    worst: dict[str, float] = {}
+    for (name, _), value in zip(system.rows, residual, strict=False):
+        worst[name] = max(worst.get(name, 0.0), float(value))
+    listed = sorted(worst.items(), key=lambda item: -item[1])
+    return ", ".join(f"{name} ({value:.3g})" for name, value in listed[:8] if value > 1e-9)
+
+
+def _cannot_assemble(system, t, q, fixed, names):
+    text = "The mechanism cannot be assembled"
+    held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
+    if held:
+        text += f" with {', '.join(held)} fixed"
+    listed = open_joints(system, t, q)
+    if listed:
+        return f"{text}: residuals remain in {listed}. Check lengths and points, or give a better guess of the positions."
+    return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
+
+
+def _cannot_move(system, t, q, u, fixed, names):
+    held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
+    residual = np.abs(np.asarray(system.velocity_residual(t, q, u)))
+    rows = sorted({name for (name, _), r in zip(system.rows, residual, strict=True) if r > 1e-9 or not np.isfinite(r)})
+    return (
+        f"No velocities satisfy the constraints with the rates {', '.join(held) or '(none)'} fixed: "
+        f"{', '.join(rows) or 'the rates are not independent of each other'}. Fix fewer rates, or others."
+    )

@@ -1,0 +1,174 @@
+"""Gaussian elimination with full pivoting inside `lax`: which columns depend on which, and the influence matrix.
+
+A constraint Jacobian `A` (m × n) of rank r splits its columns in r dependent and n − r independent ones,
+`A_d δx_d + A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for
+which H stays of order one, and leaves m − r rows that are implied by the others.
+
+Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other state the
+same split is used without search (`factor`). Pivots are integers and carry no derivative; values do.
+
+Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension Reduction in Analysis of Constrained
+Dynamic Systems", J. Mech. Design 104(1), 1982.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+# Above this size LAPACK's blocked elimination is faster than our loop (measured on XLA's CPU backend).
+_LOOP_SIZE = 24
+
+
+class Pivots(eqx.Module):
+    """Result of `full_pivot`; integers and sizes, without derivatives.
+
+    **Fields:** `rank`; `rows`, a permutation of the m rows, pivot rows first and implied rows last; `columns`, a permutation of
+    the n columns, dependent first and independent last; `smallest` and `largest` pivot of the equilibrated matrix.
+    """
+
+    rank: Int[Array, ""]
+    rows: Int[Array, "m"]
+    columns: Int[Array, "n"]
+    smallest: Float[Array, ""]
+    largest: Float[Array, ""]
+
+
+class Factor(eqx.Module):
+    """The solved form of `A δx = −residual` in a given split; full-size matrices, so no index bookkeeping is left.
+
+    **Fields:** `correction` (n × m): `δx = −correction @ residual` makes `A δx = −residual` while the independent columns keep
+    their values; columns of implied rows are zero. `basis` (n × (n − r)): `δx = basis @ δx_i` spans the null space of A, with
+    the identity on the independent rows and the influence matrix H on the dependent ones. `rows` (r,): the rows kept.
+    """
+
+    correction: Float[Array, "n m"]
+    basis: Float[Array, "n f"]
+    rows: Int[Array, "r"]
+
+
+def full_pivot(
+    A: Float[Array, "m n"],
+    *,
+    scale: Float[Array, "n"] | None = None,
+    stage: Int[Array, "m"] | None = None,
+    tol: float | None = None,
+) -> Pivots:
+    """Eliminate with full pivoting.
+
+    **Arguments:**
+
+    - `A`: the matrix, m × n, any shape and rank.
+    - `scale`: size of a typical change of each column's coordinate (a length for translations, one for angles), shape (n,); the
+        matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
+    - `stage`: rows of stage 0 are eliminated before rows of stage 1, shape (m,). This nests the dependent columns of
+        nonholonomic rows in the independent columns of the holonomic ones.
+    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, the nearest of true ranks 1e-4.
+    """
+    m, n = A.shape
+    A = lax.stop_gradient(A)
+    eps = jnp.finfo(A.dtype).eps
+    tol = float(eps) ** 0.5 if tol is None else tol
+    work = A if scale is None else A * scale[None, :]
+    size = jnp.sqrt(jnp.sum(work * work, axis=1))
+    # A row of rounding errors must not be blown up to a row of unit norm.
+    work = work / jnp.maximum(jnp.maximum(size, eps**0.75 * jnp.max(size, initial=0.0)), jnp.finfo(A.dtype).tiny)[:, None]
+    stage = jnp.zeros(m, int) if stage is None else stage
+    unused = jnp.iinfo(jnp.int32).max
+
+    def step(k, carry):
+        work, row_order, column_order, smallest, largest, rank = carry
+        open_ = (row_order == unused)[:, None] & (column_order == unused)[None, :]
+        candidates = jnp.where(open_, jnp.abs(work), 0.0)
+        candidates = jnp.where(candidates > tol, candidates, 0.0)
+        first = jnp.where((stage == 0)[:, None], candidates, 0.0)
+        candidates = jnp.where(jnp.any(first > 0), first, candidates)
+        best = jnp.argmax(candidates)
+        r, c = best // n, best % n
+        pivot = candidates[r, c]
+        found = pivot > 0
+        ratio = jnp.where(row_order == unused, work[:, c] / jnp.where(found, work[r, c], 1.0), 0.0)
+        ratio = jnp.where(found, ratio.at[r].set(0.0), 0.0)
+        work = work - ratio[:, None] * work[r][None, :]
+        row_order = jnp.where(found, row_order.at[r].set(k), row_order)
+        column_order = jnp.where(found, column_order.at[c].set(k), column_order)
+        smallest = jnp.where(found, jnp.minimum(smallest, pivot), smallest)
+        largest = jnp.where(found, jnp.maximum(largest, pivot), largest)
+        return work, row_order, column_order, smallest, largest, rank + jnp.where(found, 1, 0)
+
+    start = (
+        work,
+        jnp.full(m, unused, jnp.int32),
+        jnp.full(n, unused, jnp.int32),
+        jnp.array(jnp.inf, A.dtype),
+        jnp.array(0.0, A.dtype),
+        jnp.array(0),
+    )
+    if m == 0:
+        rank, rows, columns, smallest, largest = start[5], jnp.arange(0), jnp.arange(n), start[3], start[4]
+    else:
+        _, row_order, column_order, smallest, largest, rank = lax.fori_loop(0, min(m, n), step, start)
+        rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
+    return Pivots(rank, rows, columns, smallest, largest)
+
+
+def factor(
+    A: Float[Array, "m n"], rows: Int[Array, "m"], columns: Int[Array, "n"], rank: int
+) -> Factor:
+    """Eliminate in the order a chart already has, without search; differentiable in `A`.
+
+    **Arguments:** `A`: the matrix; `rows`, `columns`: permutations from `Pivots`; `rank`: its rank, static.
+    """
+    m, n = A.shape
+    position = jnp.argsort(columns)
+    swept = gauss_jordan(A[rows[:rank]][:, columns], rank)
+    inverse, influence = swept[:, :rank], -swept[:, rank:]
+    basis = jnp.concatenate([influence, jnp.eye(n - rank, dtype=A.dtype)])[position]
+    # Independent columns and implied rows stand last in their permutations, where the padding is zero.
+    padded = jnp.pad(inverse, ((0, n - rank), (0, m - rank)))
+    return Factor(padded[position][:, jnp.argsort(rows)], basis, rows[:rank])
+
+
+@jax.custom_jvp
+def _sweep(B: Float[Array, "r n"]) -> Float[Array, "r n"]:
+    r, n = B.shape
+    if r > _LOOP_SIZE:
+        inverse = jnp.linalg.inv(B[:, :r])
+        return jnp.concatenate([inverse, inverse @ B[:, r:]], axis=1)
+    i = jnp.arange(r)[:, None]
+    j = jnp.arange(n)[None, :]
+
+    def step(k, B):
+        pivot = B[k, k]
+        row = jnp.where(j[0] == k, 1.0, B[k]) / pivot
+        return jnp.where(i == k, row[None, :], jnp.where(j == k, 0.0, B) - B[:, k][:, None] * row[None, :])
+
+    return lax.fori_loop(0, r, step, B)
+
+
+@_sweep.defjvp
+def _sweep_jvp(primals, tangents):
+    (B,), (dB,) = primals, tangents
+    r = B.shape[0]
+    swept = _sweep(B)
+    inverse, right = swept[:, :r], swept[:, r:]
+    return swept, jnp.concatenate([-inverse @ dB[:, :r] @ inverse, inverse @ (dB[:, r:] - dB[:, :r] @ right)], axis=1)
+
+
+def gauss_jordan(B: Float[Array, "r n"], r: int) -> Float[Array, "r n"]:
+    """`[B_d⁻¹, B_d⁻¹ B_i]` for `B = [B_d, B_i]` whose first r columns are eliminated on the diagonal, in place."""
+    if r == 0:
+        return B
+    assert B.shape[0] == r
+    return _sweep(B)
+
+
+def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """Solve with a symmetric positive definite matrix, whose diagonal pivots need no search."""
+    n = M.shape[0]
+    if n == 1:
+        return b / M[0, 0]
+    if n > _LOOP_SIZE:
+        return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(M), True), b)
+    return gauss_jordan(M, n) @ b

@@ -1,0 +1,20 @@
+"""Lagrange multipliers first: the equations of all accelerations with the constraint forces."""
+
+import jax.numpy as jnp
+
+from ..elimination import solve_positive
+from ._base import AbstractFormulation
+
+
+class Multipliers(AbstractFormulation):
+    """`(A M⁻¹ Aᵀ) λ = γ − A M⁻¹ F` on the independent rows, then `u̇ = M⁻¹ (F + Aᵀ λ)`.
+
+    Needs a mass matrix that is cheap to solve with; cheapest where constraints are few and degrees of freedom many.
+    """
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        A = jacobian[factor.rows]
+        free = inertia.solve(force)
+        kept = solve_positive(A @ inertia.solve(A.T), gamma[factor.rows] - A @ free)
+        multipliers = jnp.zeros(jacobian.shape[0], force.dtype).at[factor.rows].set(kept)
+        return free + inertia.solve(A.T @ kept), multipliers

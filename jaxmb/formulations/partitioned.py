@@ -1,0 +1,28 @@
+"""Elimination of the dependent accelerations: the reduced equations of coordinate partitioning."""
+
+from ..elimination import solve_positive
+from ._base import AbstractFormulation
+
+
+class Partitioned(AbstractFormulation):
+    """Reduced equations in the independent accelerations, `(EᵀME) u̇_i = Eᵀ(F − M c)`, `u̇ = E u̇_i + c`.
+
+    E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart. Cheapest where
+    the chart is there anyway and the degrees of freedom are few.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{wehage1982generalized,
+          author = {Wehage, R. A. and Haug, E. J.},
+          title = {Generalized Coordinate Partitioning for Dimension Reduction in Analysis of Constrained Dynamic Systems},
+          journal = {Journal of Mechanical Design}, volume = {104}, number = {1}, pages = {247--255}, year = {1982},
+        }
+        ```
+    """
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        particular = factor.correction @ gamma
+        reduced = factor.basis.T @ inertia.product(factor.basis)
+        independent = solve_positive(reduced, factor.basis.T @ (force - inertia.product(particular)))
+        udot = particular + factor.basis @ independent
+        return udot, factor.correction.T @ (inertia.product(udot) - force)

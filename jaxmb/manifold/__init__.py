@@ -1,0 +1,5 @@
+"""Policies that keep the state on its constraints."""
+
+from ._base import AbstractManifold as AbstractManifold
+from .free import Free as Free
+from .partition import Partition as Partition

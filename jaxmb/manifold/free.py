@@ -1,0 +1,33 @@
+"""No constraints at all: the plain equations of motion."""
+
+import diffrax
+import equinox as eqx
+
+from .._types import State
+from ..formulations import AbstractFormulation, accelerations
+from ..system import AbstractSystem
+from ._base import AbstractManifold
+
+
+class Free(AbstractManifold):
+    """Integrate all coordinates and leave the constraints to themselves.
+
+    The policy of systems without constraints. With constraints the state drifts off them by the error of integration; that is
+    for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
+    """
+
+    def prepare(self, system, formulation, solver, rtol):
+        return diffrax.ODETerm(VectorField(system, formulation)), solver
+
+
+class VectorField(eqx.Module):
+    """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
+
+    system: AbstractSystem
+    formulation: AbstractFormulation
+
+    def __call__(self, t, y, args):
+        del args
+        q = self.system.normalize(y.q)
+        udot, _ = accelerations(self.system, self.formulation, t, q, y.u)
+        return State(self.system.rates(t, q, y.u), udot)

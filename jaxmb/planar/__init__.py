@@ -1,0 +1,17 @@
+"""Parts of planar scenes."""
+
+from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from .bodies import Body as Body, PointMass as PointMass, box as box, disc as disc, rod as rod
+from .drivers import Driver as Driver
+from .forces import Bushing as Bushing, TorsionalSpringDamper as TorsionalSpringDamper, Torque as Torque
+from .joints import (
+    Distance as Distance,
+    Fixed as Fixed,
+    Gear as Gear,
+    PointOnCurve as PointOnCurve,
+    PointOnLine as PointOnLine,
+    Prismatic as Prismatic,
+    RackAndPinion as RackAndPinion,
+    Revolute as Revolute,
+)
+from .nonholonomic import KnifeEdge as KnifeEdge

@@ -1,0 +1,180 @@
+"""A scene: named bodies, joints and forces, checked and compiled into a system."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ._forces import Gravity
+from ._names import unknown
+from ._parts import GROUND, AbstractConstraint, AbstractForce, AbstractLink, AbstractVelocityConstraint
+from ._resolve import label, vector
+from ._structure import find_structure
+from ._types import State
+from .planar import Body as PlanarBody, PointMass as PlanarPointMass
+from .planar._space import PLANE
+from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
+from .spatial._space import SPACE
+from .system import RigidBodySystem
+from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
+from .system.layout import Layout
+from .system.rigid_bodies import Ranks
+
+_BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
+
+
+class Scene(eqx.Module):
+    """Bodies, joints and forces by name.
+
+    A scene is planar or spatial, never both; its bodies decide. Joints are constraints between positions or velocities, in any
+    order; closed loops and redundant joints are the normal case.
+
+    **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints, among them drivers
+    and rolling; `forces`: force elements and at most one `Gravity`. `"ground"` names the fixed world.
+
+    **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message names the part.
+    """
+
+    bodies: tuple[Any, ...] = eqx.field(converter=tuple)
+    joints: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
+    forces: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
+
+    def __check_init__(self):
+        _check_kinds(self)
+        _check_names(self)
+
+    def compile(self) -> RigidBodySystem:
+        """Check the scene, find its structure (ranks, implied rows), and stack its parts.
+
+        **Returns:** the system, a pytree whose leaves are the parameters.
+
+        **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given poses, and for
+        constraints that contradict each other; the message names the parts.
+        """
+        for body in self.bodies:
+            body.check()
+        space = SPACE if self.bodies[0].dimension == 3 else PLANE
+        layout = Layout(space, tuple(body.rotates for body in self.bodies))
+        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
+        guess = State(
+            jnp.concatenate([body.pose() for body in self.bodies]),
+            jnp.concatenate([body.velocities() for body in self.bodies]),
+        )
+        extended = jnp.concatenate([guess.q, jnp.asarray(space.ground, guess.q.dtype)])
+
+        gravity, parts = None, []
+        for part in (*self.joints, *self.forces):
+            if isinstance(part, Gravity):
+                gravity = part
+                vector(part, "acceleration", part.acceleration, space.dimension)
+                continue
+            own = tuple(index[name] for name in part.bodies)
+            _check_rotation(part, own, layout)
+            _check_finite(part)
+            resolved = part.resolve(space, extended[layout.pose_index[np.array(own)]])
+            parts += [(component, own) for component in resolved.components()]
+
+        kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
+        system = RigidBodySystem(
+            mass=jnp.stack([body.mass for body in self.bodies]),
+            rotary=jnp.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies]),
+            gravity=None if gravity is None else gravity.acceleration,
+            constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
+            velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
+            forces=tuple(map(ForceGroup, kind(AbstractForce))),
+            guess=guess,
+            length=_length([part for part, _ in parts], guess, layout),
+            layout=layout,
+            body_names=tuple(body.name for body in self.bodies),
+            gravity_name="" if gravity is None else gravity.name,
+            ranks=Ranks(0, 0, 0),
+            implied=(),
+        )
+        ranks, implied = find_structure(system)
+        return dataclasses.replace(system, ranks=ranks, implied=implied)
+
+
+def _no_inertia(space):
+    return jnp.zeros((3, 3)) if space.dimension == 3 else jnp.zeros(())
+
+
+def _check_kinds(scene: Scene):
+    if not scene.bodies:
+        raise ValueError("A scene needs at least one body.")
+    for body in scene.bodies:
+        if not isinstance(body, _BODIES):
+            raise ValueError(f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own.")
+    for part in scene.joints:
+        if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
+            raise ValueError(f"joints must hold constraints, got {part!r}.")
+    for part in scene.forces:
+        if not isinstance(part, AbstractForce | Gravity):
+            raise ValueError(f"forces must hold force elements or Gravity, got {part!r}.")
+    if sum(isinstance(part, Gravity) for part in scene.forces) > 1:
+        raise ValueError("A scene has one Gravity; add the accelerations.")
+    dimension = scene.bodies[0].dimension
+    for part in (*scene.bodies, *scene.joints, *scene.forces):
+        own = _dimension(part)
+        if own is not None and own != dimension:
+            here, there = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
+            raise ValueError(f"{label(part)} is {there}, but the scene is {here}; use the {here} part of that name.")
+
+
+def _dimension(part):
+    """2 or 3 for parts of one space, None for those of both."""
+    module = type(part).__module__
+    return 2 if ".planar" in module else 3 if ".spatial" in module else None
+
+
+def _check_names(scene: Scene):
+    seen = {GROUND}
+    for part in (*scene.bodies, *scene.joints, *scene.forces):
+        if part.name in seen:
+            raise ValueError(
+                f"The name {part.name!r} is used twice; every body, joint and force needs its own"
+                + (" ('ground' is the fixed world)." if part.name == GROUND else ".")
+            )
+        if not part.name or "." in part.name:
+            raise ValueError(f"{label(part)}: a name must not be empty or contain a dot.")
+        seen.add(part.name)
+    known = [body.name for body in scene.bodies] + [GROUND]
+    for part in (*scene.joints, *scene.forces):
+        if isinstance(part, Gravity):
+            continue
+        for name in part.bodies:
+            if name not in known:
+                raise ValueError(f"{label(part)}: {unknown('body', name, known)}")
+        if len(set(part.bodies)) < len(part.bodies) and len(set(part.bodies) - {GROUND}) < 2:
+            raise ValueError(f"{label(part)} connects {part.bodies[0]!r} with itself.")
+
+
+def _check_rotation(part, own, layout):
+    points = [k for k in own if k < layout.bodies and not layout.rotates[k]]
+    if points and isinstance(part, AbstractConstraint) and getattr(part, "rotational", False):
+        raise ValueError(f"{label(part)} acts on an angle, and a PointMass has none; use a Body.")
+
+
+def _check_finite(part):
+    for field in part.__dataclass_fields__:
+        value = getattr(part, field)
+        for item in value.values() if isinstance(value, dict) else [value]:
+            if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
+                raise ValueError(f"{label(part)}: {field} must be finite, got {np.asarray(item)}.")
+
+
+def _length(parts, guess, layout):
+    """The scene's size [m]: the largest arm of a joint or distance between neighbours."""
+    sizes = [
+        float(np.max(np.abs(getattr(part, field)), initial=0.0))
+        for part in parts
+        for field in ("point_a", "point_b", "point", "length", "radius")
+        if eqx.is_inexact_array(getattr(part, field, None))
+    ]
+    size = max(sizes, default=0.0)
+    if size == 0.0:
+        dimension = layout.space.dimension
+        position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[:-1]])
+        size = float(np.max(np.abs(position)))
+    return jnp.asarray(size if size > 0 else 1.0)

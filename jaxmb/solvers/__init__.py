@@ -1,0 +1,3 @@
+from ._base import AbstractManifoldTerm as AbstractManifoldTerm
+from .adams import Adams as Adams
+from .controller import MultistepController as MultistepController

@@ -1,0 +1,101 @@
+"""The memory of a multistep method: scaled divided differences of the derivative on a mesh of any spacing.
+
+With the mesh `t_n > t_{n-1} > ...` and `f_j = f(t_j, y_j)`, Newton's form of the polynomial through the last `i + 1`
+derivatives is
+
+    P(t) = sum_i differences[i] * basis_i(t),    basis_i(t) = prod_{j<i} (t - t_{n-j}) / (t_n - t_{n-j-1}),
+
+where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by. All
+entries have the units of `f`, so nothing over- or underflows however small the steps are, and moving on by one step needs
+only `basis_i` at the new mesh point: there are no loops over the order.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+HIGHEST_ORDER = 12
+LENGTH = HIGHEST_ORDER + 1
+
+# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, one more than the highest basis polynomial.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+# Selects, for basis polynomial i, the factors j < i.
+_FACTORS_OF = np.tril(np.ones((LENGTH, HIGHEST_ORDER), dtype=bool), -1)
+INDEX = np.arange(LENGTH, dtype=np.int32)
+_SUM_BEFORE = np.tril(np.ones((LENGTH + 1, LENGTH)), -1)
+
+
+class History(eqx.Module):
+    """Derivatives of all components of the state at the last mesh points.
+
+    **Fields:**
+
+    - `differences`: scaled divided differences, one row each, of the raveled derivative; rows from `points` on are zero.
+    - `mesh`: `t_n, t_{n-1}, ...`, latest first. Entries from `points` on are placeholders that keep the spans nonzero.
+    - `points`: how many mesh points have been visited since the start (or the last restart), at most `LENGTH`.
+    """
+
+    differences: Float[Array, "length n"]
+    mesh: Float[Array, " length"]
+    points: Int[Array, ""]
+
+
+class Extrapolation(eqx.Module):
+    """What Newton's polynomial gives for one step from `t_n` to `t`, for all orders at once.
+
+    **Fields:**
+
+    - `values`: `basis_i(t)`.
+    - `means`: the mean of `basis_i` over the step.
+    - `partial_sums`: row `i` is the polynomial through the last `i` derivatives, evaluated at `t`; `i <= LENGTH`.
+    """
+
+    values: Float[Array, " length"]
+    means: Float[Array, " length"]
+    partial_sums: Float[Array, "length+1 n"]
+
+
+def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
+    """A history of one point."""
+    mesh = t - spacing * INDEX.astype(jnp.result_type(t))
+    differences = jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
+    return History(differences, mesh, jnp.asarray(1, jnp.int32))
+
+
+def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Array, "length points"]:
+    """The Newton basis of a mesh at some times."""
+    factors = (t[None, :] - mesh[:-1, None]) / (mesh[0] - mesh[1:])[:, None]
+    # A product over a mask: XLA makes one kernel of it, where a cumulative product becomes a dozen.
+    return jnp.prod(jnp.where(_FACTORS_OF[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
+
+
+def basis_means(mesh: Float[Array, " length"], a: Any, b: Any) -> tuple[Float[Array, " length"], Float[Array, " length"]]:
+    """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
+    dtype = mesh.dtype
+    table = basis(mesh, a + (b - a) * jnp.asarray(np.append(_NODES, 1.0), dtype))
+    return jnp.sum(table * jnp.asarray(np.append(_WEIGHTS, 0.0)[None], dtype), axis=1), table[:, -1]
+
+
+def extrapolate(history: History, t: Any) -> Extrapolation:
+    """Newton's polynomials of every order at `t`, and the means of their basis over the step that ends there."""
+    dtype = history.differences.dtype
+    means, values = basis_means(history.mesh, history.mesh[0], t)
+    means, values = means.astype(dtype), values.astype(dtype)
+    partial_sums = (jnp.asarray(_SUM_BEFORE, dtype) * values[None]) @ history.differences
+    return Extrapolation(values, means, partial_sums)
+
+
+def advance(history: History, t: Any, f: Float[Array, " n"], partial_sums: Float[Array, "length+1 n"]) -> History:
+    """The history with one mesh point more."""
+    # Rows that would mix in the placeholders are kept at zero: they are never used, but would grow without bound.
+    known = INDEX <= history.points
+    zero = jnp.zeros((), f.dtype)
+    return History(
+        differences=jnp.where(known[:, None], f[None] - partial_sums[:-1], zero),
+        mesh=jnp.concatenate([t[None], history.mesh[:-1]]),
+        points=jnp.minimum(history.points + 1, LENGTH),
+    )

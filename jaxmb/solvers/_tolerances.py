@@ -1,0 +1,42 @@
+"""How a solver that chooses its own order learns the tolerances, and what it measures errors with."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+
+class MultistepNorm(eqx.Module):
+    """The norm of a `MultistepController`; its type tells the solver which controller it runs under."""
+
+    norm: Callable[[PyTree], Any]
+
+    def __call__(self, x: PyTree) -> Any:
+        return self.norm(x)
+
+
+class Tolerances(eqx.Module):
+    """Tolerances and norm, in the place and under the names where diffrax looks for those of a root finder.
+
+    Made by `diffrax.with_stepsize_controller_tols(Tolerances)()` they are filled in from the step size controller.
+    """
+
+    rtol: Any
+    atol: Any
+    norm: Callable[[PyTree], Any]
+
+    @property
+    def from_controller(self) -> bool:
+        """Whether a `MultistepController` has filled them in."""
+        return isinstance(self.norm, MultistepNorm)
+
+    def scale(self, y0: Array, y1: Array) -> Array:
+        """The error that is tolerated in each component, over a step from `y0` to `y1`."""
+        # A step into a region where the vector field is undefined is to be judged by where it came from.
+        y1 = jnp.where(jnp.isnan(y1), y0, y1)
+        with jax.numpy_dtype_promotion("standard"):
+            scale = self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+        return jax.lax.stop_gradient(scale.astype(y0.dtype))

@@ -1,0 +1,28 @@
+"""Parts of spatial scenes."""
+
+from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from .bodies import (
+    Body as Body,
+    PointMass as PointMass,
+    box as box,
+    cylinder as cylinder,
+    disc as disc,
+    rod as rod,
+    sphere as sphere,
+)
+from .drivers import Driver as Driver
+from .forces import Bushing as Bushing, TorsionalSpringDamper as TorsionalSpringDamper, Torque as Torque
+from .joints import (
+    Cylindrical as Cylindrical,
+    Distance as Distance,
+    Fixed as Fixed,
+    Planar as Planar,
+    PointOnLine as PointOnLine,
+    PointOnPlane as PointOnPlane,
+    Prismatic as Prismatic,
+    Revolute as Revolute,
+    Screw as Screw,
+    Spherical as Spherical,
+    Universal as Universal,
+)
+from .nonholonomic import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere

@@ -1,0 +1,90 @@
+"""Motions prescribed as functions of time."""
+
+from collections.abc import Callable
+from typing import ClassVar, Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._parts import AbstractConstraint, number, optional_number
+from .._resolve import label, vector
+from .._types import Scalar
+from .._user import numbers
+from ..rotations import norm
+from ._axes import angle, cosine_sine, resolve_axis, resolve_references, shift_in_a
+
+Quantity = Literal["angle", "x", "y", "z", "distance"]
+
+
+class Driver(AbstractConstraint):
+    """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
+
+    An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, so that any
+    number of turns passes without a branch. It should be that of a joint which lets B turn about the axis only;
+    otherwise it is the angle of the projections across the axis.
+
+    **Arguments:**
+
+    - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
+    - `quantity`: `"angle"` [rad], from `x_a` to `x_b` about `axis_a`; `"x"`, `"y"` or `"z"` [m], a coordinate of point
+        B less that of point A along the axes of `body_a`; `"distance"` [m], between the points.
+    - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
+    - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
+    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres.
+    - `axis_a`, unit, shape (3,), fixed in `body_a`, or `axis` in the world: for an angle only.
+    - `x_a`, `x_b`, unit, shape (3,), body-fixed and across the axis, between which an angle is measured; default such
+        that it is zero at the given poses.
+    """
+
+    name: str = eqx.field(static=True)
+    body_a: str = eqx.field(static=True)
+    body_b: str = eqx.field(static=True)
+    quantity: Quantity = eqx.field(static=True, kw_only=True)
+    motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
+    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
+    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    rows: ClassVar[int] = 1
+    rheonomic: ClassVar[bool] = True
+
+    def __check_init__(self):
+        if self.quantity not in get_args(Quantity):
+            raise ValueError(f"{label(self)}: quantity must be one of {get_args(Quantity)}, got {self.quantity!r}.")
+        if self.quantity != "angle":
+            for field in ("axis_a", "axis", "x_a", "x_b"):
+                if getattr(self, field) is not None:
+                    raise ValueError(f"{label(self)}: {field} belongs to quantity='angle', not to {self.quantity!r}.")
+
+    @property
+    def bodies(self):
+        return (self.body_a, self.body_b)
+
+    def resolve(self, space, poses):
+        vector(self, "point_a", self.point_a, 3)
+        vector(self, "point_b", self.point_b, 3)
+        if self.quantity != "angle":
+            return self
+        return resolve_references(resolve_axis(self, space, poses), space, poses)
+
+    def value(self, space, poses):
+        """The driven quantity at given poses; an angle in (−π, π]."""
+        if self.quantity == "angle":
+            return angle(space, self, poses)
+        shift = shift_in_a(space, self, poses)
+        if self.quantity == "distance":
+            return norm(shift)
+        return shift["xyz".index(self.quantity)]
+
+    def residual(self, space, poses, t):
+        motion = self.motion(t, self.parameters)
+        if self.quantity == "angle":
+            c, s = cosine_sine(space, self, poses)
+            row = s * jnp.cos(motion) - c * jnp.sin(motion)
+        else:
+            row = self.value(space, poses) - motion
+        return jnp.reshape(row, (1,))

@@ -1,0 +1,11 @@
+"""The equation of constrained motion, and the compiled rigid-body system."""
+
+from ._base import AbstractSystem as AbstractSystem
+from .inertia import (
+    AbstractInertia as AbstractInertia,
+    BlockInertia as BlockInertia,
+    DenseInertia as DenseInertia,
+    DiagonalInertia as DiagonalInertia,
+)
+from .parameters import parameters as parameters, with_parameters as with_parameters
+from .rigid_bodies import RigidBodySystem as RigidBodySystem

@@ -1,0 +1,61 @@
+"""Coordinates and rates by name: which entries of q and u a name such as `"crank.angle"` stands for."""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from .._names import unknown
+from .rigid_bodies import RigidBodySystem
+
+
+def coordinate_names(system: RigidBodySystem) -> dict[str, list[int]]:
+    """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`, `position`, `orientation` of spatial ones."""
+    if system.spatial:
+        fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
+        return _names(system, system.layout.pose_index, fields, {"position": slice(0, 3), "orientation": slice(3, 7)})
+    return _names(system, system.layout.pose_index, ["x", "y", "angle"], {"position": slice(0, 2)})
+
+
+def rate_names(system: RigidBodySystem) -> dict[str, list[int]]:
+    """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`, `angular_velocity` in space."""
+    if system.spatial:
+        fields = ["x", "y", "z", "wx", "wy", "wz"]
+        groups = {"velocity": slice(0, 3), "angular_velocity": slice(3, 6)}
+        return _names(system, system.layout.velocity_index, fields, groups)
+    return _names(system, system.layout.velocity_index, ["x", "y", "angle"], {"velocity": slice(0, 2)})
+
+
+def _names(system, index, fields, groups):
+    names = {}
+    for body, row, rotates in zip(system.body_names, index[:-1], system.layout.rotates, strict=True):
+        own = len(fields) if rotates else system.layout.space.dimension
+        for k in range(own):
+            names[f"{body}.{fields[k]}"] = [int(row[k])]
+        for group, where in groups.items():
+            if where.stop <= own:
+                names[f"{body}.{group}"] = [int(k) for k in row[where]]
+    return names
+
+
+def prescribe(
+    what: str, names: Mapping[str, list[int]], values: Mapping[str, ArrayLike], vector: Float[Array, "n"]
+) -> tuple[Float[Array, "n"], Bool[np.ndarray, "n"]]:
+    """Write values by name into a vector.
+
+    **Returns:** the vector, and a static mask of the entries that were prescribed.
+
+    **Raises:** `ValueError` for unknown names and wrong shapes.
+    """
+    fixed = np.zeros(vector.shape[0], bool)
+    for name, value in values.items():
+        if name not in names:
+            raise unknown(what, name, names)
+        index = names[name]
+        value = jnp.asarray(value, vector.dtype)
+        if value.shape not in ((), (len(index),)) or (value.shape == () and len(index) > 1):
+            raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {value.shape}.")
+        vector = vector.at[np.array(index)].set(value)
+        fixed[index] = True
+    return vector, fixed

@@ -1,0 +1,181 @@
+"""Parts of one type, stacked: one kernel and one `vmap` for all of them, whatever their number."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._parts import AbstractLink
+from .._types import Scalar
+from .layout import Layout
+
+
+class Group(eqx.Module):
+    """Stacked parts. `part` has the structure of one part with a leading axis on every number."""
+
+    part: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
+
+    @property
+    def body_index(self) -> np.ndarray:
+        """Bodies of each part, shape (parts, k)."""
+        return np.array(self.bodies)
+
+    @property
+    def rows(self) -> int:
+        return self.part.rows
+
+    def poses(self, extended_q: Float[Array, "nq_ground"]) -> Float[Array, "parts k p"]:
+        """Poses of the parts' bodies, from the coordinates followed by the ground's pose."""
+        return extended_q[self.layout.pose_index[self.body_index]]
+
+    def velocities(self, extended_u: Float[Array, "nu_zero"]) -> Float[Array, "parts k v"]:
+        """Velocities of the parts' bodies, from the velocities followed by a zero."""
+        return extended_u[self.layout.velocity_index[self.body_index]]
+
+    def rates(self, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]) -> Float[Array, "k p"]:
+        return jax.vmap(self.layout.space.rates)(poses, velocities)
+
+
+def stack(parts: Sequence[tuple[AbstractLink, tuple[int, ...]]], layout: Layout) -> tuple[Group, ...]:
+    """Group parts that share type, static fields and shapes; order of first appearance."""
+    groups: dict[Any, list] = {}
+    for part, bodies in parts:
+        leaves, structure = jtu.tree_flatten(_anonymous(part))
+        key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
+        groups.setdefault(key, []).append((leaves, part.name, bodies))
+    out = []
+    for (structure, _, _), members in groups.items():
+        leaves = [jnp.stack(column) for column in zip(*(member[0] for member in members), strict=True)]
+        names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
+        out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout))
+    return tuple(out)
+
+
+def _anonymous(part: AbstractLink) -> AbstractLink:
+    """The part without the names that tell it from its siblings."""
+    out = object.__new__(type(part))
+    for field in part.__dataclass_fields__:
+        value = getattr(part, field)
+        if field == "name" or field in ("body", "body_a", "body_b", "reaction", "carrier"):
+            value = ""
+        elif field == "bodies":
+            value = ("",) * len(value)
+        object.__setattr__(out, field, value)
+    return out
+
+
+class ConstraintGroup(eqx.Module):
+    """Kernels of stacked constraints between positions."""
+
+    group: Group
+
+    @property
+    def rows(self) -> int:
+        return self.group.rows
+
+    def residual(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows"]:
+        return self._map(lambda part, poses: part.residual(self._space, poses, t), extended_q)
+
+    def coordinate_jacobian(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows k p"]:
+        return self._map(lambda part, poses: jax.jacfwd(lambda x: part.residual(self._space, x, t))(poses), extended_q)
+
+    def jacobian(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows k v"]:
+        """Derivative along unit velocities: `Φ_q N`, body by body."""
+
+        def single(part, poses):
+            shape = (poses.shape[0], self._space.velocity_size)
+            along = lambda v: jax.jvp(
+                lambda x: part.residual(self._space, x, t), (poses,), (self.group.rates(poses, v),)
+            )[1]
+            return jax.jacfwd(along)(jnp.zeros(shape, poses.dtype))
+
+        return self._map(single, extended_q)
+
+    def velocity(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts rows"]:
+        """`dΦ/dt`."""
+        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), extended_q, extended_u)
+
+    def acceleration(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"], extended_a: Float[Array, " _"]
+    ) -> Float[Array, "parts rows"]:
+        """`d²Φ/dt²`."""
+
+        def single(part, poses, v, a):
+            rate = lambda t, poses, v: self._rate(part, t, poses, v)
+            return jax.jvp(rate, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
+
+        return self._map(single, extended_q, extended_u, extended_a)
+
+    @property
+    def _space(self):
+        return self.group.layout.space
+
+    def _rate(self, part, t, poses, v):
+        rates = self.group.rates(poses, v)
+        if part.rheonomic:
+            return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
+        return jax.jvp(lambda x: part.residual(self._space, x, t), (poses,), (rates,))[1]
+
+    def _map(self, single, extended_q, *extended_velocities):
+        velocities = [self.group.velocities(v) for v in extended_velocities]
+        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), *velocities)
+
+
+class VelocityConstraintGroup(eqx.Module):
+    """Kernels of stacked constraints between velocities."""
+
+    group: Group
+
+    @property
+    def rows(self) -> int:
+        return self.group.rows
+
+    def velocity(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts rows"]:
+        return self._map(lambda part, poses, v: part.residual(self._space, poses, v, t), extended_q, extended_u)
+
+    def jacobian(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+    ) -> Float[Array, "parts rows k v"]:
+        single = lambda part, poses, v: jax.jacfwd(lambda w: part.residual(self._space, poses, w, t))(v)
+        return self._map(single, extended_q, extended_u)
+
+    def acceleration(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"], extended_a: Float[Array, " _"]
+    ) -> Float[Array, "parts rows"]:
+        def single(part, poses, v, a):
+            residual = lambda t, poses, v: part.residual(self._space, poses, v, t)
+            return jax.jvp(residual, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
+
+        return self._map(single, extended_q, extended_u, extended_a)
+
+    @property
+    def _space(self):
+        return self.group.layout.space
+
+    def _map(self, single, extended_q, *extended_velocities):
+        velocities = [self.group.velocities(v) for v in extended_velocities]
+        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), *velocities)
+
+
+class ForceGroup(eqx.Module):
+    """Kernels of stacked forces."""
+
+    group: Group
+
+    def wrenches(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts k v"]:
+        single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
+        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), self.group.velocities(extended_u))
+
+    def energy(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, ""]:
+        if not self.group.part.conservative:
+            return jnp.zeros((), extended_q.dtype)
+        single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
+        return jnp.sum(jax.vmap(single)(self.group.part, self.group.poses(extended_q)))

@@ -1,0 +1,89 @@
+"""Where the numbers of each body stand in the vectors of coordinates and velocities; static index arithmetic."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from .._space import AbstractSpace
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Bodies in order, each with its pose and velocity contiguous; the ground is the body after the last.
+
+    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant.
+    """
+
+    space: AbstractSpace
+    rotates: tuple[bool, ...]
+
+    @property
+    def bodies(self) -> int:
+        return len(self.rotates)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether every body rotates, so that poses are a plain reshape of the coordinates."""
+        return all(self.rotates)
+
+    @functools.cached_property
+    def pose_index(self) -> np.ndarray:
+        """Index of every pose entry, shape (bodies + 1, pose size), into the coordinates followed by the ground's pose."""
+        return self._index(self.space.pose_size, [*range(self.nq, self.nq + self.space.pose_size)])
+
+    @functools.cached_property
+    def velocity_index(self) -> np.ndarray:
+        """Index of every velocity entry, shape (bodies + 1, velocity size), into the velocities followed by a zero."""
+        return self._index(self.space.velocity_size, [self.nu] * self.space.velocity_size)
+
+    @property
+    def nq(self) -> int:
+        return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)
+
+    @property
+    def nu(self) -> int:
+        return sum(self.space.velocity_size if r else self.space.dimension for r in self.rotates)
+
+    def _index(self, size: int, constant: list[int]) -> np.ndarray:
+        index, start = [], 0
+        for rotates in self.rotates:
+            own = size if rotates else self.space.dimension
+            index.append([*range(start, start + own), *constant[own:]])
+            start += own
+        return np.array([*index, constant])
+
+    def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
+        """Where each entry of an assembled Jacobian comes from.
+
+        **Arguments:** `groups`: for each group of parts its bodies (parts, k) and its rows; `of_poses`: columns are coordinates
+        rather than velocities.
+
+        **Returns:** shape (all rows, columns), indices into the groups' blocks (parts, rows, k, size), raveled one after the
+        other and followed by a zero.
+        """
+        index = self.pose_index if of_poses else self.velocity_index
+        columns = self.nq if of_poses else self.nu
+        total = sum(bodies.shape[0] * rows * bodies.shape[1] * index.shape[1] for bodies, rows in groups)
+        source = np.full((sum(b.shape[0] * rows for b, rows in groups), columns + index.shape[1] + 1), total)
+        row = start = 0
+        for bodies, rows in groups:
+            parts, k = bodies.shape
+            block = start + np.arange(parts * rows * k * index.shape[1]).reshape(parts, rows, k, index.shape[1])
+            start += block.size
+            target = np.arange(row, row + parts * rows).reshape(parts, rows, 1, 1)
+            source[target, index[bodies][:, None]] = block
+            row += parts * rows
+        return source[:, :columns]
+
+    def force_source(self, groups: list[np.ndarray]) -> np.ndarray:
+        """Which wrench entries add up to each generalized force: shape (nu, largest count), padded with the index of a zero.
+
+        Indices are into the groups' wrenches (parts, k, velocity size), raveled one after the other and followed by a zero.
+        """
+        flat = np.concatenate([self.velocity_index[bodies].ravel() for bodies in groups])
+        contributions = [np.flatnonzero(flat == column) for column in range(self.nu)]
+        width = max((len(c) for c in contributions), default=0)
+        return np.array([np.pad(c, (0, width - len(c)), constant_values=len(flat)) for c in contributions]).reshape(
+            self.nu, width
+        )

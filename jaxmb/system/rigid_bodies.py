@@ -1,0 +1,320 @@
+"""Rigid bodies joined by constraints and forces: the compiled form of a scene."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._types import State
+from ..rotations import cross, rotate
+from ._base import AbstractSystem
+from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
+from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
+from .layout import Layout
+
+
+class Ranks(eqx.Module):
+    """Numbers of independent rows; static."""
+
+    position: int = eqx.field(static=True)
+    coordinate: int = eqx.field(static=True)
+    velocity: int = eqx.field(static=True)
+
+
+class Implied(NamedTuple):
+    """A row that other joints imply: `row` of part `name` follows from the joints `by`."""
+
+    name: str
+    row: int
+    by: tuple[str, ...]
+
+
+class RigidBodySystem(AbstractSystem):
+    """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
+
+    **Fields:** `mass` [kg], shape (bodies,); `rotary` [kg m²], shape (bodies,) in the plane and (bodies, 3, 3) in space; `gravity`
+    [m/s²] or None; the groups of parts; `guess`, the state given with the bodies; `length` [m], the scene's size;
+    `body_names`.
+    """
+
+    mass: Float[Array, "b"]
+    rotary: Float[Array, "b *matrix"]
+    gravity: Float[Array, "d"] | None
+    constraints: tuple[ConstraintGroup, ...]
+    velocity_constraints: tuple[VelocityConstraintGroup, ...]
+    forces: tuple[ForceGroup, ...]
+    guess: State
+    length: Float[Array, ""]
+    layout: Layout = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)
+    gravity_name: str = eqx.field(static=True)
+    ranks: Ranks
+    implied: tuple[Implied, ...] = eqx.field(static=True)
+
+    # Sizes
+
+    @property
+    def nq(self) -> int:
+        return self.layout.nq
+
+    @property
+    def nu(self) -> int:
+        return self.layout.nu
+
+    @property
+    def spatial(self) -> bool:
+        return self.layout.space.dimension == 3
+
+    @property
+    def position_rows(self) -> int:
+        return sum(len(g.group.names) * g.rows for g in self.constraints)
+
+    @property
+    def coordinate_rows(self) -> int:
+        return self.position_rows + (sum(self.layout.rotates) if self.spatial else 0)
+
+    @property
+    def velocity_rows(self) -> int:
+        return self.position_rows + sum(len(g.group.names) * g.rows for g in self.velocity_constraints)
+
+    @property
+    def position_rank(self) -> int:
+        return self.ranks.position
+
+    @property
+    def coordinate_rank(self) -> int:
+        return self.ranks.coordinate
+
+    @property
+    def velocity_rank(self) -> int:
+        return self.ranks.velocity
+
+    @property
+    def rates_are_velocities(self) -> bool:
+        return not self.spatial
+
+    @property
+    def linear(self) -> bool:
+        return all(g.group.part.linear for g in self.velocity_constraints)
+
+    @property
+    def homogeneous(self) -> bool:
+        return not any(g.group.part.rheonomic for g in self.constraints) and all(
+            g.group.part.homogeneous for g in self.velocity_constraints
+        )
+
+    @property
+    def rows(self) -> tuple[tuple[str, int], ...]:
+        """Name and number within its part of every row of ψ."""
+        return tuple(
+            (name, k)
+            for g in (*self.constraints, *self.velocity_constraints)
+            for name in g.group.names
+            for k in range(g.rows)
+        )
+
+    # Kinematics
+
+    def extend_q(self, q: Float[Array, "nq"]) -> Float[Array, "nq_ground"]:
+        return jnp.concatenate([q, jnp.asarray(self.layout.space.ground, q.dtype)])
+
+    def extend_u(self, u: Float[Array, "nu"]) -> Float[Array, "nu_zero"]:
+        return jnp.concatenate([u, jnp.zeros(1, u.dtype)])
+
+    def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
+        """Poses of the bodies."""
+        if self.layout.uniform:
+            return q.reshape(self.layout.bodies, -1)
+        return self.extend_q(q)[self.layout.pose_index[:-1]]
+
+    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+        """Velocities of the bodies."""
+        if self.layout.uniform:
+            return u.reshape(self.layout.bodies, -1)
+        return self.extend_u(u)[self.layout.velocity_index[:-1]]
+
+    def rates(self, t, q, u):
+        if self.rates_are_velocities:
+            return u
+        rates = jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u))
+        return self._pack(rates)
+
+    def normalize(self, q):
+        if self.rates_are_velocities:
+            return q
+        return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
+
+    def _pack(self, poses):
+        if self.layout.uniform:
+            return poses.reshape(-1)
+        sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
+        return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
+
+    # Constraints
+
+    def position_residual(self, t, q):
+        extended = self.extend_q(q)
+        return _join([g.residual(t, extended) for g in self.constraints], q.dtype)
+
+    def coordinate_residual(self, t, q):
+        residual = self.position_residual(t, q)
+        if not self.spatial:
+            return residual
+        p = self.poses(q)[_rotating(self.layout), 3:]
+        return jnp.concatenate([residual, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
+
+    def coordinate_jacobian(self, t, q):
+        extended = self.extend_q(q)
+        blocks = [g.coordinate_jacobian(t, extended) for g in self.constraints]
+        jacobian = self._assemble(blocks, self.constraints, q.dtype, of_poses=True)
+        if not self.spatial:
+            return jacobian
+        rotating = _rotating(self.layout)
+        index = self.layout.pose_index[rotating, 3:]
+        rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
+        return jnp.concatenate([jacobian, rows])
+
+    def velocity_residual(self, t, q, u):
+        extended, extended_u = self.extend_q(q), self.extend_u(u)
+        groups = (*self.constraints, *self.velocity_constraints)
+        return _join([g.velocity(t, extended, extended_u) for g in groups], q.dtype)
+
+    def jacobian(self, t, q, u):
+        extended = self.extend_q(q)
+        blocks = [g.jacobian(t, extended) for g in self.constraints]
+        if self.velocity_constraints:
+            extended_u = self.extend_u(u)
+            blocks += [g.jacobian(t, extended, extended_u) for g in self.velocity_constraints]
+        return self._assemble(blocks, (*self.constraints, *self.velocity_constraints), q.dtype, of_poses=False)
+
+    def acceleration_residual(self, t, q, u, udot):
+        t = jnp.asarray(t, q.dtype)
+        extended, extended_u, extended_a = self.extend_q(q), self.extend_u(u), self.extend_u(udot)
+        groups = (*self.constraints, *self.velocity_constraints)
+        return _join([g.acceleration(t, extended, extended_u, extended_a) for g in groups], q.dtype)
+
+    def _assemble(self, blocks, groups, dtype, *, of_poses):
+        source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
+        return _join([*blocks, jnp.zeros(1, dtype)], dtype)[source]
+
+    # Dynamics
+
+    def inertia(self, t, q) -> AbstractInertia:
+        if self.spatial and self.layout.uniform:
+            return BlockInertia(self.mass, self.rotary)
+        if self.spatial:
+            return _MixedInertia(self.mass, self.rotary, self.layout)
+        bodies = jnp.concatenate([jnp.repeat(self.mass[:, None], 2, axis=1), self.rotary[:, None]], axis=1)
+        if self.layout.uniform:
+            return DiagonalInertia(bodies.reshape(-1))
+        order = self.layout.velocity_index[:-1].ravel()
+        return DiagonalInertia(bodies.reshape(-1)[[list(order).index(k) for k in range(self.nu)]])
+
+    def force(self, t, q, u):
+        extended, extended_u = self.extend_q(q), self.extend_u(u)
+        wrenches = [g.wrenches(t, extended, extended_u).reshape(-1) for g in self.forces]
+        groups = [g.group.body_index for g in self.forces]
+        own = self._own_wrenches(u)
+        if own is not None:
+            wrenches.append(own.reshape(-1))
+            groups.append(_all_bodies(self.layout))
+        if not wrenches:
+            return jnp.zeros_like(u)
+        source = self.layout.force_source(groups)
+        return jnp.sum(_join([*wrenches, jnp.zeros(1, u.dtype)], u.dtype)[source], axis=1)
+
+    def _own_wrenches(self, u):
+        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size), or None where there is neither."""
+        size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
+        parts = []
+        if self.gravity is not None:
+            parts.append(jnp.pad(self.mass[:, None] * self.gravity[None, :], ((0, 0), (0, size - dimension))))
+        if self.spatial and any(self.layout.rotates):
+            omega = self.velocities(u)[:, 3:]
+            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.rotary, omega)
+            parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
+        return sum(parts[1:], start=parts[0]) if parts else None
+
+    # Energy and momentum
+
+    def kinetic_energy(self, t, q, u):
+        return 0.5 * jnp.dot(u, self.inertia(t, q).product(u))
+
+    def potential_energy(self, t, q):
+        extended = self.extend_q(q)
+        energy = sum((g.energy(t, extended) for g in self.forces), start=jnp.zeros((), q.dtype))
+        if self.gravity is not None:
+            position = self.poses(q)[:, : self.layout.space.dimension]
+            energy = energy - jnp.sum(self.mass * (position @ self.gravity))
+        return energy
+
+    def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
+        """`Σ m v` [kg m/s], world axes."""
+        del q
+        return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
+
+    def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in space."""
+        poses, velocities = self.poses(q), self.velocities(u)
+        if not self.spatial:
+            x, v = poses[:, :2], velocities[:, :2]
+            orbital = self.mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])
+            return jnp.sum(orbital + self.rotary * velocities[:, 2])
+        spin = jax.vmap(lambda p, J, w: rotate(p, J @ w))(poses[:, 3:], self.rotary, velocities[:, 3:])
+        orbital = jax.vmap(cross)(poses[:, :3], self.mass[:, None] * velocities[:, :3])
+        return jnp.sum(spin + orbital, axis=0)
+
+    # Scales
+
+    def coordinate_scale(self):
+        return self._scale(self.layout.pose_index, self.nq)
+
+    def velocity_scale(self):
+        return self._scale(self.layout.velocity_index, self.nu)
+
+    def _scale(self, index, size):
+        length = lax.stop_gradient(self.length)
+        translation = [False] * size
+        for body in index[:-1]:
+            for k in body[: self.layout.space.dimension]:
+                translation[k] = True
+        return jnp.where(jnp.array(translation), length, 1.0)
+
+
+class _MixedInertia(AbstractInertia):
+    """Spatial bodies and point masses together."""
+
+    mass: Float[Array, "b"]
+    rotary: Float[Array, "b 3 3"]
+    layout: Layout = eqx.field(static=True)
+
+    def product(self, v):
+        return self._through(BlockInertia(self.mass, self.rotary).product, v)
+
+    def solve(self, f):
+        points = jnp.array([not r for r in self.layout.rotates])[:, None, None]
+        rotary = jnp.where(points, jnp.eye(3, dtype=self.rotary.dtype), self.rotary)
+        return self._through(BlockInertia(self.mass, rotary).solve, f)
+
+    def _through(self, apply, v):
+        index = self.layout.velocity_index[:-1].ravel()
+        columns = v.reshape(v.shape[0], -1)
+        full = jnp.pad(columns, ((0, 1), (0, 0)))[index]
+        own = [list(index).index(k) for k in range(self.layout.nu)]
+        return apply(full)[jnp.array(own)].reshape(v.shape)
+
+
+def _join(blocks, dtype):
+    return jnp.concatenate([b.reshape(-1) for b in blocks]) if blocks else jnp.zeros(0, dtype)
+
+
+def _rotating(layout: Layout):
+    return [k for k, rotates in enumerate(layout.rotates) if rotates]
+
+
+def _all_bodies(layout: Layout):
+    return np.arange(layout.bodies)[:, None]
