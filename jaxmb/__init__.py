@@ -7,3 +7,6 @@ from ._user import Constraint as Constraint, Force as Force, VelocityConstraint 
 from .assembly import assemble as assemble
 from .scene import Scene as Scene
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
+from ._results import RESULTS as RESULTS
+from .simulate import simulate as simulate
+from .trajectory import Trajectory as Trajectory, load as load

@@ -1,3 +1,6 @@
+"""Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds."""
+
 from ._base import AbstractManifoldTerm as AbstractManifoldTerm
 from .adams import Adams as Adams
+from .adams import AdamsState as AdamsState
 from .controller import MultistepController as MultistepController

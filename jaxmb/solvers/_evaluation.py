@@ -1,7 +1,7 @@
 """Evaluations of a term, alike for a plain vector field and for one on a manifold.
 
-diffrax hands a solver its terms wrapped, so that time always increases; what is returned here is the derivative with
-respect to that time.
+diffrax hands its terms to a solver wrapped, so that time always increases. What is returned here is the derivative with
+respect to that time. States are raveled: one vector of all components.
 """
 
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
-from diffrax._term import AdjointTerm, WrapTerm  # diffrax's own wrappers, which it does not export
+from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around terms, but does not export them
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
@@ -17,7 +17,7 @@ from ._base import AbstractManifoldTerm, Args, Chart
 
 
 class Evaluation(NamedTuple):
-    """`y` restored to the manifold, `f` there, the chart, and whether this failed; `y` and `f` are raveled."""
+    """The state restored to the manifold, the derivative there, the chart, and whether restoring it failed."""
 
     y: Array
     f: Array
@@ -25,31 +25,29 @@ class Evaluation(NamedTuple):
     failed: Any
 
 
-def check_term(term: Any) -> None:
-    """Raise a `ValueError` unless `term` is an ordinary differential equation."""
+def check_problem(term: Any, y: PyTree[Array]) -> None:
+    """Raise a `ValueError` unless this is a real ordinary differential equation."""
     while isinstance(term, (WrapTerm, AdjointTerm)):
         term = term.term
     if not isinstance(term, (diffrax.ODETerm, AbstractManifoldTerm)):
         raise ValueError(
-            f"Multistep solvers integrate one `diffrax.ODETerm` or one `AbstractManifoldTerm`, but got a "
-            f"`{type(term).__name__}`. Add several vector fields up in a single `ODETerm`; turn a `ControlTerm` with a "
-            f"differentiable control into one with `.to_ode()`."
+            f"Multistep methods integrate a single `diffrax.ODETerm` or `AbstractManifoldTerm`, but got a "
+            f"`{type(term).__name__}`. Several vector fields can be added up in one `ODETerm`; a `ControlTerm` with a "
+            f"differentiable control becomes one by `.to_ode()`."
         )
-
-
-def _manifold(term: Any) -> AbstractManifoldTerm | None:
-    return term.term if isinstance(term.term, AbstractManifoldTerm) else None
+    if any(jnp.iscomplexobj(leaf) for leaf in jax.tree.leaves(y)):
+        raise ValueError("Multistep methods take real states: split complex ones into real and imaginary parts.")
 
 
 def ravel(y: PyTree[Array], dtype: Any = None) -> Array:
-    """All components of a pytree in one vector, of `dtype` if that is given."""
+    """All components in one vector, of `dtype` if that is given."""
     with jax.numpy_dtype_promotion("standard"):
         flat, _ = ravel_pytree(y)
     return flat if dtype is None else flat.astype(dtype)
 
 
 def unravel_like(y: PyTree[Array], flat: Array) -> PyTree[Array]:
-    """The inverse of `ravel` on the structure of `y`."""
+    """The inverse of `ravel`, for the structure of `y`."""
     with jax.numpy_dtype_promotion("standard"):
         _, unravel = ravel_pytree(y)
     return unravel(flat)
@@ -68,13 +66,13 @@ def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None
 
 
 def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
-    """The same chart, or a better one at `y`."""
+    """The same chart, or a better one at `y`; `None` for a plain vector field."""
     manifold = _manifold(term)
     return None if manifold is None else _freeze(manifold.update_chart(t * term.direction, y, chart, args))
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
-    """Restore a raveled state to the manifold, if there is one, and evaluate the vector field there."""
+    """Restore a state to the manifold, if there is one, and evaluate the vector field; `like` has the structure of `y`."""
     y = unravel_like(like, flat)
     manifold = _manifold(term)
     if manifold is None:
@@ -85,11 +83,15 @@ def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart |
 
 
 def free_components(term: Any, chart: Chart | None) -> Array | None:
-    """A raveled mask of the components that are integrated, or `None` if all of them are."""
+    """A mask of the components that are integrated, or `None` if all of them are."""
     manifold = _manifold(term)
     return None if manifold is None else ravel(manifold.free(chart), bool)
 
 
+def _manifold(term: Any) -> AbstractManifoldTerm | None:
+    return term.term if isinstance(term.term, AbstractManifoldTerm) else None
+
+
 def _freeze(chart: Chart) -> Chart:
-    # Index sets and factors steer the solution of the constraints and are no part of its value.
+    # Index sets and factors steer how the constraints are solved; the solution does not depend on them.
     return jax.tree.map(jax.lax.stop_gradient, chart)

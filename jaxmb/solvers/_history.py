@@ -73,7 +73,9 @@ def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Ar
     return jnp.prod(jnp.where(_FACTORS_OF[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
 
 
-def basis_means(mesh: Float[Array, " length"], a: Any, b: Any) -> tuple[Float[Array, " length"], Float[Array, " length"]]:
+def basis_means(
+    mesh: Float[Array, " length"], a: Any, b: Any
+) -> tuple[Float[Array, " length"], Float[Array, " length"]]:
     """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
     dtype = mesh.dtype
     table = basis(mesh, a + (b - a) * jnp.asarray(np.append(_NODES, 1.0), dtype))
@@ -92,7 +94,7 @@ def extrapolate(history: History, t: Any) -> Extrapolation:
 def advance(history: History, t: Any, f: Float[Array, " n"], partial_sums: Float[Array, "length+1 n"]) -> History:
     """The history with one mesh point more."""
     # Rows that would mix in the placeholders are kept at zero: they are never used, but would grow without bound.
-    known = INDEX <= history.points
+    known = history.points >= INDEX
     zero = jnp.zeros((), f.dtype)
     return History(
         differences=jnp.where(known[:, None], f[None] - partial_sums[:-1], zero),

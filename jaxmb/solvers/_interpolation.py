@@ -7,14 +7,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._evaluation import ravel, unravel_like
-from ._history import basis_means, INDEX
+from ._history import INDEX, basis_means
 
 
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
-    """The polynomial of degree `order + 1` whose derivative interpolates `f` at the end of a step and before it.
+    """The integral of the polynomial through the derivative at the end of a step and at `order` mesh points before it.
 
-    The last evaluation of a step moves that polynomial a little away from the value the step began with; a cubic that is
-    flat at both ends takes up the difference, so the solution is continuously differentiable over all steps.
+    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the step
+    began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
+    differentiable from step to step, and its derivative at mesh points is the vector field.
     """
 
     t0: Any
@@ -34,9 +35,9 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
 
     def _since_end(self, t: Any) -> Float[Array, " n"]:
         dtype = self.mismatch.dtype
-        t = jnp.asarray(t, self.mesh.dtype)
-        means, _ = basis_means(self.mesh, self.mesh[0], t)
-        means = jnp.where(INDEX <= self.order, means, jnp.zeros((), means.dtype)).astype(dtype)
-        elapsed = t - self.mesh[0]
-        back = (-elapsed / (self.mesh[0] - self.mesh[1])).astype(dtype)
-        return elapsed.astype(dtype) * (means @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch
+        end = self.mesh[0]
+        elapsed = jnp.asarray(t, end.dtype) - end
+        means, _ = basis_means(self.mesh, end, end + elapsed)
+        used = jnp.where(self.order >= INDEX, means, jnp.zeros((), means.dtype)).astype(dtype)
+        back = (elapsed / (self.mesh[1] - end)).astype(dtype)
+        return elapsed.astype(dtype) * (used @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch

@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 
 
 class MultistepNorm(eqx.Module):
-    """The norm of a `MultistepController`; its type tells the solver which controller it runs under."""
+    """The norm of a `MultistepController`; its type tells a solver which controller it runs under."""
 
     norm: Callable[[PyTree], Any]
 
@@ -21,21 +21,27 @@ class MultistepNorm(eqx.Module):
 class Tolerances(eqx.Module):
     """Tolerances and norm, in the place and under the names where diffrax looks for those of a root finder.
 
-    Made by `diffrax.with_stepsize_controller_tols(Tolerances)()` they are filled in from the step size controller.
+    Made by `diffrax.with_stepsize_controller_tols(Tolerances)()`, they are filled in from the step size controller;
+    otherwise they are `fixed`, for steps that no error estimate controls.
     """
 
     rtol: Any
     atol: Any
     norm: Callable[[PyTree], Any]
+    fixed: bool = eqx.field(static=True, default=False)
 
-    @property
-    def from_controller(self) -> bool:
-        """Whether a `MultistepController` has filled them in."""
-        return isinstance(self.norm, MultistepNorm)
+    def check(self, solver: str) -> None:
+        """Raise a `ValueError` if they come from a controller that cannot read the estimates of a multistep method."""
+        if not self.fixed and not isinstance(self.norm, MultistepNorm):
+            raise ValueError(
+                f"`{solver}` chooses its order together with its step, which only `MultistepController` understands. Use "
+                f"`stepsize_controller=jaxmb.solvers.MultistepController(rtol=..., atol=...)` instead of "
+                f"`diffrax.PIDController` and its like. (It may be wrapped in `diffrax.ClipStepSizeController`.)"
+            )
 
     def scale(self, y0: Array, y1: Array) -> Array:
-        """The error that is tolerated in each component, over a step from `y0` to `y1`."""
-        # A step into a region where the vector field is undefined is to be judged by where it came from.
+        """The error tolerated in each component over a step from `y0` to `y1`."""
+        # A step to where the vector field is undefined is judged by where it came from.
         y1 = jnp.where(jnp.isnan(y1), y0, y1)
         with jax.numpy_dtype_promotion("standard"):
             scale = self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))

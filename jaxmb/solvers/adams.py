@@ -1,4 +1,4 @@
-"""The Adams method of Shampine and Gordon, of variable order and step."""
+"""The Adams method of Shampine and Gordon, of variable order and variable step."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -11,27 +11,36 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Args, Chart, Y
-from ._evaluation import check_term, derivative, evaluate, first_chart, free_components, next_chart, ravel, unravel_like
-from ._history import advance, extrapolate, HIGHEST_ORDER, History, INDEX, LENGTH, start
+from ._evaluation import (
+    check_problem,
+    derivative,
+    evaluate,
+    first_chart,
+    free_components,
+    next_chart,
+    ravel,
+    unravel_like,
+)
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start
 from ._interpolation import MultistepInterpolation
-from ._order import choose_order, StepEstimate
+from ._order import StepEstimate, choose_order
 from ._tolerances import Tolerances
 
 
 class AdamsState(eqx.Module):
-    """What `Adams` remembers between steps; obtained with `diffrax.SaveAt(solver_state=True)`.
+    """What `Adams` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 
-    - `history`: mesh and scaled divided differences of all components.
+    - `history`: the mesh and the scaled divided differences of all components.
     - `order`: the order of the next step.
-    - `tally`: `tally[0]` counts starts (the first, and one for every restart after a jump), `tally[k]` the accepted steps
-        of order `k`. With `stats = solution.stats` the vector field was evaluated
-        `tally[0] + 2 * stats["num_steps"]` times.
-    - `chart`: the chart of an `AbstractManifoldTerm`, else `None`.
+    - `tally`: `tally[0]` counts the starts (the first, and the restarts after jumps), `tally[k]` the accepted steps of
+        order `k`. The number of evaluations of the vector field, rejected steps included, is
+        `tally[0] + 2 * solution.stats["num_steps"]`, and two more if the first step was not given as `dt0`.
+    - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     """
 
     history: History
@@ -41,7 +50,38 @@ class AdamsState(eqx.Module):
 
 
 class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptiveSolver[AdamsState]):
-    """doc"""
+    r"""Adams' method of variable order (1 to 12) and variable step, for non-stiff problems.
+
+    Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order $k$ predicts with the
+    Adams-Bashforth formula of order $k$ and corrects with the Adams-Moulton formula of order $k + 1$. Two evaluations a
+    step, whatever the order; at tolerances of about 1e-6 and below it needs roughly half the evaluations of high-order
+    Runge-Kutta methods, so it pays when the vector field is expensive.
+
+    Use it with [`jaxmb.solvers.MultistepController`][], which reads its error estimates and from which it takes the
+    tolerances:
+
+    ```python
+    diffrax.diffeqsolve(term, Adams(), t0, t1, None, y0, stepsize_controller=MultistepController(rtol=1e-8, atol=1e-10))
+    ```
+
+    The term is a `diffrax.ODETerm` or an [`jaxmb.solvers.AbstractManifoldTerm`][]. Every form of `diffrax.SaveAt`,
+    events, jumps, integration backward in time and every adjoint work as with other diffrax solvers. Derivatives are those
+    of the discrete solution with its mesh and orders frozen. After a jump (`diffrax.ClipStepSizeController(jump_ts=...)`)
+    the method restarts at order one. A solve continued with `solver_state` must start at the state where the other ended,
+    in the same direction of time; otherwise pass `made_jump=True`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @book{shampine1975computer,
+            author={Shampine, Lawrence F. and Gordon, Marilyn K.},
+            title={Computer Solution of Ordinary Differential Equations: The Initial Value Problem},
+            publisher={W. H. Freeman},
+            address={San Francisco},
+            year={1975},
+        }
+        ```
+    """
 
     tolerances: Tolerances
     min_order: int = eqx.field(static=True)
@@ -59,46 +99,52 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         atol: Any = None,
         norm: Callable[[PyTree], Any] = optx.rms_norm,
     ):
+        """**Arguments:**
+
+        - `min_order`, `max_order`: bounds of the order; equal values fix it, once enough steps have been made from order
+            one on.
+        - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
+            `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
+
+        **Raises:** `ValueError` if the bounds are not orders of the method, or if only one tolerance is given.
+        """
         if not 1 <= min_order <= max_order <= HIGHEST_ORDER:
             raise ValueError(
-                f"`Adams` has orders from 1 to {HIGHEST_ORDER}, with `min_order` at most `max_order`, but got "
+                f"`Adams` has the orders 1 to {HIGHEST_ORDER}, and `min_order` is at most `max_order`; got "
                 f"`min_order={min_order}` and `max_order={max_order}`."
             )
         if (rtol is None) != (atol is None):
-            raise ValueError("`Adams` needs both of `rtol` and `atol`, or neither of them.")
+            raise ValueError(
+                f"`Adams` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
+            )
         if rtol is None:
-            self.tolerances = diffrax.with_stepsize_controller_tols(Tolerances)()
+            self.tolerances = diffrax.with_stepsize_controller_tols(Tolerances)()  # pyright: ignore[reportArgumentType]
         else:
-            self.tolerances = Tolerances(rtol, atol, norm)
+            self.tolerances = Tolerances(rtol, atol, norm, fixed=True)
         self.min_order = min_order
         self.max_order = max_order
 
+    # The place from which diffrax fills in the tolerances of a step size controller. There is no root to find.
     @property
-    def root_finder(self) -> Tolerances:  # pyright: ignore
+    def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerances
 
     @property
-    def root_find_max_steps(self) -> int:  # pyright: ignore
-        return 1
+    def root_find_max_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0
 
-    def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int | None:
-        return None
+    def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
+        del terms
+        return self.max_order + 1
 
     def func(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, y0: Y, args: Args) -> Y:
         return derivative(terms, t0, y0, args)
 
     def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> AdamsState:
-        check_term(terms)
+        self.tolerances.check("Adams")
+        check_problem(terms, y0)
         chart = first_chart(terms, t0, y0, args)
-        tally = jnp.zeros(LENGTH, jnp.int32)
-        return self._start(terms, t0, t1, y0, args, chart, tally)
-
-    def _start(self, terms, t0, t1, y0, args, chart, tally) -> AdamsState:
-        _, f, chart, failed = evaluate(terms, t0, ravel(y0), y0, chart, args)
-        # Not a number spreads to the error estimate, and fails the step.
-        f = jnp.where(failed, jnp.full_like(f, jnp.nan), f)
-        order = jnp.asarray(1, jnp.int32)
-        return AdamsState(start(t0, f, t1 - t0), order, tally + (INDEX == 0).astype(np.int32), chart)
+        return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32))
 
     def step(
         self,
@@ -111,65 +157,73 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], AdamsState, diffrax.RESULTS]:
         if made_jump is not False:
-            solver_state = self._restart(terms, t0, t1, y0, args, solver_state, made_jump)
+            solver_state = _restart(terms, t0, t1, y0, args, solver_state, made_jump)
         history, order, chart = solver_state.history, solver_state.order, solver_state.chart
-        flat0 = ravel(y0)
-        dtype = flat0.dtype
+        before = ravel(y0)
+        dtype = before.dtype
         h = (t1 - t0).astype(dtype)
 
         ahead = extrapolate(history, t1)
-        used = jnp.where(INDEX < order, ahead.means, jnp.zeros((), dtype))
-        predicted = flat0 + h * (used @ history.differences)
-        _, f_p, new_chart, failed_p = evaluate(terms, t1, predicted, y0, chart, args)
+        weights = jnp.where(order > INDEX, ahead.means, jnp.zeros((), dtype))
+        predicted = before + h * (weights @ history.differences)
+        _, f, tried_chart, predictor_failed = evaluate(terms, t1, predicted, y0, chart, args)
 
-        # Rows: what the derivative at t1 adds to the polynomials through the last k - 1, k, k + 1 before it.
-        defects = f_p[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
-        g = ahead.means / ahead.values
-        g_steps = jnp.diff(g, prepend=jnp.zeros((1,), dtype), append=g[-1:])
-        corrected = predicted + h * g[order] * defects[1]
-        flat1, f1, new_chart, failed_c = evaluate(terms, t1, corrected, y0, new_chart, args)
-        failed = failed_p | failed_c
-        y1 = unravel_like(y0, flat1)
+        # What the new derivative adds to the polynomials through the last k - 1, k and k + 1, and the integrals of that.
+        defects = f[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
+        integrals = ahead.means / ahead.values
+        last = integrals[order]
+        differences = jnp.diff(integrals, prepend=jnp.zeros(1, dtype), append=integrals[-1:])
+        errors = h * lax.dynamic_slice_in_dim(differences, order - 1, 3)[:, None] * defects
+        corrected = predicted + h * last * defects[1]
+        after, f, tried_chart, corrector_failed = evaluate(terms, t1, corrected, y0, tried_chart, args)
 
-        errors = self._norms(
-            terms, y0, flat0, flat1, h * lax.dynamic_slice_in_dim(g_steps, order - 1, 3)[:, None] * defects, chart
-        )
-        errors = jnp.where(failed, jnp.asarray(jnp.inf, dtype), errors)
-        next_order, estimate = choose_order(errors, order, history.points, self.min_order, self.max_order)
-        new_history = advance(history, t1, f1, ahead.partial_sums)
-        new_state = AdamsState(
-            history=new_history,
+        failed = predictor_failed | corrector_failed
+        sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), self._sizes(terms, y0, before, after, errors, chart))
+        next_order, estimate = choose_order(sizes, order, history.points, self.min_order, self.max_order)
+        y1 = unravel_like(y0, after)
+        state = AdamsState(
+            history=advance(history, t1, f, ahead.partial_sums),
             order=next_order,
-            tally=solver_state.tally + (INDEX == order).astype(jnp.int32),
-            chart=next_chart(terms, t1, y1, new_chart, args),
+            tally=solver_state.tally + (order == INDEX).astype(np.int32),
+            chart=next_chart(terms, t1, y1, tried_chart, args),
         )
         dense_info = dict(
             y1=y1,
-            differences=new_history.differences,
-            mesh=new_history.mesh,
+            differences=state.history.differences,
+            mesh=state.history.mesh,
             order=order,
-            mismatch=predicted + h * g[order] * (f1 - ahead.partial_sums[order]) - flat1,
+            mismatch=predicted + h * last * (f - ahead.partial_sums[order]) - after,
         )
-        if failed is False:
-            result = diffrax.RESULTS.successful
-        else:
-            result = diffrax.RESULTS.where(
-                failed, diffrax.RESULTS.nonlinear_divergence, diffrax.RESULTS.successful
-            )
-        return y1, estimate if self.tolerances.from_controller else None, dense_info, new_state, result
+        result = diffrax.RESULTS.successful
+        if failed is not False:
+            result = diffrax.RESULTS.where(failed, diffrax.RESULTS.nonlinear_divergence, result)
+        return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
 
-    def _norms(self, terms, y0, flat0, flat1, errors, chart):
-        errors = errors / self.tolerances.scale(flat0, flat1)[None]
+    def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
+        """Weighted norms of the errors in the free components."""
+        errors = lax.stop_gradient(errors) / self.tolerances.scale(before, after)[None]
         free = free_components(terms, chart)
         if free is not None:
-            errors = jnp.where(free[None], errors, jnp.zeros((), errors.dtype))
-            errors = errors * jnp.sqrt(free.size / jnp.maximum(jnp.sum(free), 1)).astype(errors.dtype)
-        return jnp.stack([self.tolerances.norm(unravel_like(y0, e)) for e in lax.stop_gradient(errors)])
+            # The norm is a mean over all components.
+            share = jnp.maximum(jnp.sum(free), 1) / free.size
+            errors = jnp.where(free[None], errors, jnp.zeros((), errors.dtype)) / jnp.sqrt(share).astype(errors.dtype)
+        return jnp.stack([self.tolerances.norm(unravel_like(y0, error)) for error in errors])
 
-    def _restart(self, terms, t0, t1, y0, args, state, made_jump) -> AdamsState:
-        def restart():
-            chart = next_chart(terms, t0, y0, state.chart, args)
-            new = self._start(terms, t0, t1, y0, args, chart, state.tally)
-            return jax.tree.map(lambda a, b: jnp.where(made_jump, a, b), new, state)
 
-        return lax.cond(eqxi.unvmap_any(made_jump), restart, lambda: state)
+def _start(terms, t0, t1, y0, args, chart, tally) -> AdamsState:
+    _, f, chart, failed = evaluate(terms, t0, ravel(y0), y0, chart, args)
+    if failed is not False:
+        # It spreads to the error estimate, and fails the step.
+        f = jnp.where(failed, jnp.full_like(f, jnp.nan), f)
+    tally = tally + (INDEX == 0).astype(np.int32)
+    return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart)
+
+
+def _restart(terms, t0, t1, y0, args, state: AdamsState, made_jump) -> AdamsState:
+    def restart():
+        chart = next_chart(terms, t0, y0, state.chart, args)
+        restarted = _start(terms, t0, t1, y0, args, chart, state.tally)
+        return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restarted, state)
+
+    # In a batch the evaluation is spent if any of its members has made a jump.
+    return lax.cond(eqxi.unvmap_any(made_jump), restart, lambda: state)

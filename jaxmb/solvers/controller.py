@@ -5,9 +5,9 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
@@ -17,28 +17,41 @@ from ._evaluation import ravel, unravel_like
 from ._order import StepEstimate
 from ._tolerances import MultistepNorm
 
-
-_SHRINK = 0.5
+# After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
+_WITHOUT_ESTIMATE = 0.25
+# Repeated rejections mean that errors do not fall as the order promises, as at a kink or a jump: bounds of the factor after
+# the first, second, and every further rejection.
+_REPEATED = (0.95, 0.5, 0.1)
+# A step cut short by somebody else is forgotten at most by this factor; beyond it differences would be rounding errors.
+_RECOVERY = 100.0
 
 
 class ControllerState(eqx.Module):
+    """The step that was last asked for, and how often it has been rejected since the last good one."""
+
     intended: Float[Array, ""]
     rejections: Int[Array, ""]
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
-    """doc"""
+    """Steps as long as the error estimates of a multistep method allow, with the order that allows the longest.
+
+    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one in the given norm. For
+    [`jaxmb.solvers.Adams`][]; to step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`.
+
+    If no acceptable step is found down to `dtmin`, or down to what the floating-point time can resolve, the solve ends with
+    `diffrax.RESULTS.dt_min_reached`.
+    """
 
     rtol: Any
     atol: Any
-    norm: MultistepNorm = eqx.field(converter=MultistepNorm)
+    norm: MultistepNorm
     dtmin: Any
     dtmax: Any
     force_dtmin: bool = eqx.field(static=True)
     safety: Any
     factormin: Any
     factormax: Any
-    deadband: Any
 
     def __init__(
         self,
@@ -49,11 +62,23 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         dtmin: Any = None,
         dtmax: Any = None,
         force_dtmin: bool = False,
-        safety: Any = 1.0,
-        factormin: Any = 0.1,
-        factormax: Any = 2.0,
-        deadband: Any = (0.9, 1.2),
+        safety: Any = 0.9,
+        factormin: Any = 0.01,
+        factormax: Any = 4.0,
     ):
+        """**Arguments:**
+
+        - `rtol`, `atol`: relative and absolute tolerance: scalars, or vectors with one entry for each component of the
+            raveled state.
+        - `norm`: the norm of the weighted error.
+        - `dtmin`, `dtmax`: bounds of the step.
+        - `force_dtmin`: if true, steps of size `dtmin` are accepted whatever their error, and the solve goes on.
+        - `safety`: multiplies every step that the error estimates allow.
+        - `factormin`, `factormax`: by how much a step may shrink at once after a rejection, and grow after success.
+
+        **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state can
+        resolve, and for inconsistent bounds.
+        """
         self.rtol = rtol
         self.atol = atol
         self.norm = MultistepNorm(norm)
@@ -63,57 +88,127 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         self.safety = safety
         self.factormin = factormin
         self.factormax = factormax
-        self.deadband = deadband
+
+    def __check_init__(self):
+        for name in ("rtol", "atol", "dtmin", "dtmax"):
+            value = getattr(self, name)
+            if _is_known(value) and not np.all(np.isfinite(value) & (np.asarray(value) > 0)):
+                raise ValueError(
+                    f"`MultistepController` needs a positive and finite `{name}`, but got `{name}={value}`."
+                )
+        if _is_known(self.dtmin) and _is_known(self.dtmax) and self.dtmin > self.dtmax:
+            raise ValueError(f"`dtmin={self.dtmin}` is larger than `dtmax={self.dtmax}`.")
+        if self.force_dtmin and self.dtmin is None:
+            raise ValueError("`force_dtmin=True` needs a `dtmin`.")
+        for name, low, high in (("safety", 0, 1), ("factormin", 0, 1), ("factormax", 1, np.inf)):
+            value = getattr(self, name)
+            if _is_known(value) and not low < value <= high:
+                raise ValueError(f"`{name}` lies between {low} and {high}, but got `{name}={value}`.")
 
     def wrap(self, direction: Any) -> "MultistepController":
+        del direction
         return self
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order) -> tuple[Any, ControllerState]:
+    def init(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        dt0: Any,
+        args: Args,
+        func: Callable[..., Y],
+        error_order: Any,
+    ) -> tuple[Any, ControllerState]:
+        del error_order
+        self._check_resolution(y0)
         if dt0 is None:
             dt0 = self._first_step(terms, t0, t1, y0, args, func)
-        if self.dtmax is not None:
-            dt0 = jnp.minimum(dt0, self.dtmax)
-        if self.dtmin is not None:
-            dt0 = jnp.maximum(dt0, self.dtmin)
-        return t0 + dt0, ControllerState(dt0, jnp.asarray(0, jnp.int32))
+        dt0 = self._bound(dt0, t0.dtype)
+        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), jnp.asarray(0, np.int32))
 
-    def _first_step(self, terms, t0, t1, y0, args, func):
-        dtype = t0.dtype
-        flat = ravel(y0)
-        with jax.numpy_dtype_promotion("standard"):
-            scale = self.atol + self.rtol * jnp.abs(flat)
-        size = lambda x: self.norm(unravel_like(y0, (x / scale).astype(flat.dtype)))
-        f0 = ravel(func(terms, t0, y0, args), flat.dtype)
-        span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones((), dtype)).astype(flat.dtype)
-        reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f0), span)
-        probe = 0.01 * reach
-        f1 = ravel(func(terms, t0 + probe.astype(dtype), unravel_like(y0, flat + probe * f0), args), flat.dtype)
-        bend = size(f1 - f0) / probe
-        h = jnp.where(bend > 0, jnp.sqrt(1 / bend), reach)
-        h = jnp.where(jnp.isfinite(h), jnp.minimum(h, reach), probe)
-        return lax.stop_gradient(h.astype(dtype))
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        y1_candidate: Y,
+        args: Args,
+        y_error: StepEstimate | None,  # pyright: ignore[reportIncompatibleMethodOverride]
+        error_order: Any,
+        controller_state: ControllerState,
+    ) -> tuple[Any, Any, Any, bool, ControllerState, diffrax.RESULTS]:
         del y0, y1_candidate, args, error_order
-        estimate = y_error
+        if not isinstance(y_error, StepEstimate):
+            raise ValueError(
+                "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams`, "
+                "without `rtol` and `atol` in the solver: it takes those of the controller."
+            )
         dt = t1 - t0
         dtype = dt.dtype
-        keep = estimate.error < 1
-        low, high = self.deadband
-        growth = self.safety * estimate.growth
-        growth = jnp.where((growth > low) & (growth < high), jnp.ones_like(growth), growth)
-        # Errors that do not fall as the order promises are those of a kink or a jump
-        retry = jnp.clip(self.safety * estimate.retry, self.factormin, 0.9)
-        retry = jnp.where(controller_state.rejections > 0, jnp.minimum(retry, 0.5), retry)
-        kept = jnp.clip(growth, _SHRINK, self.factormax)
-        factor = lax.stop_gradient(jnp.where(keep, kept, retry)).astype(dtype)
-        next_dt = dt * factor
-        if self.dtmax is not None:
-            next_dt = jnp.minimum(next_dt, self.dtmax)
+        intended, rejections = controller_state.intended, controller_state.rejections
+        keep = y_error.error < 1
+        if self.force_dtmin:
+            keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
+
+        scalar = lambda x: jnp.asarray(x, y_error.error.dtype)
+        allowed = (scalar(self.safety) * y_error.growth) ** y_error.response
+        growth = jnp.clip(allowed, scalar(0.5), scalar(self.factormax))
+        # The last step of a stretch may be short only because the stretch ended there.
+        recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
+        repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
+        shrink = (scalar(self.safety) * y_error.retry) ** y_error.response
+        shrink = jnp.clip(shrink, scalar(self.factormin), repeated.astype(allowed.dtype))
+        shrink = jnp.where(y_error.retry > 0, shrink, scalar(_WITHOUT_ESTIMATE))
+        factor = jnp.where(keep, jnp.maximum(growth, recovered), shrink)
+        next_dt = self._bound(dt * lax.stop_gradient(factor).astype(dtype), dtype)
+
         next_t0 = jnp.where(keep, t1, t0)
-        smallest = 10 * jnp.finfo(dtype).eps * jnp.abs(next_t0)
+        smallest = 16 * jnp.finfo(dtype).eps * jnp.abs(next_t0)
+        if self.dtmin is not None and not self.force_dtmin:
+            smallest = jnp.maximum(smallest, jnp.asarray(self.dtmin, dtype))
         result = diffrax.RESULTS.where(
             ~keep & (next_dt <= smallest), diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful
         )
-        state = ControllerState(lax.stop_gradient(next_dt), jnp.where(keep, 0, controller_state.rejections + 1))
+        state = ControllerState(lax.stop_gradient(next_dt), jnp.where(keep, 0, rejections + 1).astype(np.int32))
         return keep, next_t0, next_t0 + next_dt, False, state, result
+
+    def _bound(self, dt: Any, dtype: Any) -> Any:
+        if self.dtmax is not None:
+            dt = jnp.minimum(dt, jnp.asarray(self.dtmax, dtype))
+        if self.force_dtmin:
+            dt = jnp.maximum(dt, jnp.asarray(self.dtmin, dtype))
+        return dt
+
+    def _check_resolution(self, y0: Y) -> None:
+        finest = 4 * float(jnp.finfo(ravel(y0).dtype).eps)
+        if _is_known(self.rtol) and np.any(np.asarray(self.rtol) < finest):
+            raise ValueError(
+                f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is {finest:.1e}. "
+                "For finer ones switch on `jax_enable_x64`."
+            )
+
+    def _first_step(self, terms, t0, t1, y0, args, func) -> Any:
+        """The step of order one that would just meet the tolerance, from one trial evaluation."""
+        flat = ravel(y0)
+        with jax.numpy_dtype_promotion("standard"):
+            scale = (self.atol + self.rtol * jnp.abs(flat)).astype(flat.dtype)
+        size = lambda x: self.norm(unravel_like(y0, x / scale))
+        f = ravel(func(terms, t0, y0, args), flat.dtype)
+        span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
+        # Within this time the state changes by its own size, or at least by the tolerance.
+        reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
+        trial = reach / 100
+        f_trial = ravel(func(terms, t0 + trial.astype(t0.dtype), unravel_like(y0, flat + trial * f), args), flat.dtype)
+        # The local error of order one is h^2/2 times the change of the derivative.
+        change = size(f_trial - f) / trial
+        step = jnp.minimum(1 / jnp.sqrt(change), reach)
+        return lax.stop_gradient(jnp.where(jnp.isfinite(step), step, span / 1000).astype(t0.dtype))
+
+
+def _is_known(x: Any) -> bool:
+    return x is not None and isinstance(x, (int, float, np.ndarray, np.generic, jax.Array)) and not _is_traced(x)
+
+
+def _is_traced(x: Any) -> bool:
+    return isinstance(x, jax.core.Tracer)

@@ -1,0 +1,19 @@
+"""How a simulation ended."""
+
+import diffrax
+
+
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """Outcomes; diffrax's, and those of mechanics. Each text says what to try next."""
+
+    singular_configuration = (
+        "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints falls, "
+        "and the motion beyond is not determined by them. With `throw=False` the trajectory up to there is returned."
+    )
+    newton_failed = (
+        "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives are not "
+        "smooth, or numbers that are not finite. With `throw=False` the trajectory up to there is returned."
+    )
+    assembly_failed = (
+        "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
+    )

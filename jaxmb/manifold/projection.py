@@ -1,0 +1,121 @@
+"""Projection on the constraints after every step, so that any diffrax solver runs on constrained systems.
+
+Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .._types import Scalar, State
+from ..elimination import full_pivot, solve_positive
+from ..formulations import AbstractFormulation
+from ..solvers import Adams
+from ..system import AbstractSystem
+from ._base import AbstractManifold
+from .free import VectorField
+
+_ITERATIONS = 8
+
+
+class Projection(AbstractManifold):
+    """Integrate all coordinates with any diffrax Runge–Kutta solver, and project every step on the constraints.
+
+    The projection is the smallest change in the coordinates' scales, first of the configuration, then of the velocities. A
+    first-same-as-last derivative is kept across it: the difference is of the size of the local error.
+    """
+
+    def prepare(self, system, formulation, solver, rtol):
+        if isinstance(solver, Adams):
+            raise ValueError("Projection is for one-step solvers; use manifold=Partition() with Adams, which loses no history.")
+        return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
+
+
+class ProjectedSolver(diffrax.AbstractWrappedSolver):
+    """A solver followed by the projection of what it returns."""
+
+    solver: diffrax.AbstractSolver
+    system: AbstractSystem
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        return self.solver.interpolation_cls
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, error, dense_info, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, made_jump
+        )
+        direction = getattr(terms, "direction", 1)
+        return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+
+def project(system: AbstractSystem, t: Scalar, y: State) -> State:
+    """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order."""
+    q = y.q
+    if system.coordinate_rank > 0:
+        t = jnp.asarray(t, q.dtype)
+        square = system.coordinate_scale() ** 2
+        jacobian = system.coordinate_jacobian(t, q)
+        rows = _independent(jacobian, system.coordinate_scale(), system.coordinate_rank)
+        ahead = jacobian[rows] * square[None, :]
+        gram = ahead @ jacobian[rows].T
+        moved = lambda multipliers: q - ahead.T @ multipliers
+        residual = lambda multipliers: system.coordinate_residual(t, moved(multipliers))[rows]
+        q = moved(_root(residual, gram))
+    u = y.u
+    if system.velocity_rank > 0:
+        square = system.velocity_scale() ** 2
+        for _ in range(1 if system.linear else 3):
+            jacobian = system.jacobian(t, q, u)
+            rows = _independent(jacobian, system.velocity_scale(), system.velocity_rank)
+            ahead = jacobian[rows] * square[None, :]
+            u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
+    return State(q, u)
+
+
+def _independent(jacobian: Array, scale: Array, rank: int) -> Any:
+    return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).rows[:rank]
+
+
+def _root(residual, gram: Array) -> Array:
+    """Chord Newton from zero multipliers; its derivative is that of the root."""
+
+    def solve(residual, start):
+        def correct(carry):
+            x, _, k = carry
+            step = solve_positive(gram, residual(x))  # the residual falls as the multipliers grow
+            return x + step, jnp.max(jnp.abs(step)), k + 1
+
+        def proceed(carry):
+            x, last, k = carry
+            return (last > 64 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=1e-8)) & (k < _ITERATIONS)
+
+        return lax.while_loop(proceed, correct, (start, jnp.array(jnp.inf, start.dtype), 0))[0]
+
+    def tangent_solve(linear, b):
+        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
+
+    start = jnp.zeros(gram.shape[0], gram.dtype)
+    gram = lax.stop_gradient(gram)
+    return lax.custom_root(residual, start, solve, tangent_solve)

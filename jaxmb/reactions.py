@@ -1,0 +1,66 @@
+"""Forces that joints exert."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._types import Scalar, State
+from .rotations import cross, rotate
+from .system import RigidBodySystem
+
+
+class Reaction(NamedTuple):
+    """What a joint does to the last of its bodies that is not the ground.
+
+    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where the joint has
+    none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body gets the opposite.
+    """
+
+    force: Float[Array, "*times d"]
+    moment: Float[Array, "..."]
+    multipliers: Float[Array, "*times rows"]
+
+
+def joint_names(system: RigidBodySystem) -> tuple[str, ...]:
+    """Names of the parts that exert constraint forces."""
+    return tuple(dict.fromkeys(name for name, _ in system.rows))
+
+
+def reaction(
+    system: RigidBodySystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]
+) -> Reaction:
+    """Reaction of one joint at one state from the multipliers of all rows."""
+    extended_q, extended_u = system.extend_q(y.q), system.extend_u(y.u)
+    row, force, moment, own = 0, 0.0, 0.0, []
+    for holonomic, groups in ((True, system.constraints), (False, system.velocity_constraints)):
+        for group in groups:
+            if name in group.group.names:
+                k = group.group.names.index(name)
+                blocks = group.jacobian(t, extended_q) if holonomic else group.jacobian(t, extended_q, extended_u)
+                values = multipliers[row + k * group.rows : row + (k + 1) * group.rows]
+                wrenches = jnp.einsum("r,rkv->kv", values, blocks[k])
+                f, m = _on_last_body(system, group.group, k, extended_q, wrenches)
+                force, moment = force + f, moment + m
+                own.append(values)
+            row += len(group.group.names) * group.rows
+    return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(own))
+
+
+def _on_last_body(system, group, k, extended_q, wrenches):
+    bodies = group.bodies[k]
+    last = max(i for i, body in enumerate(bodies) if body < system.layout.bodies)
+    pose, wrench = group.poses(extended_q)[k, last], wrenches[last]
+    part = jax.tree.map(lambda leaf: leaf[k], group.part)
+    point = getattr(part, "point_b" if last else "point_a", None)
+    if not system.spatial:
+        force, moment = wrench[:2], wrench[2]
+        if point is not None:
+            arm = system.layout.space.direction(pose, point)
+            moment = moment - (arm[0] * force[1] - arm[1] * force[0])
+        return force, moment
+    force, moment = wrench[:3], rotate(pose[3:], wrench[3:])
+    if point is not None:
+        moment = moment - cross(system.layout.space.direction(pose, point), force)
+    return force, moment

@@ -1,0 +1,255 @@
+"""From a system and a state to a motion."""
+
+import math
+import warnings
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from ._results import RESULTS
+from ._types import Scalar, State
+from .elimination import full_pivot
+from .formulations import AbstractFormulation, Partitioned
+from .formulations._base import stages
+from .manifold import AbstractManifold, Free, Partition, Projection, project
+from .manifold.partition import Chart
+from .solvers import Adams, MultistepController
+from .system import AbstractSystem
+from .trajectory import Trajectory
+
+# Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
+_CHECKPOINTS = 4096
+_CHECKPOINT_BYTES = 2**28
+
+# A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
+_SINGULAR_PIVOT = 1e-3
+
+
+def simulate(
+    system: AbstractSystem,
+    state: State,
+    *,
+    t1: Scalar,
+    t0: Scalar = 0.0,
+    dt0: Scalar | None = None,
+    saveat: diffrax.SaveAt | ArrayLike | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    formulation: AbstractFormulation | None = None,
+    manifold: AbstractManifold | None = None,
+    rtol: float = 1e-8,
+    atol: float | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    event: diffrax.Event | None = None,
+    max_steps: int = 65536,
+    throw: bool = True,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Trajectory:
+    """Integrate the motion of a system.
+
+    **Main arguments:**
+
+    - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.
+    - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
+    - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows `Trajectory.at(t)`.
+    - `rtol`, `atol`: tolerances of the error of one step; `atol` defaults to `rtol` times one hundredth.
+
+    **Other arguments, rarely needed:**
+
+    - `solver`: default `Adams()`; any diffrax Runge–Kutta solver.
+    - `formulation`: how accelerations are solved for, default `Partitioned()`.
+    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams`, `Projection()` for others, and
+        nothing of either for a system without constraints.
+    - `dt0`: first step [s], default chosen from the motion.
+    - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams`.
+    - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of them computed twice. For few
+        parameters forward mode is faster and needs no memory: `jax.jacfwd` with `adjoint=diffrax.ForwardMode()`.
+    - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
+
+    **Returns:** a `Trajectory`.
+
+    **Raises:** `ValueError` for tolerances out of range and combinations that cannot work; `RuntimeError`, if `throw`, when the
+    integration fails: the text of its `RESULTS` says how. With `throw=False` the trajectory up to there is kept.
+
+    Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true ones.
+    """
+    state = jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
+    if state.q.shape != (system.nq,) or state.u.shape != (system.nu,):
+        raise ValueError(
+            f"The state must have {system.nq} coordinates and {system.nu} velocities, got {state.q.shape} and {state.u.shape}."
+        )
+    _check_tolerances(rtol, atol, state.q.dtype)
+    atol = rtol / 100 if atol is None else atol
+    solver = Adams() if solver is None else solver
+    formulation = Partitioned() if formulation is None else formulation
+    if manifold is None:
+        manifold = Free() if system.velocity_rows == 0 else Partition() if isinstance(solver, Adams) else Projection()
+    if stepsize_controller is None:
+        controller = MultistepController if isinstance(solver, Adams) else diffrax.PIDController
+        stepsize_controller = controller(rtol=rtol, atol=atol)
+    if adjoint is None:
+        size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
+        kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
+    term, solver = manifold.prepare(system, formulation, solver, rtol)
+
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    trajectory = _integrate(
+        system,
+        formulation,
+        term,
+        solver,
+        (t0, t1, dt0),
+        state,
+        _save_at(saveat),
+        stepsize_controller,
+        adjoint,
+        event,
+        max_steps,
+        meter,
+        restore=event is not None or isinstance(manifold, Free),
+    )
+    if throw:
+        result = trajectory.result
+        bad = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+        trajectory = result.error_if(trajectory, bad)
+    return trajectory.trimmed()
+
+
+@eqx.filter_jit
+def _integrate(
+    system, formulation, term, solver, times, state, saveat, controller, adjoint, event, max_steps, meter, *, restore
+):
+    t0, t1, dt0 = times
+    solution = diffrax.diffeqsolve(
+        term,
+        solver,
+        t0,
+        t1,
+        dt0,
+        state,
+        saveat=_with_end(saveat),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        event=event,
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=meter,
+    )
+    ts, saved = solution.ts[0], solution.ys[0]
+    end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
+    if isinstance(saved, State) and (restore or saveat.subs is not None and saveat.subs.ts is not None):
+        saved = _restore(system, ts, saved)
+    return Trajectory(
+        system=system,
+        formulation=formulation,
+        ts=ts,
+        ys=saved,
+        stats=_statistics(solution),
+        result=_diagnose(system, state, end, solution),
+        interpolation=solution.interpolation,
+        event_mask=solution.event_mask,
+    )
+
+
+def _check_tolerances(rtol: Any, atol: Any, dtype) -> None:
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is None or isinstance(value, jax.core.Tracer):
+            continue
+        if not np.all(np.isfinite(value)) or np.any(np.asarray(value) < 0) or np.any(np.asarray(value) >= 1):
+            raise ValueError(f"{name} must be between 0 and 1, got {value}.")
+    if isinstance(rtol, jax.core.Tracer):
+        return
+    smallest = 10 * float(jnp.finfo(dtype).eps)
+    if rtol < smallest:
+        if dtype == jnp.float32:
+            warnings.warn(
+                f"rtol={rtol:g} is below what single precision can do ({smallest:.1e}). Switch double precision on before "
+                'anything else: import jax; jax.config.update("jax_enable_x64", True).',
+                stacklevel=3,
+            )
+        elif rtol <= 0 or rtol < float(jnp.finfo(dtype).eps):
+            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {smallest:.1e}.")
+
+
+def _save_at(saveat) -> diffrax.SaveAt:
+    if saveat is None:
+        return diffrax.SaveAt(t1=True)
+    if isinstance(saveat, diffrax.SaveAt):
+        if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
+            raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
+        return saveat
+    ts = jnp.asarray(saveat, dtype=jnp.result_type(float))
+    if ts.ndim != 1 or ts.shape[0] == 0:
+        raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
+    return diffrax.SaveAt(ts=ts)
+
+
+def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
+    """The user's series and, for statistics and diagnosis, the end state."""
+    first = saveat.subs if saveat.subs is not None else diffrax.SubSaveAt(t1=True)
+    return diffrax.SaveAt(
+        subs=(first, diffrax.SubSaveAt(t1=True)), dense=saveat.dense, solver_state=True, controller_state=True
+    )
+
+
+def _restore(system, ts, saved):
+    """Bring interpolated states back to the constraints; entries after the end of a run stay as they are."""
+    finite = jnp.isfinite(ts)
+    inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(_first(y))), saved)
+    restored = jax.vmap(lambda t, y: _on_manifold(system, t, y))(jnp.where(finite, ts, 0.0), inside)
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), restored, saved)
+
+
+def _first(y):
+    return jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
+
+
+def _on_manifold(system, t, y):
+    return project(system, t, State(system.normalize(y.q), y.u))
+
+
+def _diagnose(system, start, end, solution):
+    """Diffrax's outcome, made precise where mechanics knows more."""
+    result = RESULTS.promote(solution.result)
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
+    stuck = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+    result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
+    if system.velocity_rows == 0 or not isinstance(_chart(solution), Chart):
+        return result
+    stuck = stuck & finite
+    t, y = lax.stop_gradient(end)
+    system = lax.stop_gradient(system)
+
+    def smallest_pivot():
+        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
+        return jnp.where(pivots.rank < system.velocity_rank, 0.0, pivots.smallest)
+
+    pivot = lax.cond(stuck, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
+    singular = stuck & ((pivot < _SINGULAR_PIVOT) | _chart(solution).singular)
+    result = RESULTS.where(singular, RESULTS.singular_configuration, result)
+    newton = stuck & ~singular & (solution.result == diffrax.RESULTS.dt_min_reached)
+    return RESULTS.where(newton, RESULTS.newton_failed, result)
+
+
+def _chart(solution):
+    return getattr(solution.solver_state, "chart", None)
+
+
+def _statistics(solution) -> dict[str, Array]:
+    stats = dict(solution.stats)
+    tally = getattr(solution.solver_state, "tally", None)
+    if tally is not None:
+        stats["num_evaluations"] = tally[0] + 2 * stats["num_steps"]
+        stats["orders"] = tally[1:]
+    chart = _chart(solution)
+    if isinstance(chart, Chart):
+        stats["newton_iterations"] = chart.newton
+        stats["charts"] = chart.charts
+    return stats

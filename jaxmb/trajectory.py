@@ -1,0 +1,200 @@
+"""A motion, with views by name."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ._names import unknown
+from ._results import RESULTS
+from ._types import State
+from .formulations import AbstractFormulation, accelerations
+from .manifold import project
+from .reactions import Reaction, joint_names, reaction
+from .system import RigidBodySystem
+
+
+class ConstraintViolation(NamedTuple):
+    """Largest residuals, scaled by the system's size; shape (times,). `position` of Φ, `velocity` of ψ [1/s]."""
+
+    position: Float[Array, "times"]
+    velocity: Float[Array, "times"]
+
+
+class BodyMotion(NamedTuple):
+    """Motion of one body; axis 0 is time.
+
+    **Fields:** `position` [m] of the mass centre and `velocity` [m/s], world axes, shape (times, 2) or (times, 3); in the plane
+    `angle` [rad] and `angular_velocity` [rad/s], shape (times,); in space `orientation` (Euler parameters, (times, 4)) and
+    `angular_velocity` [rad/s] in the body frame, (times, 3). A point mass has no attitude: None.
+    """
+
+    position: Array
+    velocity: Array
+    angle: Array | None
+    orientation: Array | None
+    angular_velocity: Array | None
+
+
+class Reactions(Mapping[str, Reaction]):
+    """Forces of the joints by name, worked out when asked for."""
+
+    def __init__(self, trajectory: "Trajectory"):
+        self._trajectory = trajectory
+
+    def __getitem__(self, name: str) -> Reaction:
+        names = joint_names(self._trajectory.system)
+        if name not in names:
+            raise unknown("joint", name, names)
+        system = self._trajectory.system
+        solve = lambda t, y, multipliers: reaction(system, name, t, y, multipliers)
+        return jax.vmap(solve)(self._trajectory.ts, self._trajectory.ys, self._trajectory.multipliers)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(joint_names(self._trajectory.system))
+
+    def __len__(self) -> int:
+        return len(joint_names(self._trajectory.system))
+
+
+class Trajectory(eqx.Module):
+    """What `simulate` returns.
+
+    **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the integration
+    (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`: accepted steps at order 1, 2, …);
+    `result`, how it ended. `trajectory["crank"]` is the motion of a body.
+    """
+
+    system: RigidBodySystem
+    formulation: AbstractFormulation
+    ts: Float[Array, "times"]
+    ys: Any
+    stats: dict[str, Any]
+    result: RESULTS
+    interpolation: diffrax.AbstractPath | None
+    event_mask: Any
+
+    def __getitem__(self, body: str) -> BodyMotion:
+        system = self.system
+        if body not in system.body_names:
+            raise unknown("body", body, system.body_names)
+        k = system.body_names.index(body)
+        d = system.layout.space.dimension
+        pose = self.ys.q[:, [i for i in system.layout.pose_index[k] if i < system.nq]]
+        velocity = self.ys.u[:, [i for i in system.layout.velocity_index[k] if i < system.nu]]
+        if not system.layout.rotates[k]:
+            return BodyMotion(pose, velocity, None, None, None)
+        if d == 2:
+            return BodyMotion(pose[:, :2], velocity[:, :2], pose[:, 2], None, velocity[:, 2])
+        return BodyMotion(pose[:, :3], velocity[:, :3], None, pose[:, 3:], velocity[:, 3:])
+
+    def at(self, t: ArrayLike) -> State:
+        """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints."""
+        if self.interpolation is None:
+            raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
+        t = jnp.asarray(t, self.ys_dtype)
+        single = lambda t: self._restored(t, self.interpolation.evaluate(t))
+        out = jax.vmap(single)(t.reshape(-1))
+        return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
+
+    def _restored(self, t, y):
+        return project(self.system, t, State(self.system.normalize(y.q), y.u))
+
+    @property
+    def ys_dtype(self):
+        return self.system.guess.q.dtype
+
+    @property
+    def kinetic_energy(self) -> Float[Array, "times"]:
+        """Kinetic energy [J]."""
+        return jax.vmap(lambda t, y: self.system.kinetic_energy(t, y.q, y.u))(self.ts, self.ys)
+
+    @property
+    def potential_energy(self) -> Float[Array, "times"]:
+        """Potential energy [J] of gravity and conservative forces."""
+        return jax.vmap(lambda t, y: self.system.potential_energy(t, y.q))(self.ts, self.ys)
+
+    @property
+    def energy(self) -> Float[Array, "times"]:
+        """Kinetic and potential energy [J]."""
+        return self.kinetic_energy + self.potential_energy
+
+    @property
+    def linear_momentum(self) -> Float[Array, "times d"]:
+        """`Σ m v` [kg m/s], world axes."""
+        return jax.vmap(lambda y: self.system.linear_momentum(y.q, y.u))(self.ys)
+
+    @property
+    def angular_momentum(self) -> Float[Array, "times *d"]:
+        """Moment of momentum about the world origin [kg m²/s]."""
+        return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
+
+    @property
+    def accelerations(self) -> Float[Array, "times nu"]:
+        """u̇ of every velocity."""
+        return self._solved[0]
+
+    @property
+    def multipliers(self) -> Float[Array, "times rows"]:
+        """Multipliers λ of every row, `M u̇ = F + Aᵀλ`; zero for implied rows."""
+        return self._solved[1]
+
+    @property
+    def _solved(self):
+        return jax.vmap(lambda t, y: accelerations(self.system, self.formulation, t, y.q, y.u))(self.ts, self.ys)
+
+    @property
+    def reactions(self) -> Reactions:
+        """Forces of the joints by name: `reactions["A"].force`."""
+        return Reactions(self)
+
+    @property
+    def constraint_violation(self) -> ConstraintViolation:
+        """Largest scaled residuals of position and velocity constraints at every saved time."""
+
+        def at(t, y):
+            length = self.system.length
+            position = jnp.max(jnp.abs(self.system.coordinate_residual(t, y.q)), initial=0.0) / length
+            velocity = jnp.max(jnp.abs(self.system.velocity_residual(t, y.q, y.u)), initial=0.0)
+            return ConstraintViolation(position, velocity / length)
+
+        return jax.vmap(at)(self.ts, self.ys)
+
+    def trimmed(self) -> "Trajectory":
+        """Without the padding of `SaveAt(steps=True)` and of runs that ended early; unchanged under `jit` and `vmap`."""
+        if isinstance(self.ts, jax.core.Tracer) or self.ts is None or self.ts.ndim != 1:
+            return self
+        finite = np.isfinite(np.asarray(self.ts))
+        if finite.all():
+            return self
+        where = lambda t: (t.ts, t.ys)
+        return eqx.tree_at(where, self, (self.ts[finite], jax.tree.map(lambda y: y[finite], self.ys)))
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
+        out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
+        for body in self.system.body_names:
+            for field, value in self[body]._asdict().items():
+                if value is not None:
+                    out[f"{body}.{field}"] = np.asarray(value)
+        out["energy"] = np.asarray(self.energy)
+        for name, value in self.stats.items():
+            if value is not None:
+                out[f"stats.{name}"] = np.asarray(value)
+        return out
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_dict` as a compressed `.npz`."""
+        np.savez_compressed(path, **self.to_dict())
+
+
+def load(path: str | Path) -> dict[str, np.ndarray]:
+    """Read what `Trajectory.save` wrote, as a dictionary of arrays."""
+    with np.load(path) as data:
+        return {name: data[name] for name in data.files}
