@@ -1,6 +1,12 @@
 """Accurate, differentiable dynamics of constrained mechanical systems in JAX."""
 
-from . import formulations as formulations, manifold as manifold, planar as planar, solvers as solvers, spatial as spatial
+from . import (
+    formulations as formulations,
+    manifold as manifold,
+    planar as planar,
+    solvers as solvers,
+    spatial as spatial,
+)
 from ._forces import Gravity as Gravity
 from ._types import State as State
 from ._user import Constraint as Constraint, Force as Force, VelocityConstraint as VelocityConstraint

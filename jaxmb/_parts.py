@@ -83,9 +83,7 @@ class AbstractVelocityConstraint(AbstractLink):
     homogeneous: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
-    def residual(
-        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
-    ) -> Float[Array, "rows"]:
+    def residual(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Float[Array, "rows"]:
         """ψ(poses, velocities, t) of this part."""
 
 

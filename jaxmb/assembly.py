@@ -58,25 +58,29 @@ def assemble(
     if concrete:
         _check_finite(q, "coordinates"), _check_finite(u, "rates")
 
-    q, ok = positions(system, t, q, fixed)
+    q, ok = positions(system, t, q, tuple(fixed.tolist()))
     if concrete and throw and not bool(ok):
         raise ValueError(_cannot_assemble(system, t, q, fixed, coordinate_names(system)))
-    u, ok_rates = velocities(system, t, q, u, fixed_rates)
+    u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     if concrete and throw and not bool(ok_rates):
         raise ValueError(_cannot_move(system, t, q, u, fixed_rates, rate_names(system)))
     ok = ok & ok_rates
     if throw and not concrete:
-        q = eqx.error_if(q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are open.")
+        q = eqx.error_if(
+            q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are open."
+        )
     state = State(q, u)
     return state if throw else jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), state)
 
 
+@eqx.filter_jit
 def positions(
-    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], fixed: Bool[np.ndarray, "nq"]
+    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...]
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
-    """The configuration nearest to the guess; and whether every residual is at rounding level."""
+    """The configuration nearest to the guess with some coordinates held; and whether every residual is at rounding level."""
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
+    fixed = np.array(held)
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
     start = lax.stop_gradient(guess)
     frozen = lax.stop_gradient(system)
@@ -86,20 +90,26 @@ def positions(
     # The minimiser, exactly: Newton on the optimality conditions with the independent rows.
     rank = system.coordinate_rank
     jacobian = frozen.coordinate_jacobian(t, q)
-    pivots = full_pivot(jacobian, scale=jnp.where(fixed, 0.0, system.coordinate_scale()))
+    pivots = full_pivot(jacobian, scale=scale)
     ok = ok & (pivots.rank == rank)
-    rows = pivots.rows[:rank]
+    rows = pivots.order.rows[:rank]
     square = jnp.where(fixed, 1.0, scale) ** 2
+
+    # Where there is none, the equations are replaced by ones with a solution, so that their derivatives stay finite.
+    closed = ok
 
     def optimality(z, inputs):
         system, t, guess = inputs
         q, multipliers = z
         residual, pull = jax.vjp(lambda q: system.coordinate_residual(t, q)[rows], q)
         (gradient,) = pull(multipliers)
-        return (q - guess) / square + jnp.where(fixed, 0.0, gradient), residual
+        balance = (q - guess) / square + jnp.where(fixed, 0.0, gradient)
+        return jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)
 
     selected = (jacobian * scale[None, :])[rows]
-    multipliers = jnp.linalg.solve(selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square)))
+    multipliers = jnp.linalg.solve(
+        selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
+    )
     solution = optx.root_find(
         optimality,
         optx.Newton(rtol=1e-10, atol=1e-10),
@@ -113,13 +123,14 @@ def positions(
     return jnp.where(ok, refined, q), ok
 
 
+@eqx.filter_jit
 def velocities(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], fixed: Bool[np.ndarray, "nu"]
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: tuple[bool, ...]
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
-    """The velocities nearest to the guess; and whether every residual is at rounding level."""
+    """The velocities nearest to the guess with some rates held; and whether every residual is at rounding level."""
     if system.velocity_rows == 0:
         return guess, jnp.array(True)
-    scale = jnp.where(fixed, 0.0, system.velocity_scale())
+    scale = jnp.where(np.array(held), 0.0, system.velocity_scale())
     u = guess
     rank = system.velocity_rank
     ok = jnp.array(True)
@@ -127,7 +138,7 @@ def velocities(
         jacobian = system.jacobian(t, q, u)
         pivots = full_pivot(jacobian, scale=scale)
         ok = ok & (pivots.rank == rank)
-        rows = pivots.rows[:rank]
+        rows = pivots.order.rows[:rank]
         selected = jacobian[rows] * scale[None, :]
         # A fixed rate that leaves too few free columns makes this singular; `ok` says so.
         gram = selected @ selected.T + jnp.where(ok, 0.0, 1.0) * jnp.eye(rank, dtype=u.dtype)
@@ -137,7 +148,9 @@ def velocities(
     return u, ok & (jnp.max(jnp.abs(residual)) <= 1e2 * tolerance(u.dtype) * size)
 
 
-def nearest(system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]) -> Float[Array, "nq"]:
+def nearest(
+    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
+) -> Float[Array, "nq"]:
     """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
 
     Implied rows are allowed: the normal equations are regularised at rounding level.
@@ -204,7 +217,9 @@ def _cannot_assemble(system, t, q, fixed, names):
         text += f" with {', '.join(held)} fixed"
     listed = open_joints(system, t, q)
     if listed:
-        return f"{text}: residuals remain in {listed}. Check lengths and points, or give a better guess of the positions."
+        return (
+            f"{text}: residuals remain in {listed}. Check lengths and points, or give a better guess of the positions."
+        )
     return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
 
 

@@ -21,16 +21,42 @@ from jaxtyping import Array, Float, Int
 _LOOP_SIZE = 24
 
 
+class Order(eqx.Module):
+    """An order of elimination: two permutations and their inverses, packed in one array of integers.
+
+    **Fields:** `packed`; `m`, `n`: the matrix's shape, static. `rows` has pivot rows first and implied rows last, `columns` dependent
+    columns first and independent ones last; `row_place` and `column_place` are their inverses.
+    """
+
+    packed: Int[Array, "both"]
+    m: int = eqx.field(static=True)
+    n: int = eqx.field(static=True)
+
+    @property
+    def rows(self) -> Int[Array, "m"]:
+        return self.packed[: self.m]
+
+    @property
+    def columns(self) -> Int[Array, "n"]:
+        return self.packed[self.m : self.m + self.n]
+
+    @property
+    def row_place(self) -> Int[Array, "m"]:
+        return self.packed[self.m + self.n : 2 * self.m + self.n]
+
+    @property
+    def column_place(self) -> Int[Array, "n"]:
+        return self.packed[2 * self.m + self.n :]
+
+
 class Pivots(eqx.Module):
     """Result of `full_pivot`; integers and sizes, without derivatives.
 
-    **Fields:** `rank`; `rows`, a permutation of the m rows, pivot rows first and implied rows last; `columns`, a permutation of
-    the n columns, dependent first and independent last; `smallest` and `largest` pivot of the equilibrated matrix.
+    **Fields:** `rank`; `order` of elimination; `smallest` and `largest` pivot of the equilibrated matrix.
     """
 
     rank: Int[Array, ""]
-    rows: Int[Array, "m"]
-    columns: Int[Array, "n"]
+    order: Order
     smallest: Float[Array, ""]
     largest: Float[Array, ""]
 
@@ -73,7 +99,9 @@ def full_pivot(
     work = A if scale is None else A * scale[None, :]
     size = jnp.sqrt(jnp.sum(work * work, axis=1))
     # A row of rounding errors must not be blown up to a row of unit norm.
-    work = work / jnp.maximum(jnp.maximum(size, eps**0.75 * jnp.max(size, initial=0.0)), jnp.finfo(A.dtype).tiny)[:, None]
+    work = (
+        work / jnp.maximum(jnp.maximum(size, eps**0.75 * jnp.max(size, initial=0.0)), jnp.finfo(A.dtype).tiny)[:, None]
+    )
     stage = jnp.zeros(m, int) if stage is None else stage
     unused = jnp.iinfo(jnp.int32).max
 
@@ -105,29 +133,25 @@ def full_pivot(
         jnp.array(0.0, A.dtype),
         jnp.array(0),
     )
-    if m == 0:
-        rank, rows, columns, smallest, largest = start[5], jnp.arange(0), jnp.arange(n), start[3], start[4]
-    else:
-        _, row_order, column_order, smallest, largest, rank = lax.fori_loop(0, min(m, n), step, start)
-        rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
-    return Pivots(rank, rows, columns, smallest, largest)
+    _, row_order, column_order, smallest, largest, rank = start if m == 0 else lax.fori_loop(0, min(m, n), step, start)
+    rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
+    packed = jnp.concatenate([rows, columns, jnp.argsort(rows), jnp.argsort(columns)])
+    return Pivots(rank, Order(packed, m, n), smallest, largest)
 
 
-def factor(
-    A: Float[Array, "m n"], rows: Int[Array, "m"], columns: Int[Array, "n"], rank: int
-) -> Factor:
+def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     """Eliminate in the order a chart already has, without search; differentiable in `A`.
 
-    **Arguments:** `A`: the matrix; `rows`, `columns`: permutations from `Pivots`; `rank`: its rank, static.
+    **Arguments:** `A`: the matrix; `order` from `Pivots`; `rank`: its rank, static.
     """
     m, n = A.shape
-    position = jnp.argsort(columns)
-    swept = gauss_jordan(A[rows[:rank]][:, columns], rank)
+    rows = order.rows[:rank]
+    swept = gauss_jordan(A[rows][:, order.columns], rank)
     inverse, influence = swept[:, :rank], -swept[:, rank:]
-    basis = jnp.concatenate([influence, jnp.eye(n - rank, dtype=A.dtype)])[position]
+    basis = jnp.concatenate([influence, jnp.eye(n - rank, dtype=A.dtype)])[order.column_place]
     # Independent columns and implied rows stand last in their permutations, where the padding is zero.
     padded = jnp.pad(inverse, ((0, n - rank), (0, m - rank)))
-    return Factor(padded[position][:, jnp.argsort(rows)], basis, rows[:rank])
+    return Factor(padded[order.column_place][:, order.row_place], basis, rows)
 
 
 @jax.custom_jvp

@@ -28,9 +28,7 @@ def joint_names(system: RigidBodySystem) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, _ in system.rows))
 
 
-def reaction(
-    system: RigidBodySystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]
-) -> Reaction:
+def reaction(system: RigidBodySystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]) -> Reaction:
     """Reaction of one joint at one state from the multipliers of all rows."""
     extended_q, extended_u = system.extend_q(y.q), system.extend_u(y.u)
     row, force, moment, own = 0, 0.0, 0.0, []

@@ -19,6 +19,7 @@ from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
 from .spatial._space import SPACE
 from .system import RigidBodySystem
 from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
+from .system.describe import Description
 from .system.layout import Layout
 from .system.rigid_bodies import Ranks
 
@@ -44,6 +45,10 @@ class Scene(eqx.Module):
     def __check_init__(self):
         _check_kinds(self)
         _check_names(self)
+
+    def describe(self) -> Description:
+        """Compile, and describe the result; as text and as HTML."""
+        return self.compile().describe()
 
     def compile(self) -> RigidBodySystem:
         """Check the scene, find its structure (ranks, implied rows), and stack its parts.
@@ -105,7 +110,9 @@ def _check_kinds(scene: Scene):
         raise ValueError("A scene needs at least one body.")
     for body in scene.bodies:
         if not isinstance(body, _BODIES):
-            raise ValueError(f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own.")
+            raise ValueError(
+                f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own."
+            )
     for part in scene.joints:
         if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
             raise ValueError(f"joints must hold constraints, got {part!r}.")

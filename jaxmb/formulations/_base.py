@@ -38,7 +38,7 @@ def linearize(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float
     """The Jacobian A at a state and its factor, with a search for pivots."""
     jacobian = system.jacobian(t, q, u)
     pivots = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
-    return jacobian, factor(jacobian, pivots.rows, pivots.columns, system.velocity_rank)
+    return jacobian, factor(jacobian, pivots.order, system.velocity_rank)
 
 
 def stages(system: AbstractSystem) -> Array:

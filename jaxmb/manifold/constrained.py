@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar
-from ..elimination import Factor, factor, solve_positive
+from ..elimination import Factor, Order, factor, solve_positive
 from ..formulations import AbstractFormulation
 from ..system import AbstractSystem
 
@@ -26,15 +26,19 @@ _MAX_ITERATIONS = 12
 class Split(eqx.Module):
     """A chart's index sets and the carried matrix of its position Newton.
 
-    **Fields:** `coordinate_rows`, `coordinate_columns`, `velocity_rows`, `velocity_columns`: permutations as in
-    `elimination.Pivots`; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq = −Φ` along dependent columns.
+    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `coordinate`: that of the coordinates' Jacobian, None
+    where one split serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq = −Φ` along dependent
+    columns, made at `time`.
     """
 
-    coordinate_rows: Int[Array, "mq"]
-    coordinate_columns: Int[Array, "nq"]
-    velocity_rows: Int[Array, "m"]
-    velocity_columns: Int[Array, "nu"]
+    velocity: Order
+    coordinate: Order | None
     correction: Float[Array, "nq mq"]
+    time: Float[Array, ""]
+
+    @property
+    def coordinates(self) -> Order:
+        return self.velocity if self.coordinate is None else self.coordinate
 
 
 class Evaluation(eqx.Module):
@@ -59,7 +63,7 @@ def shared(system: AbstractSystem) -> bool:
 def coordinate_factor(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: Split) -> Factor:
     """Factor of the coordinates' Jacobian in a chart."""
     jacobian = system.coordinate_jacobian(t, q)
-    return factor(jacobian, split.coordinate_rows, split.coordinate_columns, system.coordinate_rank)
+    return factor(jacobian, split.coordinates, system.coordinate_rank)
 
 
 @eqx.filter_custom_jvp
@@ -92,23 +96,26 @@ def _restore_positions(system, t, q, split, tol):
     scale = system.coordinate_scale()
 
     def correct(carry):
-        q, _, k = carry
+        q, before, _, k = carry
         step = split.correction @ system.coordinate_residual(t, q)
-        return q - step, jnp.max(jnp.abs(step) / scale), k + 1
+        size = jnp.max(jnp.abs(step) / scale)
+        # Corrections shrink by a constant factor, so the next one is known: no iteration is spent on verifying it.
+        return q - step, size, size * jnp.minimum(size / before, 1.0), k + 1
 
     def proceed(carry):
-        _, size, k = carry
-        return (size > tol) & (size < 1.0) & (k < _MAX_ITERATIONS)
+        _, size, ahead, k = carry
+        return (ahead > tol) & (size < 1.0) & (k < _MAX_ITERATIONS)
 
-    # The first correction is unconditional; starting the loop with it saves a test of nothing.
-    q, size, k = lax.while_loop(proceed, correct, correct((q, None, jnp.array(0))))
-    return q, k, ~(size <= tol)
+    # A matrix of this very time is wrong by the first correction only; of an older one nothing is known.
+    before = jnp.where(split.time == t, jnp.ones((), q.dtype), jnp.zeros((), q.dtype))
+    q, size, ahead, k = lax.while_loop(proceed, correct, correct((q, before, before, jnp.array(0))))
+    return q, k, ~(ahead <= tol)
 
 
 def _restore_velocities(system, t, q, u, split, tol):
     def solve(u):
         jacobian = system.jacobian(t, q, u)
-        solved = factor(jacobian, split.velocity_rows, split.velocity_columns, system.velocity_rank)
+        solved = factor(jacobian, split.velocity, system.velocity_rank)
         residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
         return u - solved.correction @ residual, jacobian, solved
 

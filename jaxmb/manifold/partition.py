@@ -9,7 +9,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._types import State
 from ..elimination import full_pivot
@@ -58,19 +58,37 @@ class Partition(AbstractManifold):
 class Chart(eqx.Module):
     """A split with its quality and counters.
 
-    **Fields:** `split`; `influence`: largest scaled |H| at the last evaluation; `pivot`: smallest pivot when the chart was made;
-    `age`: steps since the position factor was refreshed; `iterations`: of the last position Newton; `newton`: all of them;
-    `charts`: charts made; `singular`: whether the rank fell.
+    **Fields:** `split`; `influence`: largest scaled |H| at the last evaluation; `counters`: see the properties.
     """
 
     split: Split
     influence: Float[Array, ""]
-    pivot: Float[Array, ""]
-    age: Int[Array, ""]
-    iterations: Int[Array, ""]
-    newton: Int[Array, ""]
-    charts: Int[Array, ""]
-    singular: Array
+    counters: Int[Array, "5"]
+
+    @property
+    def age(self) -> Int[Array, ""]:
+        """Steps since the position factor was refreshed."""
+        return self.counters[0]
+
+    @property
+    def iterations(self) -> Int[Array, ""]:
+        """Iterations of the last position Newton."""
+        return self.counters[1]
+
+    @property
+    def newton(self) -> Int[Array, ""]:
+        """Iterations of all position Newtons."""
+        return self.counters[2]
+
+    @property
+    def charts(self) -> Int[Array, ""]:
+        """Charts made."""
+        return self.counters[3]
+
+    @property
+    def singular(self) -> Bool[Array, ""]:
+        """Whether the rank has fallen."""
+        return self.counters[4] > 0
 
 
 class PartitionTerm(AbstractManifoldTerm):
@@ -93,84 +111,74 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def init_chart(self, t, y, args):
         system, y = lax.stop_gradient((self.system, y))
-        split, influence, pivot, singular = _choose(system, t, y)
-        zero = jnp.array(0)
-        return Chart(split, influence, pivot, zero, zero, zero, jnp.array(1), singular)
+        split, singular = _choose(system, t, y)
+        return Chart(split, jnp.ones((), y.q.dtype), jnp.stack([0, 0, 0, 1, singular.astype(int)]))
 
     def evaluate(self, t, y, chart, args):
         chart = lax.stop_gradient(chart)
-        out = evaluate(self.system, self.formulation, t, y.q, y.u, chart.split, self.newton_tol)
-        iterations = chart.newton + out.iterations
-        split = chart.split
-        if shared(self.system):
-            split = eqx.tree_at(lambda s: s.correction, split, lax.stop_gradient(out.factor.correction))
-        influence = chart.influence if self.system.velocity_rows == 0 else _influence(self.system, out.factor, split)
-        chart = Chart(
-            split, influence, chart.pivot, chart.age, out.iterations, iterations, chart.charts, chart.singular
-        )
+        split, influence = chart.split, chart.influence
+        out = evaluate(self.system, self.formulation, t, y.q, y.u, split, self.newton_tol)
+        if split.coordinate is None:
+            split = Split(split.velocity, None, lax.stop_gradient(out.factor.correction), _time(t, y))
+        if self.system.velocity_rows:
+            basis = lax.stop_gradient(out.factor.basis)
+            influence = _scaled(basis, self.system.velocity_scale(), split.velocity, self.system.velocity_rank)
+        age, _, newton, charts, singular = chart.counters
+        counters = jnp.stack([age, out.iterations, newton + out.iterations, charts, singular])
         f = State(self.system.rates(t, out.q, out.u), out.udot)
-        return State(out.q, out.u), f, chart, out.failed | chart.singular
+        return State(out.q, out.u), f, Chart(split, influence, counters), out.failed | chart.singular
 
     def free(self, chart):
-        split = chart.split
+        split, system = chart.split, self.system
         return State(
-            jnp.argsort(split.coordinate_columns) >= self.system.coordinate_rank,
-            jnp.argsort(split.velocity_columns) >= self.system.velocity_rank,
+            split.coordinates.column_place >= system.coordinate_rank, split.velocity.column_place >= system.velocity_rank
         )
 
     def update_chart(self, t, y, chart, args):
         system, y, chart = lax.stop_gradient((self.system, y, chart))
-        poor = chart.influence > self.max_influence
-        if not shared(system) and system.coordinate_rank > 0:
-            stale = poor | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
+        influence = chart.influence
+        if chart.split.coordinate is not None and system.coordinate_rank > 0:
+            stale = (influence > self.max_influence) | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
 
             def refresh(chart):
                 solved = coordinate_factor(system, t, y.q, chart.split)
-                split = eqx.tree_at(lambda s: s.correction, chart.split, solved.correction)
-                influence = _scaled(solved.basis, system.coordinate_scale(), split.coordinate_columns, system.coordinate_rank)
-                return split, jnp.maximum(influence, chart.influence), jnp.zeros_like(chart.age)
+                own = _scaled(solved.basis, system.coordinate_scale(), chart.split.coordinates, system.coordinate_rank)
+                split = Split(chart.split.velocity, chart.split.coordinate, solved.correction, _time(t, y))
+                return Chart(split, jnp.maximum(own, chart.influence), chart.counters.at[0].set(0))
 
-            split, influence, age = _any_lane(
-                stale, refresh, lambda chart: (chart.split, chart.influence, chart.age + 1), chart
-            )
-            poor = influence > self.max_influence
-            chart = Chart(
-                split, chart.influence, chart.pivot, age, chart.iterations, chart.newton, chart.charts, chart.singular
-            )
+            keep = lambda chart: Chart(chart.split, chart.influence, chart.counters.at[0].add(1))
+            chart = _any_lane(stale, refresh, keep, chart)
 
         def renew(chart):
-            split, influence, pivot, singular = _choose(system, t, y)
-            zero = jnp.zeros_like(chart.age)
-            return Chart(split, influence, pivot, zero, chart.iterations, chart.newton, chart.charts + 1, singular)
+            split, singular = _choose(system, t, y)
+            counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
+            return Chart(split, jnp.ones_like(chart.influence), counters)
 
-        return _any_lane(poor, renew, lambda chart: chart, chart)
+        return _any_lane(chart.influence > self.max_influence, renew, lambda chart: chart, chart)
 
 
 def _choose(system, t, y):
-    """A chart by full pivoting."""
-    velocity_jacobian = system.jacobian(t, y.q, y.u)
-    velocity = full_pivot(velocity_jacobian, scale=system.velocity_scale(), stage=stages(system))
+    """A chart by full pivoting, and whether the rank is less than it was when the scene was compiled."""
+    velocity = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
     singular = velocity.rank != system.velocity_rank
-    coordinate = velocity
+    coordinate = None
     if not shared(system):
-        coordinate = full_pivot(system.coordinate_jacobian(t, y.q), scale=system.coordinate_scale())
-        singular = singular | (coordinate.rank != system.coordinate_rank)
+        pivots = full_pivot(system.coordinate_jacobian(t, y.q), scale=system.coordinate_scale())
+        singular, coordinate = singular | (pivots.rank != system.coordinate_rank), pivots.order
     empty = jnp.zeros((system.nq, system.coordinate_rows), y.q.dtype)
-    split = Split(coordinate.rows, coordinate.columns, velocity.rows, velocity.columns, empty)
+    split = Split(velocity.order, coordinate, empty, _time(t, y))
     if system.coordinate_rank > 0:
-        correction = coordinate_factor(system, t, y.q, split).correction
-        split = eqx.tree_at(lambda s: s.correction, split, correction)
-    pivot = jnp.minimum(velocity.smallest, coordinate.smallest)
-    return split, jnp.ones((), y.q.dtype), pivot, singular
+        split = Split(split.velocity, coordinate, coordinate_factor(system, t, y.q, split).correction, split.time)
+    return split, singular
 
 
-def _influence(system, solved, split):
-    return _scaled(lax.stop_gradient(solved.basis), system.velocity_scale(), split.velocity_columns, system.velocity_rank)
+def _time(t, y):
+    return lax.stop_gradient(jnp.asarray(t, y.q.dtype))
 
 
-def _scaled(basis, scale, columns, rank):
+def _scaled(basis, scale, order, rank):
     """Largest entry of the influence matrix in units of the coordinates' scales."""
-    return jnp.max(jnp.abs(basis) * scale[columns[rank:]][None, :] / scale[:, None], initial=1.0)
+    return jnp.max(jnp.abs(basis) * scale[order.columns[rank:]][None, :] / scale[:, None], initial=1.0)
 
 
 def _any_lane(pred, true_fn, false_fn, operand):

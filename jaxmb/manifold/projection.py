@@ -32,7 +32,9 @@ class Projection(AbstractManifold):
 
     def prepare(self, system, formulation, solver, rtol):
         if isinstance(solver, Adams):
-            raise ValueError("Projection is for one-step solvers; use manifold=Partition() with Adams, which loses no history.")
+            raise ValueError(
+                "Projection is for one-step solvers; use manifold=Partition() with Adams, which loses no history."
+            )
         return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
 
 
@@ -60,9 +62,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, dense_info, solver_state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, made_jump
-        )
+        y1, error, dense_info, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         direction = getattr(terms, "direction", 1)
         return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
 
@@ -95,7 +95,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
 
 
 def _independent(jacobian: Array, scale: Array, rank: int) -> Any:
-    return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).rows[:rank]
+    return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
 
 
 def _root(residual, gram: Array) -> Array:

@@ -141,7 +141,9 @@ class Prismatic(AbstractConstraint):
 def _resolve_slide(part, space, poses):
     part = point_pair(part, space, poses)
     if (part.axis is None) == (part.axis_a is None):
-        raise ValueError(f"{label(part)}: give axis_a (fixed in {part.body_a!r}) or axis (world), and only one of them.")
+        raise ValueError(
+            f"{label(part)}: give axis_a (fixed in {part.body_a!r}) or axis (world), and only one of them."
+        )
     if part.axis is None:
         axis = unit(part, "axis_a", part.axis_a, 2)
     else:

@@ -4,10 +4,10 @@ from typing import Any
 
 import diffrax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._evaluation import ravel, unravel_like
-from ._history import INDEX, basis_means
+from ._history import basis_means
 
 
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
@@ -23,7 +23,6 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
     y1: PyTree[Array]
     differences: Float[Array, "length n"]
     mesh: Float[Array, " length"]
-    order: Int[Array, ""]
     mismatch: Float[Array, " n"]
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
@@ -38,6 +37,5 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
         end = self.mesh[0]
         elapsed = jnp.asarray(t, end.dtype) - end
         means, _ = basis_means(self.mesh, end, end + elapsed)
-        used = jnp.where(self.order >= INDEX, means, jnp.zeros((), means.dtype)).astype(dtype)
         back = (elapsed / (self.mesh[1] - end)).astype(dtype)
-        return elapsed.astype(dtype) * (used @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch
+        return elapsed.astype(dtype) * (means.astype(dtype) @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch

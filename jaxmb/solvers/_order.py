@@ -14,9 +14,9 @@ from ._history import LENGTH
 # The error that a step aims at, in units of the tolerance.
 _TARGET = 0.2
 # How the step of the order below, and of the order above, counts against that of the present order.
-_LOWER, _UPPER = 0.985, 0.965
+_LOWER, _UPPER = 0.98, 0.95
 # How much of the deviation from the target the next step is to make up for.
-_GAIN = 0.75
+_GAIN = 0.85
 
 
 def _responses() -> np.ndarray:

@@ -187,13 +187,13 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
             tally=solver_state.tally + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, tried_chart, args),
         )
-        dense_info = dict(
-            y1=y1,
-            differences=state.history.differences,
-            mesh=state.history.mesh,
-            order=order,
-            mismatch=predicted + h * last * (f - ahead.partial_sums[order]) - after,
-        )
+        used = (order >= INDEX)[:, None]
+        dense_info = {
+            "y1": y1,
+            "differences": jnp.where(used, state.history.differences, jnp.zeros((), dtype)),
+            "mesh": state.history.mesh,
+            "mismatch": predicted + h * last * (f - ahead.partial_sums[order]) - after,
+        }
         result = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, diffrax.RESULTS.nonlinear_divergence, result)

@@ -62,7 +62,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         dtmin: Any = None,
         dtmax: Any = None,
         force_dtmin: bool = False,
-        safety: Any = 0.9,
+        safety: Any = 0.92,
         factormin: Any = 0.01,
         factormax: Any = 4.0,
     ):

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._parts import AbstractConstraint, number, optional_number
-from .._resolve import label, vector
+from .._parts import AbstractConstraint, optional_number
+from .._resolve import fill, label, vector
 from .._types import Scalar
 from .._user import numbers
 from ..rotations import norm
@@ -31,7 +31,7 @@ class Driver(AbstractConstraint):
         B less that of point A along the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
-    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres.
+    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres: for a coordinate or distance only.
     - `axis_a`, unit, shape (3,), fixed in `body_a`, or `axis` in the world: for an angle only.
     - `x_a`, `x_b`, unit, shape (3,), body-fixed and across the axis, between which an angle is measured; default such
         that it is zero at the given poses.
@@ -43,8 +43,8 @@ class Driver(AbstractConstraint):
     quantity: Quantity = eqx.field(static=True, kw_only=True)
     motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
     parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
+    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
     axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
     axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
     x_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
@@ -55,21 +55,23 @@ class Driver(AbstractConstraint):
     def __check_init__(self):
         if self.quantity not in get_args(Quantity):
             raise ValueError(f"{label(self)}: quantity must be one of {get_args(Quantity)}, got {self.quantity!r}.")
-        if self.quantity != "angle":
-            for field in ("axis_a", "axis", "x_a", "x_b"):
-                if getattr(self, field) is not None:
-                    raise ValueError(f"{label(self)}: {field} belongs to quantity='angle', not to {self.quantity!r}.")
+        turn, length = ("axis_a", "axis", "x_a", "x_b"), ("point_a", "point_b")
+        for field in length if self.quantity == "angle" else turn:
+            if getattr(self, field) is not None:
+                raise ValueError(f"{label(self)}: {field} has no meaning for quantity={self.quantity!r}; leave it out.")
 
     @property
     def bodies(self):
         return (self.body_a, self.body_b)
 
     def resolve(self, space, poses):
-        vector(self, "point_a", self.point_a, 3)
-        vector(self, "point_b", self.point_b, 3)
-        if self.quantity != "angle":
-            return self
-        return resolve_references(resolve_axis(self, space, poses), space, poses)
+        if self.quantity == "angle":
+            return resolve_references(resolve_axis(self, space, poses), space, poses)
+        part = self
+        for field in ("point_a", "point_b"):
+            part = fill(part, field, jnp.zeros(3))
+            vector(part, field, getattr(part, field), 3)
+        return part
 
     def value(self, space, poses):
         """The driven quantity at given poses; an angle in (−π, π]."""

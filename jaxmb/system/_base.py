@@ -67,7 +67,9 @@ class AbstractSystem(eqx.Module):
         """Derivative of `coordinate_residual` with respect to q."""
 
     @abc.abstractmethod
-    def velocity_residual(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "velocity_rows"]:
+    def velocity_residual(
+        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
+    ) -> Float[Array, "velocity_rows"]:
         """`ψ(t, q, u)`."""
 
     @abc.abstractmethod

@@ -99,7 +99,9 @@ class ConstraintGroup(eqx.Module):
 
         return self._map(single, extended_q)
 
-    def velocity(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts rows"]:
+    def velocity(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+    ) -> Float[Array, "parts rows"]:
         """`dΦ/dt`."""
         return self._map(lambda part, poses, v: self._rate(part, t, poses, v), extended_q, extended_u)
 
@@ -138,7 +140,9 @@ class VelocityConstraintGroup(eqx.Module):
     def rows(self) -> int:
         return self.group.rows
 
-    def velocity(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts rows"]:
+    def velocity(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+    ) -> Float[Array, "parts rows"]:
         return self._map(lambda part, poses, v: part.residual(self._space, poses, v, t), extended_q, extended_u)
 
     def jacobian(
@@ -170,7 +174,9 @@ class ForceGroup(eqx.Module):
 
     group: Group
 
-    def wrenches(self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]) -> Float[Array, "parts k v"]:
+    def wrenches(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+    ) -> Float[Array, "parts k v"]:
         single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
         return jax.vmap(single)(self.group.part, self.group.poses(extended_q), self.group.velocities(extended_u))
 

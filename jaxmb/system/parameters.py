@@ -76,5 +76,3 @@ def _accessor(kind: str, group: int, field: str, key: str | None):
         return value if key is None else value[key]
 
     return where
-
-

@@ -1,6 +1,6 @@
 """Rigid bodies joined by constraints and forces: the compiled form of a scene."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,9 @@ from ._base import AbstractSystem
 from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout
+
+if TYPE_CHECKING:
+    from .describe import Description
 
 
 class Ranks(eqx.Module):
@@ -54,6 +57,18 @@ class RigidBodySystem(AbstractSystem):
     gravity_name: str = eqx.field(static=True)
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        return str(self.describe())
+
+    def _repr_html_(self) -> str:
+        return self.describe()._repr_html_()
+
+    def describe(self) -> "Description":
+        """Bodies, joints, rows, degrees of freedom, redundant rows by name, and what was left out; as text and as HTML."""
+        from .describe import describe
+
+        return describe(self)
 
     # Sizes
 

@@ -1,0 +1,18 @@
+"""Figures, with matplotlib imported when one is made."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """An empty figure of a size in inches, without a window or any global state.
+
+    **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('Figures need matplotlib; install it with: pip install "jaxmb[plot]"') from error
+    return Figure(figsize=(width, height), layout="constrained")

@@ -1,0 +1,59 @@
+"""A library of mechanisms with their sources and reference values; `names()` lists them, `get(name)` builds one."""
+
+from typing import Any
+
+from .._names import unknown
+from ._base import Mechanism as Mechanism, References as References
+from .andrews import andrews as andrews
+from .bricard import bricard as bricard
+from .car_axis import car_axis as car_axis
+from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
+from .four_bar import four_bar as four_bar
+from .free_body import free_body as free_body
+from .heavy_top import heavy_top as heavy_top
+from .knife_edge import knife_edge as knife_edge
+from .parallelogram import parallelogram as parallelogram
+from .pendulum import pendulum as pendulum
+from .rod_chain import rod_chain as rod_chain
+from .rolling_disk import rolling_disk as rolling_disk
+from .slider_crank import slider_crank as slider_crank
+from .spatial_loop import spatial_loop as spatial_loop
+from .spatial_slider_crank import spatial_slider_crank as spatial_slider_crank
+
+_LIBRARY = {
+    function.__name__: function
+    for function in (
+        pendulum,
+        rod_chain,
+        four_bar,
+        slider_crank,
+        parallelogram,
+        andrews,
+        car_axis,
+        knife_edge,
+        chaplygin_sleigh,
+        free_body,
+        heavy_top,
+        spatial_slider_crank,
+        spatial_loop,
+        bricard,
+        rolling_disk,
+    )
+}
+
+
+def names() -> tuple[str, ...]:
+    """The names of all mechanisms, planar ones first."""
+    return tuple(_LIBRARY)
+
+
+def get(name: str, **parameters: Any) -> Mechanism:
+    """Build a mechanism by name.
+
+    **Arguments:** `name`, one of `names()`; `parameters` of that mechanism, by keyword.
+
+    **Raises:** `ValueError` for an unknown name, with the nearest one, and for an unknown parameter.
+    """
+    if name not in _LIBRARY:
+        raise unknown("mechanism", name, names())
+    return _LIBRARY[name](**parameters)

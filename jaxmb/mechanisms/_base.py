@@ -1,0 +1,168 @@
+"""What a mechanism of the library is: a system with a consistent state, and values to compare its motion with."""
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from .._types import Scalar, State
+from ..assembly import assemble
+from ..system import RigidBodySystem, with_parameters
+from ..trajectory import Trajectory
+
+Observation = dict[str, Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class References:
+    """Values of a motion that do not come from this package.
+
+    **Fields:**
+
+    - `times` [s]: when, ascending, shape (times,).
+    - `labels`: what, as in `Mechanism.observe`.
+    - `values`: shape (times, labels), in SI units.
+    - `source`: where they come from.
+    - `tolerance`: the relative error up to which the values themselves can be trusted.
+    """
+
+    times: np.ndarray
+    labels: tuple[str, ...]
+    values: np.ndarray
+    source: str
+    tolerance: float
+
+    def __post_init__(self):
+        object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
+        object.__setattr__(self, "values", np.asarray(self.values, dtype=float))
+        if self.values.shape != (len(self.times), len(self.labels)):
+            raise ValueError(
+                f"References need a value for each of {len(self.times)} times and {len(self.labels)} labels, "
+                f"got shape {self.values.shape}."
+            )
+
+    @property
+    def scales(self) -> np.ndarray:
+        """The size that errors of each label are relative to: its largest value, 1 where that is zero; shape (labels,)."""
+        largest = np.max(np.abs(self.values), axis=0)
+        return np.where(largest > 1e-12, largest, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """A mechanism of the library, ready to run: `simulate(m.system, m.state, t1=m.t1)`.
+
+    **Fields:**
+
+    - `name`: as in `names()`.
+    - `system`, `state`: the compiled scene, and a consistent state of it at t = 0.
+    - `t1`: the end of the motion that it is known for [s].
+    - `references`: values to compare with, or None where there are none (other parameters than the published ones).
+    - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the references.
+    - `description`: what it is and where its data come from.
+    - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
+    """
+
+    name: str
+    system: RigidBodySystem
+    state: State
+    t1: float
+    references: References | None
+    observe: Callable[[Trajectory], Observation]
+    description: str
+    fix: Mapping[str, ArrayLike] = dataclasses.field(default_factory=dict)
+    rates: Mapping[str, ArrayLike] = dataclasses.field(default_factory=dict)
+
+    def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
+        """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
+
+        Errors are relative to the largest reference value of their label.
+
+        **Raises:** `ValueError` if there are no references, or none of their times was saved.
+        """
+        if self.references is None:
+            raise ValueError(f"There are no reference values for {self.name!r} with these parameters.")
+        times, saved = self.references.times, np.asarray(trajectory.ts)
+        near = np.isclose(saved[None, :], times[:, None], rtol=0.0, atol=1e-12 * max(1.0, float(times[-1])))
+        own, where = np.nonzero(near)
+        if own.size == 0:
+            raise ValueError(
+                f"The trajectory of {self.name!r} was saved at none of the reference times {times.tolist()}; "
+                "use simulate(..., saveat=mechanism.references.times)."
+            )
+        observed = self.observe(trajectory)
+        return {
+            label: np.abs(np.asarray(observed[label])[where] - self.references.values[own, k]) / scale
+            for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
+        }
+
+    def with_parameters(self, values: Mapping[str, ArrayLike]) -> "Mechanism":
+        """The same mechanism with some parameters replaced, assembled again near its present state; also under `jit`.
+
+        **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
+        """
+        system = with_parameters(self.system, values)
+        state = assemble(system, self.state, fix=self.fix, rates=self.rates)
+        return dataclasses.replace(self, system=system, state=state, references=None)
+
+
+def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mechanism]], Callable[..., Mechanism]]:
+    """Make a function a member of the library: its references hold for the default values of its parameters only.
+
+    **Arguments:** `variants`: parameters for whose values the function itself chooses the references.
+    """
+
+    def decorate(function: Callable[..., Mechanism]) -> Callable[..., Mechanism]:
+        defaults = {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
+
+        @functools.wraps(function)
+        def build(**parameters: Any) -> Mechanism:
+            made = function(**parameters)
+            published = all(name in variants or _same(value, defaults[name]) for name, value in parameters.items())
+            return made if published else dataclasses.replace(made, references=None)
+
+        return build
+
+    return decorate
+
+
+def _same(value: Any, default: Any) -> bool:
+    if isinstance(value, jax.core.Tracer):
+        return False
+    return value is default or (default is not None and value is not None and np.array_equal(value, default))
+
+
+def point_motion(trajectory: Trajectory, body: str, s: ArrayLike) -> tuple[Array, Array]:
+    """Position [m] and velocity [m/s] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
+    system = trajectory.system
+    space, k = system.layout.space, system.body_names.index(body)
+    s = jnp.asarray(s, float)
+
+    def at(y):
+        pose, velocity = system.poses(y.q)[k], system.velocities(y.u)[k]
+        return space.point(pose, s), space.point_velocity(pose, velocity, s)
+
+    return jax.vmap(at)(trajectory.ys)
+
+
+def build(
+    name: str,
+    system: RigidBodySystem,
+    *,
+    t1: Scalar,
+    observe: Callable[[Trajectory], Observation],
+    description: str,
+    references: References | None = None,
+    fix: Mapping[str, ArrayLike] | None = None,
+    rates: Mapping[str, ArrayLike] | None = None,
+) -> Mechanism:
+    """Assemble a compiled scene into a mechanism."""
+    fix, rates = fix or {}, rates or {}
+    state = assemble(system, fix=fix, rates=rates)
+    return Mechanism(name, system, state, float(t1), references, observe, description, fix, rates)

@@ -1,0 +1,59 @@
+"""Chaplygin's sleigh."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .. import planar
+from ..scene import Scene
+from ._base import Mechanism, References, build, mechanism, point_motion
+
+
+@mechanism()
+def chaplygin_sleigh(
+    *, mass: float = 2.0, inertia: float = 0.5, distance: float = 0.3, speed: float = 1.0, spin: float = 2.0
+) -> Mechanism:
+    """A sleigh on a horizontal plane with one blade behind its mass centre: it straightens out although nothing dissipates.
+
+    Source: S. A. Chaplygin, "On the theory of motion of nonholonomic systems. The reducing-multiplier theorem", Mat. Sb. 28(2),
+    1911. The reference values are the closed form `v = V tanh(kt + c)`, `ω = V/√J sech(kt + c)`, `k = aV/J`, `J = (I + m a²)/m`.
+
+    **Arguments:** `mass` m [kg]; `inertia` I [kg m²] about the mass centre; `distance` a [m] from the blade forward to the mass
+    centre; `speed` [m/s] of the blade and `spin` [rad/s] at the start, with the blade in the origin, along x.
+
+    **Labels:** `x_blade`, `y_blade` [m]; `theta` [rad], heading from x; `v` [m/s] of the blade, forward; `omega` [rad/s].
+    """
+    sleigh = planar.Body("sleigh", mass=mass, inertia=inertia, position=(distance, 0.0))
+    blade = planar.KnifeEdge("blade", "sleigh", point=(-distance, 0.0))
+    return build(
+        "chaplygin_sleigh",
+        Scene([sleigh], joints=[blade]).compile(),
+        t1=4.0,
+        observe=lambda trajectory: _observe(trajectory, distance),
+        description="Chaplygin's sleigh: a rigid body on one blade, which straightens out.",
+        references=_REFERENCES,
+        rates={"sleigh.x": speed, "sleigh.angle": spin},
+    )
+
+
+def _observe(trajectory, distance):
+    sleigh = trajectory["sleigh"]
+    blade, _ = point_motion(trajectory, "sleigh", (-distance, 0.0))
+    c, s = jnp.cos(sleigh.angle), jnp.sin(sleigh.angle)
+    return {
+        "x_blade": blade[:, 0],
+        "y_blade": blade[:, 1],
+        "theta": sleigh.angle,
+        "v": c * sleigh.velocity[:, 0] + s * sleigh.velocity[:, 1],
+        "omega": sleigh.angular_velocity,
+    }
+
+
+_REFERENCES = References(
+ times=np.array([1.0, 2.0, 4.0]),
+ labels=("x_blade", "y_blade", "theta", "v", "omega"),
+ values=np.array([[0.9093525070921825, 0.8720776074197882, 1.2166719092853335, 1.4936479581580446, 0.6160017596668536],
+[1.130389915267493, 2.3702508629920396, 1.5565902538314427, 1.5333616448320357, 0.16089881875405923],
+[0.9350308158619882, 5.434025117781834, 1.66746769015489, 1.536216468103753, 0.010705019003067275]]),
+ source="closed form",
+ tolerance=1e-14,
+)

@@ -1,0 +1,64 @@
+"""Lagrange's heavy symmetric top."""
+
+import numpy as np
+
+from .. import rotations, spatial
+from .._forces import Gravity
+from ..scene import Scene
+from ._base import Mechanism, References, build, mechanism
+
+
+@mechanism()
+def heavy_top(
+    *,
+    mass: float = 1.0,
+    distance: float = 0.1,
+    inertia: tuple[float, float] = (0.002, 0.001),
+    tilt: float = np.pi / 6,
+    precession: float = 2.0,
+    spin: float = 60.0,
+    gravity: float = 9.81,
+) -> Mechanism:
+    """A symmetric top whose tip is held in the origin by a ball joint; z up.
+
+    Its axis is `e₃ = (sin ψ sin θ, −cos ψ sin θ, cos θ)`, θ the tilt from the vertical and ψ the precession angle. The reference
+    values are Lagrange's solution in elliptic functions.
+
+    **Arguments:** `mass` [kg]; `distance` [m] from the tip to the mass centre; `inertia` [kg m²] about the mass centre, across and
+    along the axis, shape (2,); `tilt` θ [rad], `precession` dψ/dt [rad/s] and `spin` ω₃ [rad/s] about its own axis at the start, with
+    dθ/dt = 0; `gravity` [m/s²].
+
+    **Labels:** `xc`, `yc`, `zc` [m], the mass centre; `e0` … `e3`, Euler parameters from the body frame, whose third axis is
+    that of the top; `w1`, `w2`, `w3` [rad/s], angular velocity in the body frame.
+    """
+    across, along = inertia
+    p = np.asarray(rotations.from_axis_angle((1.0, 0.0, 0.0), tilt))
+    position = distance * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    top = spatial.Body("top", mass=mass, inertia=(across, across, along), position=position, orientation=p)
+    tip = spatial.Spherical("tip", "ground", "top", point_a=(0.0, 0.0, 0.0), point_b=(0.0, 0.0, -distance))
+    return build(
+        "heavy_top",
+        Scene([top], joints=[tip], forces=[Gravity((0.0, 0.0, -gravity))]).compile(),
+        t1=2.0,
+        observe=_observe,
+        description="Lagrange's heavy symmetric top on a fixed tip.",
+        references=_REFERENCES,
+        rates={"top.angular_velocity": (0.0, precession * np.sin(tilt), spin)},
+    )
+
+
+def _observe(trajectory):
+    top = trajectory["top"]
+    observed = {f"{axis}c": top.position[:, k] for k, axis in enumerate("xyz")}
+    observed |= {f"e{k}": top.orientation[:, k] for k in range(4)}
+    return observed | {f"w{k + 1}": top.angular_velocity[:, k] for k in range(3)}
+
+
+_REFERENCES = References(
+ times=np.array([0.5, 2.0]),
+ labels=("xc", "yc", "zc", "e0", "e1", "e2", "e3", "w1", "w2", "w3"),
+ values=np.array([[-0.040884508258957404, 0.06373918308369278, 0.06531288941890977, 0.2519318784595748, 0.11890694786646458, -0.3991198950873447, -0.8735529610220429, -5.63396586860976, 2.0166824019112495, 60.0],
+[-0.021352675758547383, -0.06766491374445817, 0.07046646497381133, 0.22520335879728975, 0.20154143866834934, 0.32718301244171494, -0.8953299794240533, -4.7369786466465476, 2.2234020301755724, 60.0]]),
+ source="Lagrange's solution in elliptic functions, checked by a quaternion solution in extended precision",
+ tolerance=1e-13,
+)

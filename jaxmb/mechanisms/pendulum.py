@@ -1,0 +1,65 @@
+"""The planar pendulum."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .. import planar
+from .._forces import Gravity
+from ..scene import Scene
+from ._base import Mechanism, References, build, mechanism
+
+_SOURCE = (
+    "Problem A01 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics "
+    "(https://www.iftomm-multibody.org/benchmark)"
+)
+
+
+@mechanism()
+def pendulum(
+    *, mass: float = 1.0, length: float = 1.0, angle: float = -np.pi / 2, rate: float = 0.0, gravity: float = 9.81
+) -> Mechanism:
+    """A point mass on a massless bar, released at the side; x to the right, y up, the pivot in the origin.
+
+    Source: problem A01 of the IFToMM Library of Computational Benchmark Problems (1 kg, 1 m, released at (−1, 0)). The reference
+    values are Jacobi's elliptic functions in 22 digits.
+
+    **Arguments:** `mass` [kg]; `length` [m]; `angle` [rad] from the downward vertical, counter-clockwise, and its `rate` [rad/s], at
+    the start; `gravity` [m/s²].
+
+    **Labels:** `x`, `y` [m], `vx`, `vy` [m/s] of the mass.
+    """
+    along = np.array([np.sin(angle), -np.cos(angle)])
+    bob = planar.PointMass("bob", mass=mass, position=length * along)
+    bar = planar.Distance("bar", "ground", "bob", length=length)
+    scene = Scene([bob], joints=[bar], forces=[Gravity((0.0, -gravity))])
+    return build(
+        "pendulum",
+        scene.compile(),
+        t1=9.99,
+        observe=_observe,
+        description=f"Planar pendulum: a point mass on a massless bar. {_SOURCE}.",
+        references=_REFERENCES,
+        rates={"bob.velocity": length * rate * jnp.array([-along[1], along[0]])},
+    )
+
+
+def _observe(trajectory):
+    bob = trajectory["bob"]
+    return {
+        "x": bob.position[:, 0],
+        "y": bob.position[:, 1],
+        "vx": bob.velocity[:, 0],
+        "vy": bob.velocity[:, 1],
+    }
+
+
+_REFERENCES = References(
+ times=np.array([1.0, 5.0, 9.99, 10.0]),
+ labels=("x", "y", "vx", "vy"),
+ values=np.array([[0.9862917511318753, -0.16501085312554117, 0.2969055159163158, 1.7746436411126556],
+[-0.9423054350437573, -0.3347543384140006, 0.8579042568859491, -2.4149286543704886],
+[-0.3164364699130314, -0.9486137045757768, 4.0924519914940225, -1.365151120240301],
+[-0.2750874625761169, -0.961419205099125, 4.175598100951729, -1.1947490545604753]]),
+ source="Jacobi's elliptic functions, checked by extrapolation in extended precision; problem: IFToMM A01",
+ tolerance=1e-15,
+)

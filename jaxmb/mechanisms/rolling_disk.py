@@ -1,0 +1,91 @@
+"""A disk that rolls without slipping."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import rotations, spatial
+from .._forces import Gravity
+from ..scene import Scene
+from ._base import Mechanism, References, build, mechanism
+
+
+@mechanism()
+def rolling_disk(
+    *,
+    mass: float = 1.0,
+    radius: float = 0.3,
+    lean: float = 0.4,
+    roll: float | None = None,
+    turn: float = -2.0,
+    pitch: float = 0.0,
+    gravity: float = 9.81,
+) -> Mechanism:
+    """A thin uniform disk that rolls on a horizontal plane without slipping; z up. By default it runs in a circle, leaning steadily.
+
+    With the heading ψ and the lean θ from upright, `e₁ = (cos ψ, sin ψ, 0)` is the heading, `e₂ = (−sin ψ cos θ, cos ψ cos θ,
+    sin θ)` the axle and `e₃ = e₁ × e₂` points from the contact to the centre; ω₁, ω₂, ω₃ are the components of the angular velocity
+    along them. Steady motion needs `m g r sin θ + (C + m r²) ω₂ ω₃ = A ω₃² tan θ`.
+
+    Source: E. J. Routh, "Advanced Dynamics of a System of Rigid Bodies", 1905, §244. The reference values are those of the steady
+    circle, in closed form.
+
+    **Arguments:** `mass` [kg]; `radius` [m]; `lean` θ [rad] at the start, with ψ = 0; `roll` ω₂ [rad/s], default that of steady
+    motion; `turn` ω₃ [rad/s]; `pitch` ω₁ [rad/s], the rate of the lean; `gravity` [m/s²].
+
+    **Labels:** `xc`, `yc` [m], the centre, from (0, 0); `theta` [rad]; `cos_psi`, `sin_psi`; `w1`, `w2`, `w3` [rad/s].
+    """
+    A, C = mass * radius**2 / 4, mass * radius**2 / 2
+    if roll is None:
+        if turn * lean == 0:
+            raise ValueError("rolling_disk: straight rolling is steady at any roll; give roll [rad/s].")
+        roll = (A * turn**2 * np.tan(lean) - mass * gravity * radius * np.sin(lean)) / ((C + mass * radius**2) * turn)
+    disk = spatial.Body(
+        "disk",
+        mass=mass,
+        inertia=spatial.disc(mass, radius, "y"),
+        position=(0.0, 0.0, radius * np.cos(lean)),
+        orientation=rotations.from_axis_angle((1.0, 0.0, 0.0), lean),
+    )
+    plane = spatial.RollingDisk("plane", "disk", radius=radius, axis=(0.0, 1.0, 0.0))
+    return build(
+        "rolling_disk",
+        Scene([disk], joints=[plane], forces=[Gravity((0.0, 0.0, -gravity))]).compile(),
+        t1=4.0,
+        observe=_observe,
+        description="A thin disk that rolls on a plane without slipping, in a steady circle.",
+        references=_REFERENCES,
+        rates={"disk.angular_velocity": (pitch, roll, turn)},
+    )
+
+
+def _observe(trajectory):
+    disk = trajectory["disk"]
+    axle = jax.vmap(lambda p: rotations.rotate(p, jnp.array([0.0, 1.0, 0.0])))(disk.orientation)
+    omega_W = jax.vmap(rotations.rotate)(disk.orientation, disk.angular_velocity)
+    level = jnp.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
+    cos, sin = axle[:, 1] / level, -axle[:, 0] / level
+    e1 = jnp.stack([cos, sin, jnp.zeros_like(cos)], axis=1)
+    e3 = jnp.cross(e1, axle)
+    along = lambda e: jnp.sum(e * omega_W, axis=1)
+    return {
+        "xc": disk.position[:, 0],
+        "yc": disk.position[:, 1],
+        "theta": jnp.arctan2(axle[:, 2], level),
+        "cos_psi": cos,
+        "sin_psi": sin,
+        "w1": along(e1),
+        "w2": along(axle),
+        "w3": along(e3),
+    }
+
+
+_REFERENCES = References(
+ times=np.array([1.0, 2.0, 4.0]),
+ labels=("xc", "yc", "theta", "cos_psi", "sin_psi", "w1", "w2", "w3"),
+ values=np.array([[0.46774244528083975, -0.8873882907863094, 0.4, -0.565147910239229, -0.82498959966307, 0.0, 4.1037288582515705, -2.0],
+[-0.528687330961307, -0.7717653053553305, 0.4, -0.36121567910446395, 0.9324822964373645, 0.0, 4.1037288582515705, -2.0],
+[0.38194030657423056, -0.985983152944281, 0.4, -0.7390464663382018, -0.6736544519210254, 0.0, 4.10372885825157, -2.0]]),
+ source="the steady circle in closed form",
+ tolerance=1e-14,
+)

@@ -1,0 +1,259 @@
+"""Everything diffrax offers works with the multistep solver: saving, events, jumps, batches, backward time, pytrees."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from jaxmb.solvers import Adams, MultistepController
+
+CONTROLLER = MultistepController(1e-8, 1e-8)
+
+
+def _oscillator(t, y, omega):
+    return {"x": y["v"], "v": -(omega**2) * y["x"]}
+
+
+def _exact(t, omega=1.0):
+    return {"x": jnp.cos(omega * t), "v": -omega * jnp.sin(omega * t)}
+
+
+def _solve(t0=0.0, t1=4.0, *, y0=None, omega=1.0, vector_field=_oscillator, controller=CONTROLLER, dt0=None, **kwargs):
+    y0 = _exact(jnp.asarray(t0)) if y0 is None else y0
+    term = diffrax.ODETerm(vector_field)
+    return diffrax.diffeqsolve(term, Adams(), t0, t1, dt0, y0, omega, stepsize_controller=controller, **kwargs)
+
+
+def _assert_close(a, b, atol=2e-7):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol, rtol=0), a, b)
+
+
+def test_every_form_of_saving():
+    ts = jnp.linspace(0.0, 4.0, 9)
+    subs = {
+        "ends": diffrax.SubSaveAt(t0=True, t1=True),
+        "ts": diffrax.SubSaveAt(ts=ts),
+        "steps": diffrax.SubSaveAt(steps=3, fn=lambda t, y, args: y["x"]),
+    }
+    saveat = diffrax.SaveAt(subs=subs, dense=True, solver_state=True, controller_state=True, made_jump=True)
+    solution = _solve(saveat=saveat, max_steps=256)
+    np.testing.assert_allclose(solution.ts["ends"], [0.0, 4.0])
+    _assert_close(solution.ys["ts"], _exact(ts))
+    saved = np.isfinite(solution.ts["steps"])
+    assert saved.sum() == solution.stats["num_accepted_steps"] // 3
+    _assert_close(solution.ys["steps"][saved], jnp.cos(solution.ts["steps"][saved]))
+    _assert_close(jax.vmap(solution.evaluate)(ts), _exact(ts))
+    assert solution.made_jump is False or not solution.made_jump
+
+
+def test_backward_in_time():
+    ts = jnp.linspace(4.0, 0.0, 9)
+    solution = _solve(4.0, 0.0, saveat=diffrax.SaveAt(ts=ts, dense=True), max_steps=256)
+    _assert_close(solution.ys, _exact(ts))
+    _assert_close(jax.vmap(solution.evaluate)(ts), _exact(ts))
+    vector_field = lambda t, y, args: 2 * t + 0 * y
+    solution = _solve(3.0, 1.0, y0=jnp.array(9.0), vector_field=vector_field)
+    np.testing.assert_allclose(solution.ys, [1.0], atol=1e-9)
+
+
+def test_backward_mirrors_forward():
+    mirrored = lambda t, y, omega: jax.tree.map(jnp.negative, _oscillator(-t, y, omega))
+    forward = _solve(0.0, 4.0, saveat=diffrax.SaveAt(steps=True), max_steps=128)
+    backward = _solve(0.0, -4.0, vector_field=mirrored, saveat=diffrax.SaveAt(steps=True), max_steps=128)
+    n = int(forward.stats["num_accepted_steps"])
+    np.testing.assert_allclose(forward.ts[:n], -backward.ts[:n], atol=1e-12)
+    _assert_close(jax.tree.map(lambda x: x[:n], forward.ys), jax.tree.map(lambda x: x[:n], backward.ys), atol=1e-12)
+
+
+def test_event_is_located():
+    event = diffrax.Event(lambda t, y, args, **kwargs: y["x"], optx.Newton(1e-12, 1e-12))
+    solution = _solve(event=event)
+    assert solution.result == diffrax.RESULTS.event_occurred
+    np.testing.assert_allclose(solution.ts, [np.pi / 2], atol=1e-7)
+
+    def time_of_event(omega):
+        return _solve(omega=omega, event=event, y0={"x": jnp.array(1.0), "v": jnp.array(0.0)}).ts[0]
+
+    np.testing.assert_allclose(jax.grad(time_of_event)(jnp.array(1.0)), -np.pi / 2, atol=1e-5)
+
+
+def test_batch_equals_loop():
+    omegas = jnp.array([0.5, 1.0, 7.0, 20.0])
+
+    def run(omega):
+        solution = _solve(omega=omega, dt0=0.5, saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 4.0, 5), solver_state=True))
+        return solution.ys, solution.stats["num_rejected_steps"], solution.solver_state.tally
+
+    batch = jax.jit(jax.vmap(run))(omegas)
+    single = jax.jit(run)
+    loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(omega) for omega in omegas])
+    assert np.all(batch[1] > 0) and len(set(np.sum(batch[2], axis=1).tolist())) > 1
+    np.testing.assert_array_equal(batch[1], loop[1])
+    np.testing.assert_array_equal(batch[2], loop[2])
+    _assert_close(batch[0], loop[0], atol=1e-12)
+
+
+def test_jit_changes_nothing():
+    with jax.disable_jit(False):
+        inside = jax.jit(lambda: _solve().ys)()
+    _assert_close(inside, _solve().ys, atol=1e-13)
+
+
+def test_continuation_repeats_the_unbroken_solve():
+    """With solver and controller state a solve in two parts has no second start."""
+    keep = diffrax.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)
+    first = _solve(0.0, 2.0, saveat=keep)
+    y = jax.tree.map(lambda x: x[-1], first.ys)
+    second = _solve(
+        2.0, 4.0, y0=y, saveat=keep, solver_state=first.solver_state, controller_state=first.controller_state, dt0=0.02
+    )
+    _assert_close(jax.tree.map(lambda x: x[-1], second.ys), _exact(4.0))
+    assert second.solver_state.tally[0] == 1
+    whole = _solve(0.0, 4.0, saveat=keep)
+    assert second.solver_state.tally.sum() < whole.solver_state.tally.sum() + 10
+    jumped = _solve(2.0, 4.0, y0=y, saveat=keep, solver_state=first.solver_state, made_jump=True)
+    _assert_close(jax.tree.map(lambda x: x[-1], jumped.ys), _exact(4.0))
+    assert jumped.solver_state.tally[0] == 2
+
+
+def test_single_precision_and_mixed_leaves():
+    y0 = {"x": jnp.array([1.0], jnp.float32), "v": jnp.zeros((1, 1), jnp.float32)}
+    vector_field = lambda t, y, args: {"x": y["v"][0], "v": -y["x"][None]}
+    solution = _solve(
+        jnp.float32(0), jnp.float32(4), y0=y0, vector_field=vector_field, controller=MultistepController(1e-4, 1e-4)
+    )
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(solution.ys))
+    np.testing.assert_allclose(solution.ys["x"][0, 0], np.cos(4.0), atol=2e-3)
+
+    mixed = {"x": jnp.array([1.0], jnp.float32), "v": jnp.zeros((1, 1), jnp.float64)}
+    vector_field = lambda t, y, args: {
+        "x": y["v"][0].astype(jnp.float32),
+        "v": -y["x"][None].astype(jnp.float64),
+    }
+    solution = _solve(
+        jnp.float32(0), jnp.float32(4), y0=mixed, vector_field=vector_field, controller=MultistepController(1e-4, 1e-4)
+    )
+    assert solution.ys["x"].dtype == jnp.float32 and solution.ys["v"].dtype == jnp.float64
+    np.testing.assert_allclose(solution.ys["x"][0, 0], np.cos(4.0), atol=2e-3)
+
+
+def _pulse(t, y, args):
+    return jnp.where(t < 1.0, -y, -y + 3.0 * jnp.cos(t))
+
+
+def _steps(solution):
+    n = int(solution.stats["num_accepted_steps"])
+    return np.diff(np.asarray(solution.ts[:n]))
+
+
+def test_restart_after_a_jump_repeats_an_opening():
+    y1, steps = jnp.array([2.0]), diffrax.SaveAt(steps=True, solver_state=True)
+    jumping = diffrax.ClipStepSizeController(CONTROLLER, jump_ts=jnp.array([1.0]))
+    whole = _solve(0.0, 3.0, y0=y1, vector_field=_pulse, controller=jumping, saveat=steps, max_steps=256)
+    at_jump = int(np.argmin(np.abs(np.asarray(whole.ts) - 1.0)))
+    after = float(whole.ts[at_jump])
+    assert whole.solver_state.tally[0] == 2
+    # The same, started after the jump with the first step that the restart settled for.
+    t0 = jnp.nextafter(jnp.nextafter(after, 2.0), 2.0)
+    first = whole.ts[at_jump + 1] - t0
+    fresh = _solve(
+        t0,
+        3.0,
+        y0=whole.ys[at_jump],
+        dt0=first,
+        vector_field=_pulse,
+        controller=CONTROLLER,
+        saveat=steps,
+        max_steps=256,
+    )
+    n = int(fresh.stats["num_accepted_steps"])
+    np.testing.assert_allclose(whole.ts[at_jump + 1 : at_jump + 1 + n], fresh.ts[:n], rtol=1e-12)
+    np.testing.assert_allclose(whole.ys[at_jump + 1 : at_jump + 1 + n], fresh.ys[:n], rtol=1e-12)
+
+
+def test_jumps_in_a_batch_and_their_cost():
+    def run(when):
+        vector_field = lambda t, y, args: jnp.where(t < when, -y, -y + 3.0)
+        controller = diffrax.ClipStepSizeController(CONTROLLER, jump_ts=when[None])
+        solution = _solve(0.0, 3.0, y0=jnp.array([2.0]), vector_field=vector_field, controller=controller)
+        return solution.ys[-1, 0], solution.stats["num_rejected_steps"]
+
+    whens = jnp.array([0.7, 1.9])
+    exact = 3.0 + (2.0 * jnp.exp(-whens) - 3.0) * jnp.exp(-(3.0 - whens))
+    ys, rejected = jax.jit(jax.vmap(run))(whens)
+    np.testing.assert_allclose(ys, exact, atol=1e-6)
+    assert np.all(rejected < 10)
+
+
+def test_unannounced_jump_is_found():
+    solution = _solve(0.0, 3.0, y0=jnp.array([2.0]), vector_field=_pulse)
+    a = 2.0 * np.exp(-1.0)
+    forced = lambda t: 1.5 * (np.cos(t) + np.sin(t))
+    np.testing.assert_allclose(solution.ys[-1], [forced(3.0) + (a - forced(1.0)) * np.exp(-2.0)], atol=1e-6)
+    assert solution.stats["num_rejected_steps"] < 40
+
+
+def test_stepping_to_times_costs_little():
+    stops = jnp.linspace(0.05, 3.95, 40)
+    controller = diffrax.ClipStepSizeController(MultistepController(1e-6, 1e-6), step_ts=stops)
+    solution = _solve(controller=controller, saveat=diffrax.SaveAt(steps=True), max_steps=512)
+    n = int(solution.stats["num_accepted_steps"])
+    assert all(np.min(np.abs(np.asarray(solution.ts[:n]) - stop)) == 0 for stop in stops)
+    assert solution.stats["num_rejected_steps"] < 20
+    _assert_close(jax.tree.map(lambda x: x[n - 1], solution.ys), _exact(4.0), atol=1e-4)
+
+
+def test_step_after_a_short_one_recovers():
+    stops = jnp.array([2.0, 2.0 + 1e-5])
+    saveat = diffrax.SaveAt(steps=True)
+    plain = _solve(saveat=saveat, max_steps=512)
+    controller = diffrax.ClipStepSizeController(CONTROLLER, step_ts=stops)
+    clipped = _solve(controller=controller, saveat=saveat, max_steps=512)
+    assert clipped.stats["num_steps"] < plain.stats["num_steps"] + 12
+    n = int(clipped.stats["num_accepted_steps"])
+    _assert_close(jax.tree.map(lambda x: x[n - 1], clipped.ys), _exact(4.0))
+
+
+def test_constant_steps():
+    solver = Adams(rtol=1e-8, atol=1e-8)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(_oscillator), solver, 0.0, 4.0, 0.01, _exact(0.0), 1.0, saveat=diffrax.SaveAt(solver_state=True)
+    )
+    assert solution.solver_state.order > 2
+
+
+def test_maximum_number_of_steps():
+    solution = _solve(max_steps=20, throw=False)
+    assert solution.result == diffrax.RESULTS.max_steps_reached
+
+
+def test_evaluations_are_counted():
+    calls = []
+
+    def vector_field(t, y, args):
+        jax.debug.callback(lambda: calls.append(1))
+        return -y + jnp.sin(t)
+
+    solution = _solve(
+        0.0,
+        3.0,
+        y0=jnp.array([1.0]),
+        vector_field=vector_field,
+        dt0=0.3,
+        saveat=diffrax.SaveAt(t1=True, solver_state=True),
+    )
+    jax.effects_barrier()
+    assert solution.stats["num_rejected_steps"] > 0
+    tally = solution.solver_state.tally
+    assert tally[1:].sum() == solution.stats["num_accepted_steps"]
+    assert len(calls) == tally[0] + 2 * solution.stats["num_steps"]
+
+
+def test_plain_terms_trace_no_manifold():
+    jaxpr = str(jax.make_jaxpr(lambda: _solve(adjoint=diffrax.ForwardMode()).ys)())
+    state = eqx.filter_eval_shape(lambda: _solve(saveat=diffrax.SaveAt(solver_state=True))).solver_state
+    assert state.chart is None
+    # Without jumps, events and charts nothing is left to branch on within a step.
+    assert "cond[" not in jaxpr.split("while[")[1].split("body_jaxpr")[0]
