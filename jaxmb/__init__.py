@@ -3,14 +3,18 @@
 from . import (
     formulations as formulations,
     manifold as manifold,
+    mechanisms as mechanisms,
     planar as planar,
+    report as report,
     solvers as solvers,
     spatial as spatial,
+    viz as viz,
 )
 from ._forces import Gravity as Gravity
 from ._types import State as State
 from ._user import Constraint as Constraint, Force as Force, VelocityConstraint as VelocityConstraint
 from .assembly import assemble as assemble
+from .identify import Identification as Identification, identify as identify
 from .scene import Scene as Scene
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from ._results import RESULTS as RESULTS

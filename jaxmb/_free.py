@@ -65,7 +65,7 @@ class Interval(AbstractRange):
 
 
 class PositiveDefinite(AbstractRange):
-    """Symmetric positive definite matrices: `C T Tᵀ Cᵀ` with `C Cᵀ = start` and `T` lower triangular, `exp z` on its diagonal."""
+    """Positive definite matrices: `C T Tᵀ Cᵀ` with `C Cᵀ = start`, `T` lower triangular, `exp z` on its diagonal."""
 
     start: Array
 
@@ -110,11 +110,12 @@ def free_parameters(
 ) -> FreeParameters:
     """Free parameters with their starting values and ranges.
 
-    **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`: `(low, high)` by
-    name, either of them None. Masses and moments of inertia stay positive, and inertia matrices positive definite, without
-    being told.
+    **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
+    `(low, high)` by name, either of them None. Masses and moments of inertia stay positive, and inertia matrices
+    positive definite, without being told.
 
-    **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their bounds.
+    **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
+    bounds.
     """
     known = parameters(system)
     if isinstance(free, str):
@@ -162,7 +163,9 @@ def _range(name: str, start: Any, own: Array, bounds: Bounds | None) -> Abstract
 def _bound(name: str, value: Array, bound: ArrayLike | None, empty: float) -> Array:
     bound = np.asarray(empty if bound is None else bound, dtype=value.dtype)
     if bound.shape not in ((), value.shape):
-        raise ValueError(f"Bounds of {name!r} have shape {bound.shape}; give numbers, or arrays of shape {value.shape}.")
+        raise ValueError(
+            f"Bounds of {name!r} have shape {bound.shape}; give numbers, or arrays of shape {value.shape}."
+        )
     if not (np.all(np.isfinite(bound)) or np.all(bound == empty)):
         raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
     return jnp.broadcast_to(jnp.asarray(bound), value.shape)

@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._types import Scalar, State
 from .elimination import full_pivot
+from .rotations import normalize
 from .system import AbstractSystem, RigidBodySystem
 from .system.coordinates import coordinate_names, prescribe, rate_names
 
@@ -58,7 +59,8 @@ def assemble(
     if concrete:
         _check_finite(q, "coordinates"), _check_finite(u, "rates")
 
-    q, ok = positions(system, t, q, tuple(fixed.tolist()))
+    q, whole = _normalize_fixed(system, q, fixed)
+    q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if concrete and throw and not bool(ok):
         raise ValueError(_cannot_assemble(system, t, q, fixed, coordinate_names(system)))
     u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
@@ -75,9 +77,12 @@ def assemble(
 
 @eqx.filter_jit
 def positions(
-    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...]
+    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...], rank: int
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
-    """The configuration nearest to the guess with some coordinates held; and whether every residual is at rounding level."""
+    """The configuration nearest to the guess with some coordinates held; and whether every residual is at rounding level.
+
+    `rank`: of the rows in the columns that are not held.
+    """
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
@@ -88,7 +93,6 @@ def positions(
     q, ok = lax.stop_gradient(q), residual_size(frozen, t, q) <= tolerance(q.dtype)
 
     # The minimiser, exactly: Newton on the optimality conditions with the independent rows.
-    rank = system.coordinate_rank
     jacobian = frozen.coordinate_jacobian(t, q)
     pivots = full_pivot(jacobian, scale=scale)
     ok = ok & (pivots.rank == rank)
@@ -113,7 +117,7 @@ def positions(
     solution = optx.root_find(
         optimality,
         optx.Newton(rtol=1e-10, atol=1e-10),
-        (q, multipliers),
+        (jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)),
         (system, t, guess),
         max_steps=16,
         throw=False,
@@ -193,6 +197,14 @@ def residual_size(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> F
 def tolerance(dtype) -> float:
     """What counts as zero for a scaled residual: 1e-10 in double precision."""
     return float(jnp.finfo(dtype).eps) ** 0.64
+
+
+def _normalize_fixed(system, q, fixed):
+    """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of those."""
+    whole = [row[3:] for row in system.layout.pose_index[:-1] if system.spatial and row[-1] < system.nq and fixed[row[3:]].all()]
+    for index in whole:
+        q = q.at[index].set(normalize(q[index]))
+    return q, len(whole)
 
 
 def _check_finite(vector, what):

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float
 
 from ._free import Bounds, FreeParameters, free_parameters
+from ._least_squares import LeastSquares, levenberg_marquardt
 from ._names import unknown
 from ._results import RESULTS
 from ._types import Scalar, State
@@ -23,8 +23,8 @@ from .simulate import simulate
 from .system import RigidBodySystem, with_parameters
 from .trajectory import Trajectory
 
-# Residuals of a simulation that failed, as a multiple of the largest measured value: worse than any that did not fail.
-_FAILED = 1e3
+# A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
+_NO_EFFECT = 1e-10
 
 # Directions of parameters that the residuals feel less than this, relative to the strongest one, are not determined.
 _UNDETERMINED = 1e-6
@@ -41,9 +41,9 @@ class Identification:
     **Fields:**
 
     - `parameters`: estimates by name; `start`: where they started from.
-    - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution. Without `sigma`
-        the noise is estimated from the residuals. Infinite for parameters that the data do not determine, NaN where there are
-        no more residuals than parameters and no `sigma`.
+    - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
+        Without `sigma` the noise is estimated from the residuals. Infinite for parameters that the data do not
+        determine, NaN where there are no more residuals than parameters and no `sigma`.
     - `covariance`: of all components, in the order of `components`, the names of all scalar components.
     - `undetermined`: names of components that may change together, or alone, without changing the residuals.
     - `residuals`: weighted, at the solution; `rms`: their root mean square.
@@ -102,35 +102,37 @@ def identify(
     **Arguments:**
 
     - `system`: a compiled scene.
-    - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position": (times, 2)}`.
-        Names are those of `Trajectory[body]` (`position`, `velocity`, `angle`, `orientation`, `angular_velocity`) and of its
-        reactions (`"A.force"`, `"A.moment"`). NaN marks a sample that is missing. Angles are compared without wrapping.
+    - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
+        (times, 2)}`. Names are those of `Trajectory[body]` (`position`, `velocity`, `angle`, `orientation`,
+        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). NaN marks a sample that is missing. Angles
+        are compared without wrapping.
     - `ts`: times [s], shape (times,), increasing, from `t0` on.
-    - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the system's
-        values.
+    - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
+        system's values.
 
     **The initial state**, at `t0`, is found anew for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints whatever the free parameters is therefore kept as it is.
 
     **Other arguments:**
 
-    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without it every
-        quantity is weighted by its own range, and the noise is estimated from the residuals.
-    - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Masses and moments of inertia stay
-        positive, and inertia matrices positive definite, without being told. Unbounded parameters are scaled by their start.
+    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
+        it every quantity is weighted by its own range, and the noise is estimated from the residuals.
+    - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Masses and moments of inertia
+        stay positive, and inertia matrices positive definite, without being told. Unbounded parameters are scaled by
+        their start.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
-    - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an optax
-        optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
-    - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: relative change of parameters and residuals, or size of an
-        optax step, at which to stop.
+    - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
+        optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
+    - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: change of the residuals' root mean square,
+        absolute and relative, or size of an optax step, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
 
-    A simulation that fails at some value of the parameters counts as a very bad fit, not as an error.
+    A trial at which the mechanism cannot be assembled or the simulation fails is rejected, and a smaller step is tried.
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, and if the simulation with the
-    starting values fails or a free parameter has no effect on the residuals there.
+    **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, and if the simulation with
+    the starting values fails or a free parameter has no effect on the residuals there.
     """
     names = free_parameters(system, free, bounds)
     ts = _times(ts, t0)
@@ -153,8 +155,7 @@ def identify(
     kind = "lm" if method == "lm" else "optax"
     limit = _ITERATIONS[kind] if max_iterations is None else max_iterations
     solve = _levenberg_marquardt if isinstance(method, str) else lambda *args: _descend(method, *args)
-    z, iterations, success = solve(problem, start, tol, limit)
-    return _summary(problem, z, iterations, success, known_noise=sigma is not None or residual is not None)
+    return _summary(problem, solve(problem, start, tol, limit), known_noise=sigma is not None or residual is not None)
 
 
 class _Measured(eqx.Module):
@@ -172,17 +173,17 @@ class _Measured(eqx.Module):
         return jnp.concatenate(out)
 
     @property
-    def failed(self) -> Array:
-        """What every residual is where the simulation fails."""
+    def size(self) -> Array:
+        """The size of what is measured, weighted."""
         largest = [jnp.max(jnp.abs(self.values[name] * self.weights[name])) for name in self.values]
-        return _FAILED * (1 + jnp.max(jnp.stack(largest)))
+        return 1 + jnp.max(jnp.stack(largest))
 
 
 class _Residual(eqx.Module):
     """Residuals of the user."""
 
     fn: Callable[[Trajectory], Array]
-    failed: Array
+    size: Array
 
     def __call__(self, trajectory: Trajectory) -> Float[Array, "residuals"]:
         return jnp.asarray(self.fn(trajectory)).reshape(-1)
@@ -218,7 +219,7 @@ class _Problem(eqx.Module):
         trajectory = self.simulate(z, adjoint)
         residuals = self.fit(trajectory)
         ok = (trajectory.result == RESULTS.successful) & jnp.all(jnp.isfinite(residuals))
-        return jnp.where(ok, residuals, self.fit.failed), trajectory.result
+        return jnp.where(ok, residuals, jnp.inf), trajectory.result
 
 
 def _quantity(trajectory: Trajectory, name: str) -> Array:
@@ -268,7 +269,7 @@ def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
     if measured is None:
         if sigma is not None:
             raise ValueError("sigma belongs to measured quantities; a residual function does its own weighting.")
-        return _Residual(residual, jnp.asarray(_FAILED**2, ts.dtype))
+        return _Residual(residual, jnp.ones((), ts.dtype))
     if not measured:
         raise ValueError("measured is empty: give at least one quantity by name.")
     known = _quantities(system, ts.shape[0])
@@ -279,7 +280,9 @@ def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
     for name, data in measured.items():
         data = np.asarray(data, dtype=ts.dtype)
         if data.shape != known[name]:
-            raise ValueError(f"Measured {name!r} must have shape {known[name]} for {ts.shape[0]} times, got {data.shape}.")
+            raise ValueError(
+                f"Measured {name!r} must have shape {known[name]} for {ts.shape[0]} times, got {data.shape}."
+            )
         there = np.isfinite(data)
         if not there.any():
             raise ValueError(f"Measured {name!r} holds no number.")
@@ -322,32 +325,24 @@ def _linearised(problem: _Problem, z: Float[Array, "n"]):
 def _check_start(problem: _Problem, z: Float[Array, "n"]) -> None:
     residuals, jacobian, result = _linearised(problem, z)
     if not bool(result == RESULTS.successful):
-        raise ValueError(f"The simulation fails with the starting values: {RESULTS[result]}")
-    if bool(jnp.all(residuals == problem.fit.failed)):
+        text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
+        raise ValueError(f"The simulation fails with the starting values: {text}")
+    if not bool(jnp.all(jnp.isfinite(residuals))):
         raise ValueError("The residuals are not finite with the starting values.")
-    ahead = np.asarray(jnp.max(jnp.abs(jacobian), axis=0))
+    ahead = np.asarray(jnp.max(jnp.abs(jacobian), axis=0) / problem.fit.size)
     position = 0
     for name, r in zip(problem.free.names, problem.free.ranges, strict=True):
-        if not np.any(ahead[position : position + r.size] > 0):
+        if not np.any(ahead[position : position + r.size] > _NO_EFFECT):
             raise ValueError(f"{name!r} has no effect on what was measured; leave it out of free, or measure more.")
         position += r.size
 
 
-@eqx.filter_jit
-def _least_squares(problem: _Problem, z: Float[Array, "n"], tol: float, limit: int):
-    return optx.least_squares(
-        lambda z, _: problem.residuals(z, diffrax.ForwardMode())[0],
-        optx.LevenbergMarquardt(rtol=tol, atol=tol),
-        z,
-        options=dict(jac="fwd"),
-        max_steps=limit,
-        throw=False,
-    )
+def _levenberg_marquardt(problem: _Problem, z: Float[Array, "n"], tol: float, limit: int) -> LeastSquares:
+    def linearise(z):
+        residuals, jacobian, _ = _linearised(problem, jnp.asarray(z))
+        return np.asarray(residuals), np.asarray(jacobian)
 
-
-def _levenberg_marquardt(problem: _Problem, z: Float[Array, "n"], tol: float, limit: int):
-    solution = _least_squares(problem, z, tol, limit)
-    return solution.value, int(solution.stats["num_steps"]), bool(solution.result == optx.RESULTS.successful)
+    return levenberg_marquardt(linearise, np.asarray(z), tol=tol, limit=limit, cut=_UNDETERMINED)
 
 
 @eqx.filter_jit
@@ -357,14 +352,16 @@ def _descent_step(problem: _Problem, optimiser: optax.GradientTransformation, z:
         return 0.5 * jnp.mean(residuals**2)
 
     value, gradient = jax.value_and_grad(loss)(z)
-    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient)) & (value < 0.5 * problem.fit.failed**2)
+    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
     with jax.numpy_dtype_promotion("standard"):
         update = optax.with_extra_args_support(optimiser).update
         step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=loss)
     return value, finite, jnp.asarray(step, z.dtype), memory
 
 
-def _descend(optimiser: optax.GradientTransformation, problem: _Problem, z: Float[Array, "n"], tol: float, limit: int):
+def _descend(
+    optimiser: optax.GradientTransformation, problem: _Problem, z: Float[Array, "n"], tol: float, limit: int
+) -> LeastSquares:
     """Steps of an optimiser; where the simulation fails, half the step is tried instead."""
     memory = optimiser.init(z)
     best, best_value, good = z, np.inf, z
@@ -377,11 +374,12 @@ def _descend(optimiser: optax.GradientTransformation, problem: _Problem, z: Floa
             best, best_value = z, float(value)
         good, memory, z = z, ahead, z + step
         if float(jnp.max(jnp.abs(step))) <= tol:
-            return best, iteration + 1, True
-    return best, limit, False
+            return LeastSquares(np.asarray(best), iteration + 1, True)
+    return LeastSquares(np.asarray(best), limit, False)
 
 
-def _summary(problem: _Problem, z, iterations: int, success: bool, *, known_noise: bool) -> Identification:
+def _summary(problem: _Problem, solution: LeastSquares, *, known_noise: bool) -> Identification:
+    z = jnp.asarray(solution.z)
     residuals, jacobian, _ = (np.asarray(x) if eqx.is_array(x) else x for x in _linearised(problem, z))
     free = problem.free
     values = {name: np.asarray(value) for name, value in free(z).items()}
@@ -403,7 +401,9 @@ def _summary(problem: _Problem, z, iterations: int, success: bool, *, known_nois
     covariance[lost, lost] = np.inf
     undetermined = tuple(np.array(components)[lost].tolist())
 
-    message = "converged" if success else "the iteration did not converge; try another start, or more iterations"
+    message = (
+        "converged" if solution.success else "the iteration did not converge; try another start, or more iterations"
+    )
     if undetermined:
         message += f"; the data do not determine {', '.join(undetermined)} separately"
     system, state = problem.initial(z)
@@ -415,8 +415,8 @@ def _summary(problem: _Problem, z, iterations: int, success: bool, *, known_nois
         components=components,
         undetermined=undetermined,
         residuals=residuals,
-        iterations=iterations,
-        success=success,
+        iterations=solution.iterations,
+        success=solution.success,
         message=message,
         system=system,
         state=state,

@@ -9,7 +9,39 @@ Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+
+# Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would make a
+# kernel of every slice and every stack of components.
+
+
+def _tables():
+    epsilon = np.zeros((3, 3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        epsilon[i, j, k], epsilon[i, k, j] = 1.0, -1.0
+    product = np.zeros((4, 4, 4))  # (a b)_i = product[i, j, k] a_j b_k
+    product[0, 0, 0] = 1.0
+    product[0, 1:, 1:] = -np.eye(3)
+    product[1:, 0, 1:] = product[1:, 1:, 0] = np.eye(3)
+    product[1:, 1:, 1:] = epsilon
+    conjugate = np.array([1.0, -1.0, -1.0, -1.0])
+    # R v is the vector part of p v p*.
+    rotation = np.einsum("iam,akj,m->ijkm", product[1:], product[:, :, 1:], conjugate)
+    return epsilon, product, conjugate, rotation, 0.5 * product[:, :, 1:]
+
+
+_CROSS, _MULTIPLY, _CONJUGATE, _ROTATION, _RATES = _tables()
+
+
+def _constant(table: np.ndarray, like: Array) -> Array:
+    return jnp.asarray(table, like.dtype)
+
+
+def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
+    return jnp.sum(_constant(table, a) * (a[:, None] * b[None, :])[None], axis=(1, 2))
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
@@ -33,46 +65,45 @@ def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array,
 
 def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Matrix from body to world components, `(e0² − e·e) I + 2 e eᵀ + 2 e0 ẽ`."""
-    return jnp.stack([rotate(p, axis) for axis in jnp.eye(3, dtype=p.dtype)], axis=-1)
+    return jnp.sum(_constant(_ROTATION, p) * (p[:, None] * p[None, :])[None, None], axis=(2, 3))
 
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """World components of the body vector `v`."""
-    e0, e = p[0], p[1:]
-    return (e0 * e0 - jnp.dot(e, e)) * v + 2.0 * jnp.dot(e, v) * e + 2.0 * e0 * cross(e, v)
+    return jnp.sum(rotation_matrix(p) * v[None, :], axis=1)
 
 
 def unrotate(p: Float[Array, "4"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
     """Body components of the world vector `v_W`."""
-    return rotate(conjugate(p), v_W)
+    return jnp.sum(rotation_matrix(p) * v_W[:, None], axis=0)
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     """Vector product."""
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return _bilinear(_CROSS, a, b)
 
 
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:
     """Euler parameters of the inverse rotation."""
-    return jnp.concatenate([p[:1], -p[1:]])
+    return p * _constant(_CONJUGATE, p)
 
 
 def multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """Euler parameters of rotation `b` followed, in the world, by rotation `a`: R(a b) = R(a) R(b)."""
-    scalar = a[0] * b[0] - jnp.dot(a[1:], b[1:])
-    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
+    return _bilinear(_MULTIPLY, a, b)
 
 
 def rates(p: Float[Array, "4"], omega: Float[Array, "3"]) -> Float[Array, "4"]:
     """`ṗ = ½ Lᵀ ω′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
-    e0, e = p[0], p[1:]
-    return 0.5 * jnp.concatenate([-jnp.dot(e, omega)[None], e0 * omega + cross(e, omega)])
+    return _bilinear(_RATES, p, omega)
 
 
 def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array, "3"]:
-    """`½ L g`: the body torque that does the work of the gradient `g` with respect to Euler parameters (adjoint of `rates`)."""
-    e0, e = p[0], p[1:]
-    return 0.5 * (e0 * gradient[1:] - gradient[0] * e - cross(e, gradient[1:]))
+    """`½ L g`: the body torque that does the work of the gradient `g` with respect to Euler parameters.
+
+    This is the adjoint of `rates`.
+    """
+    return _bilinear(_RATES.transpose(2, 1, 0), p, gradient)
 
 
 def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Array, "3"]:

@@ -100,7 +100,8 @@ def _restore_positions(system, t, q, split, tol):
         step = split.correction @ system.coordinate_residual(t, q)
         size = jnp.max(jnp.abs(step) / scale)
         # Corrections shrink by a constant factor, so the next one is known: no iteration is spent on verifying it.
-        return q - step, size, size * jnp.minimum(size / before, 1.0), k + 1
+        rate = jnp.where(size < before, size / before, 1.0)
+        return q - step, size, size * rate, k + 1
 
     def proceed(carry):
         _, size, ahead, k = carry

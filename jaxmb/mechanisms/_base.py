@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike
 
 from .._types import Scalar, State
 from ..assembly import assemble
+from ..scene import Scene
 from ..system import RigidBodySystem, with_parameters
 from ..trajectory import Trajectory
 
@@ -61,6 +62,7 @@ class Mechanism:
     **Fields:**
 
     - `name`: as in `names()`.
+    - `scene`: its parts, to build on: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`.
     - `system`, `state`: the compiled scene, and a consistent state of it at t = 0.
     - `t1`: the end of the motion that it is known for [s].
     - `references`: values to compare with, or None where there are none (other parameters than the published ones).
@@ -70,6 +72,7 @@ class Mechanism:
     """
 
     name: str
+    scene: Scene
     system: RigidBodySystem
     state: State
     t1: float
@@ -153,7 +156,7 @@ def point_motion(trajectory: Trajectory, body: str, s: ArrayLike) -> tuple[Array
 
 def build(
     name: str,
-    system: RigidBodySystem,
+    scene: Scene,
     *,
     t1: Scalar,
     observe: Callable[[Trajectory], Observation],
@@ -162,7 +165,8 @@ def build(
     fix: Mapping[str, ArrayLike] | None = None,
     rates: Mapping[str, ArrayLike] | None = None,
 ) -> Mechanism:
-    """Assemble a compiled scene into a mechanism."""
+    """Compile and assemble a scene into a mechanism."""
     fix, rates = fix or {}, rates or {}
+    system = scene.compile()
     state = assemble(system, fix=fix, rates=rates)
-    return Mechanism(name, system, state, float(t1), references, observe, description, fix, rates)
+    return Mechanism(name, scene, system, state, float(t1), references, observe, description, fix, rates)

@@ -5,7 +5,7 @@ import numpy as np
 from .. import planar
 from .._forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from ._base import Mechanism, build, mechanism
 
 
 @mechanism()
@@ -51,7 +51,7 @@ def four_bar(
     ]
     return build(
         "four_bar",
-        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]).compile(),
+        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]),
         t1=10.0,
         observe=_observe,
         description="Planar four-bar linkage of uniform bars under gravity, crank started at 4 rad/s.",

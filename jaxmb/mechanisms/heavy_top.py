@@ -38,7 +38,7 @@ def heavy_top(
     tip = spatial.Spherical("tip", "ground", "top", point_a=(0.0, 0.0, 0.0), point_b=(0.0, 0.0, -distance))
     return build(
         "heavy_top",
-        Scene([top], joints=[tip], forces=[Gravity((0.0, 0.0, -gravity))]).compile(),
+        Scene([top], joints=[tip], forces=[Gravity((0.0, 0.0, -gravity))]),
         t1=2.0,
         observe=_observe,
         description="Lagrange's heavy symmetric top on a fixed tip.",
@@ -55,10 +55,36 @@ def _observe(trajectory):
 
 
 _REFERENCES = References(
- times=np.array([0.5, 2.0]),
- labels=("xc", "yc", "zc", "e0", "e1", "e2", "e3", "w1", "w2", "w3"),
- values=np.array([[-0.040884508258957404, 0.06373918308369278, 0.06531288941890977, 0.2519318784595748, 0.11890694786646458, -0.3991198950873447, -0.8735529610220429, -5.63396586860976, 2.0166824019112495, 60.0],
-[-0.021352675758547383, -0.06766491374445817, 0.07046646497381133, 0.22520335879728975, 0.20154143866834934, 0.32718301244171494, -0.8953299794240533, -4.7369786466465476, 2.2234020301755724, 60.0]]),
- source="Lagrange's solution in elliptic functions, checked by a quaternion solution in extended precision",
- tolerance=1e-13,
+    times=np.array([0.5, 2.0]),
+    labels=("xc", "yc", "zc", "e0", "e1", "e2", "e3", "w1", "w2", "w3"),
+    values=np.array(
+        [
+            [
+                -0.040884508258957404,
+                0.06373918308369278,
+                0.06531288941890977,
+                0.2519318784595748,
+                0.11890694786646458,
+                -0.3991198950873447,
+                -0.8735529610220429,
+                -5.63396586860976,
+                2.0166824019112495,
+                60.0,
+            ],
+            [
+                -0.021352675758547383,
+                -0.06766491374445817,
+                0.07046646497381133,
+                0.22520335879728975,
+                0.20154143866834934,
+                0.32718301244171494,
+                -0.8953299794240533,
+                -4.7369786466465476,
+                2.2234020301755724,
+                60.0,
+            ],
+        ]
+    ),
+    source="Lagrange's solution in elliptic functions, checked by a quaternion solution in extended precision",
+    tolerance=1e-13,
 )

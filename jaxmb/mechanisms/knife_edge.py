@@ -33,7 +33,7 @@ def knife_edge(
     blade = planar.KnifeEdge("blade", "skate")
     return build(
         "knife_edge",
-        Scene([skate], joints=[blade], forces=[Gravity((gravity * np.sin(incline), 0.0))]).compile(),
+        Scene([skate], joints=[blade], forces=[Gravity((gravity * np.sin(incline), 0.0))]),
         t1=5.0,
         observe=_observe,
         description="A knife edge on an incline, which drifts sideways on a cycloid.",
@@ -54,11 +54,15 @@ def _observe(trajectory):
 
 
 _REFERENCES = References(
- times=np.array([1.0, 2.0, 5.0]),
- labels=("x", "y", "phi", "v"),
- values=np.array([[0.5069451225210011, 1.458257264967837, 2.0, 2.2300519392899845],
-[0.3511673541144531, 2.1491998625195197, 4.0, -1.8560581197426942],
-[0.18145984292533202, 5.851375221573812, 10.0, -1.3342117744561794]]),
- source="the cycloid in closed form",
- tolerance=1e-14,
+    times=np.array([1.0, 2.0, 5.0]),
+    labels=("x", "y", "phi", "v"),
+    values=np.array(
+        [
+            [0.5069451225210011, 1.458257264967837, 2.0, 2.2300519392899845],
+            [0.3511673541144531, 2.1491998625195197, 4.0, -1.8560581197426942],
+            [0.18145984292533202, 5.851375221573812, 10.0, -1.3342117744561794],
+        ]
+    ),
+    source="the cycloid in closed form",
+    tolerance=1e-14,
 )

@@ -34,7 +34,9 @@ def parallelogram(
         raise ValueError(f"parallelogram needs at least 2 rockers, got {rockers}.")
     along = rocker * np.array([np.cos(angle), np.sin(angle)])
     width = spacing * (rockers - 1)
-    bodies = [planar.Body("coupler", mass=masses[1], inertia=planar.rod(masses[1], width), position=along + (width / 2, 0))]
+    bodies = [
+        planar.Body("coupler", mass=masses[1], inertia=planar.rod(masses[1], width), position=along + (width / 2, 0))
+    ]
     joints = []
     for k in range(rockers):
         name, x = f"rocker{k + 1}", spacing * k
@@ -54,7 +56,7 @@ def parallelogram(
         ]
     return build(
         "parallelogram",
-        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]).compile(),
+        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]),
         t1=2.0,
         observe=_observe,
         description="Parallel rockers under a coupler, redundant beyond the second.",

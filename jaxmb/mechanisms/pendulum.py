@@ -1,6 +1,5 @@
 """The planar pendulum."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
@@ -29,17 +28,17 @@ def pendulum(
     **Labels:** `x`, `y` [m], `vx`, `vy` [m/s] of the mass.
     """
     along = np.array([np.sin(angle), -np.cos(angle)])
-    bob = planar.PointMass("bob", mass=mass, position=length * along)
+    across = np.array([-along[1], along[0]])
+    bob = planar.PointMass("bob", mass=mass, position=length * along, velocity=length * rate * across)
     bar = planar.Distance("bar", "ground", "bob", length=length)
     scene = Scene([bob], joints=[bar], forces=[Gravity((0.0, -gravity))])
     return build(
         "pendulum",
-        scene.compile(),
+        scene,
         t1=9.99,
         observe=_observe,
         description=f"Planar pendulum: a point mass on a massless bar. {_SOURCE}.",
         references=_REFERENCES,
-        rates={"bob.velocity": length * rate * jnp.array([-along[1], along[0]])},
     )
 
 
@@ -54,12 +53,16 @@ def _observe(trajectory):
 
 
 _REFERENCES = References(
- times=np.array([1.0, 5.0, 9.99, 10.0]),
- labels=("x", "y", "vx", "vy"),
- values=np.array([[0.9862917511318753, -0.16501085312554117, 0.2969055159163158, 1.7746436411126556],
-[-0.9423054350437573, -0.3347543384140006, 0.8579042568859491, -2.4149286543704886],
-[-0.3164364699130314, -0.9486137045757768, 4.0924519914940225, -1.365151120240301],
-[-0.2750874625761169, -0.961419205099125, 4.175598100951729, -1.1947490545604753]]),
- source="Jacobi's elliptic functions, checked by extrapolation in extended precision; problem: IFToMM A01",
- tolerance=1e-15,
+    times=np.array([1.0, 5.0, 9.99, 10.0]),
+    labels=("x", "y", "vx", "vy"),
+    values=np.array(
+        [
+            [0.9862917511318753, -0.16501085312554117, 0.2969055159163158, 1.7746436411126556],
+            [-0.9423054350437573, -0.3347543384140006, 0.8579042568859491, -2.4149286543704886],
+            [-0.3164364699130314, -0.9486137045757768, 4.0924519914940225, -1.365151120240301],
+            [-0.2750874625761169, -0.961419205099125, 4.175598100951729, -1.1947490545604753],
+        ]
+    ),
+    source="Jacobi's elliptic functions, checked by extrapolation in extended precision; problem: IFToMM A01",
+    tolerance=1e-15,
 )

@@ -50,7 +50,7 @@ def rolling_disk(
     plane = spatial.RollingDisk("plane", "disk", radius=radius, axis=(0.0, 1.0, 0.0))
     return build(
         "rolling_disk",
-        Scene([disk], joints=[plane], forces=[Gravity((0.0, 0.0, -gravity))]).compile(),
+        Scene([disk], joints=[plane], forces=[Gravity((0.0, 0.0, -gravity))]),
         t1=4.0,
         observe=_observe,
         description="A thin disk that rolls on a plane without slipping, in a steady circle.",
@@ -81,11 +81,42 @@ def _observe(trajectory):
 
 
 _REFERENCES = References(
- times=np.array([1.0, 2.0, 4.0]),
- labels=("xc", "yc", "theta", "cos_psi", "sin_psi", "w1", "w2", "w3"),
- values=np.array([[0.46774244528083975, -0.8873882907863094, 0.4, -0.565147910239229, -0.82498959966307, 0.0, 4.1037288582515705, -2.0],
-[-0.528687330961307, -0.7717653053553305, 0.4, -0.36121567910446395, 0.9324822964373645, 0.0, 4.1037288582515705, -2.0],
-[0.38194030657423056, -0.985983152944281, 0.4, -0.7390464663382018, -0.6736544519210254, 0.0, 4.10372885825157, -2.0]]),
- source="the steady circle in closed form",
- tolerance=1e-14,
+    times=np.array([1.0, 2.0, 4.0]),
+    labels=("xc", "yc", "theta", "cos_psi", "sin_psi", "w1", "w2", "w3"),
+    values=np.array(
+        [
+            [
+                0.46774244528083975,
+                -0.8873882907863094,
+                0.4,
+                -0.565147910239229,
+                -0.82498959966307,
+                0.0,
+                4.1037288582515705,
+                -2.0,
+            ],
+            [
+                -0.528687330961307,
+                -0.7717653053553305,
+                0.4,
+                -0.36121567910446395,
+                0.9324822964373645,
+                0.0,
+                4.1037288582515705,
+                -2.0,
+            ],
+            [
+                0.38194030657423056,
+                -0.985983152944281,
+                0.4,
+                -0.7390464663382018,
+                -0.6736544519210254,
+                0.0,
+                4.10372885825157,
+                -2.0,
+            ],
+        ]
+    ),
+    source="the steady circle in closed form",
+    tolerance=1e-14,
 )

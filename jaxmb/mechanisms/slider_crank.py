@@ -5,7 +5,7 @@ import numpy as np
 from .. import planar
 from .._forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from ._base import Mechanism, build, mechanism
 
 
 @mechanism()
@@ -50,7 +50,7 @@ def slider_crank(
     ]
     return build(
         "slider_crank",
-        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]).compile(),
+        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]),
         t1=0.2,
         observe=_observe,
         description="Planar slider-crank, spun up to 150 rad/s and left alone.",

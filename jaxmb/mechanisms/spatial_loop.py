@@ -65,7 +65,7 @@ def spatial_loop(
     ]
     return build(
         "spatial_loop",
-        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity, 0.0))]).compile(),
+        Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity, 0.0))]),
         t1=10.0,
         observe=lambda trajectory: _observe(trajectory, crank, rocker),
         description="Planar four-bar linkage of spatial hinges, with three redundant rows.",

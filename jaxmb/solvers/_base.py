@@ -34,9 +34,9 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
         The free components of `y` are kept; the others are a first guess and are solved for.
 
-        **Returns:** `(y on the manifold, f, chart, failed)`. The returned chart has the same index sets and may carry what
-        makes the next evaluation cheaper (a matrix factor) and counters. `failed` is true where the state could not be
-        restored; the step is then retried with a smaller step.
+        **Returns:** `(y on the manifold, f, chart, failed)`. The returned chart has the same index sets and may carry
+        what makes the next evaluation cheaper (a matrix factor) and counters. `failed` is true where the state could
+        not be restored; the step is then retried with a smaller one.
         """
 
     @abc.abstractmethod
@@ -45,4 +45,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def update_chart(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
-        """Keep the chart or choose a better one at a state on the manifold. Its result only counts if the step is accepted."""
+        """Keep the chart or choose a better one at a state on the manifold.
+
+        Its result only counts if the step that led there is accepted. It is also asked before a restart after a jump.
+        """

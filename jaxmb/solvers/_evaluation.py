@@ -25,8 +25,8 @@ class Evaluation(NamedTuple):
     failed: Any
 
 
-def check_problem(term: Any, y: PyTree[Array]) -> None:
-    """Raise a `ValueError` unless this is a real ordinary differential equation."""
+def check_term(term: Any) -> None:
+    """Raise a `ValueError` unless `term` is an ordinary differential equation."""
     while isinstance(term, (WrapTerm, AdjointTerm)):
         term = term.term
     if not isinstance(term, (diffrax.ODETerm, AbstractManifoldTerm)):
@@ -35,6 +35,10 @@ def check_problem(term: Any, y: PyTree[Array]) -> None:
             f"`{type(term).__name__}`. Several vector fields can be added up in one `ODETerm`; a `ControlTerm` with a "
             f"differentiable control becomes one by `.to_ode()`."
         )
+
+
+def check_real(y: PyTree[Array]) -> None:
+    """Raise a `ValueError` if a state has complex components."""
     if any(jnp.iscomplexobj(leaf) for leaf in jax.tree.leaves(y)):
         raise ValueError("Multistep methods take real states: split complex ones into real and imaginary parts.")
 
@@ -72,7 +76,10 @@ def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: A
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
-    """Restore a state to the manifold, if there is one, and evaluate the vector field; `like` has the structure of `y`."""
+    """Restore a state to the manifold, if there is one, and evaluate the vector field.
+
+    `like` has the structure of the state before raveling.
+    """
     y = unravel_like(like, flat)
     manifold = _manifold(term)
     if manifold is None:

@@ -5,9 +5,9 @@ derivatives is
 
     P(t) = sum_i differences[i] * basis_i(t),    basis_i(t) = prod_{j<i} (t - t_{n-j}) / (t_n - t_{n-j-1}),
 
-where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by. All
-entries have the units of `f`, so nothing over- or underflows however small the steps are, and moving on by one step needs
-only `basis_i` at the new mesh point: there are no loops over the order.
+where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by.
+All entries have the units of `f`, so nothing over- or underflows however small the steps are, and moving on by one step
+needs only `basis_i` at the new mesh point: there are no loops over the order.
 """
 
 from typing import Any
@@ -34,7 +34,7 @@ class History(eqx.Module):
 
     **Fields:**
 
-    - `differences`: scaled divided differences, one row each, of the raveled derivative; rows from `points` on are zero.
+    - `differences`: scaled divided differences of the raveled derivative, one row each; zero from row `points` on.
     - `mesh`: `t_n, t_{n-1}, ...`, latest first. Entries from `points` on are placeholders that keep the spans nonzero.
     - `points`: how many mesh points have been visited since the start (or the last restart), at most `LENGTH`.
     """
@@ -61,6 +61,7 @@ class Extrapolation(eqx.Module):
 
 def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
     """A history of one point."""
+    spacing = jnp.where(spacing > 0, spacing, jnp.ones_like(spacing))
     mesh = t - spacing * INDEX.astype(jnp.result_type(t))
     differences = jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
     return History(differences, mesh, jnp.asarray(1, jnp.int32))
@@ -80,6 +81,16 @@ def basis_means(
     dtype = mesh.dtype
     table = basis(mesh, a + (b - a) * jnp.asarray(np.append(_NODES, 1.0), dtype))
     return jnp.sum(table * jnp.asarray(np.append(_WEIGHTS, 0.0)[None], dtype), axis=1), table[:, -1]
+
+
+def step_end(history: History, t: Any) -> Any:
+    """`t`, or some later time where the step has no length.
+
+    Such steps are made, and thrown away, by members of a batch that are done before the others. Without a length they
+    would divide by zero, and spoil reverse-mode derivatives.
+    """
+    latest, previous = history.mesh[0], history.mesh[1]
+    return jnp.where(t > latest, t, latest + (latest - previous))
 
 
 def extrapolate(history: History, t: Any) -> Extrapolation:

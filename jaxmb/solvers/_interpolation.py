@@ -13,8 +13,8 @@ from ._history import basis_means
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
     """The integral of the polynomial through the derivative at the end of a step and at `order` mesh points before it.
 
-    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the step
-    began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
+    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the
+    step began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
     differentiable from step to step, and its derivative at mesh points is the vector field.
     """
 
@@ -38,4 +38,6 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
         elapsed = jnp.asarray(t, end.dtype) - end
         means, _ = basis_means(self.mesh, end, end + elapsed)
         back = (elapsed / (self.mesh[1] - end)).astype(dtype)
-        return elapsed.astype(dtype) * (means.astype(dtype) @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch
+        return (
+            elapsed.astype(dtype) * (means.astype(dtype) @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch
+        )

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Int
 
 from ._history import LENGTH
 
-# The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's orbit.
-# They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
+# The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
+# orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
 #
 # The error that a step aims at, in units of the tolerance.
 _TARGET = 0.2
@@ -20,8 +20,8 @@ _GAIN = 0.85
 
 
 def _responses() -> np.ndarray:
-    # The local error of order k falls with the power k + 1 of the steps if all of them change, but if only the last one does,
-    # with the power 1 + sum_{m<=k} 1/m: that of the spans, h_n + ... + h_{n-m+1}, which it is a product of.
+    # The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
+    # 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
     orders = np.arange(1, LENGTH)
     return np.append(1.0, _GAIN * (orders + 1) / (1 + np.cumsum(1 / orders)))
 
@@ -53,8 +53,8 @@ def choose_order(
     - `errors`: weighted norms of the local errors that the three orders would have made in the step. Infinite or not a
         number if the step went wrong. Those of orders out of bounds are ignored.
     - `order`: the order `k` of the step.
-    - `points`: the number of mesh points the step was built on, at least `k`. An estimate for order `k + 1` needs one more
-        than `k`.
+    - `points`: the number of mesh points the step was built on, at least `k`. An estimate for order `k + 1` needs one
+        more than `k`.
     - `min_order`, `max_order`: bounds of the order. Starting from order one, `min_order` is approached step by step.
 
     **Returns:** `(order of the next step, StepEstimate)`.
@@ -70,7 +70,7 @@ def choose_order(
     lower = jnp.where(order > min_order, _LOWER * factors[0], zero)
     same = factors[1]
     higher = jnp.where(raisable & (order < points), _UPPER * factors[2], zero)
-    # With every point since the start in use there is no estimate for the next order, but as a rule it is the better one.
+    # With every point since the start in use there is no estimate for the next order, but it is better as a rule.
     opening = raisable & (order == points) & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))
     fall = ~rise & (lower > same)

@@ -8,6 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from ._evaluation import unravel_like
+
+
+def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> Any:
+    """The norm of a raveled quantity, given to it in the structure of `like`, but in one precision."""
+    return norm(unravel_like(jax.tree.map(lambda leaf: leaf.astype(flat.dtype), like), flat))
+
 
 class MultistepNorm(eqx.Module):
     """The norm of a `MultistepController`; its type tells a solver which controller it runs under."""
@@ -34,8 +41,8 @@ class Tolerances(eqx.Module):
         """Raise a `ValueError` if they come from a controller that cannot read the estimates of a multistep method."""
         if not self.fixed and not isinstance(self.norm, MultistepNorm):
             raise ValueError(
-                f"`{solver}` chooses its order together with its step, which only `MultistepController` understands. Use "
-                f"`stepsize_controller=jaxmb.solvers.MultistepController(rtol=..., atol=...)` instead of "
+                f"`{solver}` chooses its order together with its step, which only `MultistepController` understands. "
+                f"Use `stepsize_controller=jaxmb.solvers.MultistepController(rtol=..., atol=...)` instead of "
                 f"`diffrax.PIDController` and its like. (It may be wrapped in `diffrax.ClipStepSizeController`.)"
             )
 

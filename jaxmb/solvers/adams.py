@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Args, Chart, Y
 from ._evaluation import (
-    check_problem,
+    check_real,
+    check_term,
     derivative,
     evaluate,
     first_chart,
@@ -24,10 +25,13 @@ from ._evaluation import (
     ravel,
     unravel_like,
 )
-from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start, step_end
 from ._interpolation import MultistepInterpolation
 from ._order import StepEstimate, choose_order
-from ._tolerances import Tolerances
+from ._tolerances import Tolerances, norm_of
+
+# A step whose constraints were not solved; it only counts if the steps are fixed, otherwise its error is infinite.
+_FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
 class AdamsState(eqx.Module):
@@ -65,10 +69,11 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
     ```
 
     The term is a `diffrax.ODETerm` or an [`jaxmb.solvers.AbstractManifoldTerm`][]. Every form of `diffrax.SaveAt`,
-    events, jumps, integration backward in time and every adjoint work as with other diffrax solvers. Derivatives are those
-    of the discrete solution with its mesh and orders frozen. After a jump (`diffrax.ClipStepSizeController(jump_ts=...)`)
-    the method restarts at order one. A solve continued with `solver_state` must start at the state where the other ended,
-    in the same direction of time; otherwise pass `made_jump=True`.
+    events, jumps, integration backward in time and every adjoint work as with other diffrax solvers. Derivatives are
+    those of the discrete solution with its mesh and orders frozen. After a jump
+    (`diffrax.ClipStepSizeController(jump_ts=...)`) the method restarts at order one. A solve continued with
+    `solver_state` must start at the state where the other ended, in the same direction of time; otherwise pass
+    `made_jump=True`.
 
     ??? cite "Reference"
 
@@ -101,8 +106,8 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
     ):
         """**Arguments:**
 
-        - `min_order`, `max_order`: bounds of the order; equal values fix it, once enough steps have been made from order
-            one on.
+        - `min_order`, `max_order`: bounds of the order; equal values fix it, once enough steps have been made from
+            order one on.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
 
@@ -142,7 +147,8 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
 
     def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> AdamsState:
         self.tolerances.check("Adams")
-        check_problem(terms, y0)
+        check_term(terms)
+        check_real(y0)
         chart = first_chart(terms, t0, y0, args)
         return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32))
 
@@ -163,12 +169,13 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         dtype = before.dtype
         h = (t1 - t0).astype(dtype)
 
-        ahead = extrapolate(history, t1)
+        end = step_end(history, t1)
+        ahead = extrapolate(history, end)
         weights = jnp.where(order > INDEX, ahead.means, jnp.zeros((), dtype))
         predicted = before + h * (weights @ history.differences)
         _, f, tried_chart, predictor_failed = evaluate(terms, t1, predicted, y0, chart, args)
 
-        # What the new derivative adds to the polynomials through the last k - 1, k and k + 1, and the integrals of that.
+        # What the new derivative adds to the polynomials through the last k - 1, k and k + 1, and its integral.
         defects = f[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
         integrals = ahead.means / ahead.values
         last = integrals[order]
@@ -182,7 +189,7 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         next_order, estimate = choose_order(sizes, order, history.points, self.min_order, self.max_order)
         y1 = unravel_like(y0, after)
         state = AdamsState(
-            history=advance(history, t1, f, ahead.partial_sums),
+            history=advance(history, end, f, ahead.partial_sums),
             order=next_order,
             tally=solver_state.tally + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, tried_chart, args),
@@ -196,7 +203,7 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         }
         result = diffrax.RESULTS.successful
         if failed is not False:
-            result = diffrax.RESULTS.where(failed, diffrax.RESULTS.nonlinear_divergence, result)
+            result = diffrax.RESULTS.where(failed, _FAILED, result)
         return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
 
     def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
@@ -207,7 +214,7 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
             # The norm is a mean over all components.
             share = jnp.maximum(jnp.sum(free), 1) / free.size
             errors = jnp.where(free[None], errors, jnp.zeros((), errors.dtype)) / jnp.sqrt(share).astype(errors.dtype)
-        return jnp.stack([self.tolerances.norm(unravel_like(y0, error)) for error in errors])
+        return jnp.stack([norm_of(self.tolerances.norm, error, y0) for error in errors])
 
 
 def _start(terms, t0, t1, y0, args, chart, tally) -> AdamsState:

@@ -10,17 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Args, Y
-from ._evaluation import ravel, unravel_like
+from ._evaluation import check_real, ravel, unravel_like
 from ._order import StepEstimate
-from ._tolerances import MultistepNorm
+from ._tolerances import MultistepNorm, norm_of
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
 _WITHOUT_ESTIMATE = 0.25
-# Repeated rejections mean that errors do not fall as the order promises, as at a kink or a jump: bounds of the factor after
-# the first, second, and every further rejection.
+# Repeated rejections mean that errors do not fall as the order promises, as at a kink or a jump: bounds of the factor
+# after the first, second, and every further rejection.
 _REPEATED = (0.95, 0.5, 0.1)
 # A step cut short by somebody else is forgotten at most by this factor; beyond it differences would be rounding errors.
 _RECOVERY = 100.0
@@ -37,10 +38,11 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     """Steps as long as the error estimates of a multistep method allow, with the order that allows the longest.
 
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one in the given norm. For
-    [`jaxmb.solvers.Adams`][]; to step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`.
+    [`jaxmb.solvers.Adams`][]; to step exactly to some times, or over jumps, wrap it in
+    `diffrax.ClipStepSizeController`.
 
-    If no acceptable step is found down to `dtmin`, or down to what the floating-point time can resolve, the solve ends with
-    `diffrax.RESULTS.dt_min_reached`.
+    If no acceptable step is found down to `dtmin`, or down to what the floating-point time can resolve, the solve ends
+    with `diffrax.RESULTS.dt_min_reached`.
     """
 
     rtol: Any
@@ -76,12 +78,12 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         - `safety`: multiplies every step that the error estimates allow.
         - `factormin`, `factormax`: by how much a step may shrink at once after a rejection, and grow after success.
 
-        **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state can
-        resolve, and for inconsistent bounds.
+        **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state
+        can resolve, and for inconsistent bounds.
         """
         self.rtol = rtol
         self.atol = atol
-        self.norm = MultistepNorm(norm)
+        self.norm = MultistepNorm(norm)  # pyright: ignore[reportIncompatibleMethodOverride]
         self.dtmin = dtmin
         self.dtmax = dtmax
         self.force_dtmin = force_dtmin
@@ -121,6 +123,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         error_order: Any,
     ) -> tuple[Any, ControllerState]:
         del error_order
+        check_real(y0)
         self._check_resolution(y0)
         if dt0 is None:
             dt0 = self._first_step(terms, t0, t1, y0, args, func)
@@ -184,8 +187,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         finest = 4 * float(jnp.finfo(ravel(y0).dtype).eps)
         if _is_known(self.rtol) and np.any(np.asarray(self.rtol) < finest):
             raise ValueError(
-                f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is {finest:.1e}. "
-                "For finer ones switch on `jax_enable_x64`."
+                f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is "
+                f"{finest:.1e}. For finer ones switch on `jax_enable_x64`."
             )
 
     def _first_step(self, terms, t0, t1, y0, args, func) -> Any:
@@ -193,7 +196,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         flat = ravel(y0)
         with jax.numpy_dtype_promotion("standard"):
             scale = (self.atol + self.rtol * jnp.abs(flat)).astype(flat.dtype)
-        size = lambda x: self.norm(unravel_like(y0, x / scale))
+        size = lambda x: norm_of(self.norm, x / scale, y0)
         f = ravel(func(terms, t0, y0, args), flat.dtype)
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
         # Within this time the state changes by its own size, or at least by the tolerance.
@@ -207,8 +210,4 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
 
 
 def _is_known(x: Any) -> bool:
-    return x is not None and isinstance(x, (int, float, np.ndarray, np.generic, jax.Array)) and not _is_traced(x)
-
-
-def _is_traced(x: Any) -> bool:
-    return isinstance(x, jax.core.Tracer)
+    return x is not None and not isinstance(x, Tracer)

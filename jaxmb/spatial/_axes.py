@@ -43,9 +43,7 @@ def relative_orientation(poses: Float[Array, "k 7"]) -> Float[Array, "4"]:
 
 
 def turn_vector(part, poses: Float[Array, "k 7"]) -> Vector3:
-    """Twice the vector part of the turn from `part.orientation` to the present relative attitude [rad, for small
-    turns].
-    """
+    """Twice the vector part of the turn from `part.orientation` to the relative attitude [rad, for small turns]."""
     return 2.0 * rot.multiply(rot.conjugate(part.orientation), relative_orientation(poses))[1:]
 
 
@@ -61,9 +59,7 @@ def cosine_sine(space, part, poses: Float[Array, "k 7"]) -> tuple[Float[Array, "
 
 
 def angle(space, part, poses: Float[Array, "k 7"]) -> Float[Array, ""]:
-    """The angle from `x_a` to `x_b` about `axis_a`, in (−π, π] [rad]; zero, with derivative zero, where it is
-    undefined.
-    """
+    """The angle [rad] from `x_a` to `x_b` about `axis_a`, in (−π, π]; zero where it is undefined."""
     c, s = cosine_sine(space, part, poses)
     defined = c * c + s * s > 0
     return jnp.where(defined, jnp.arctan2(s, jnp.where(defined, c, 1.0)), 0.0)
@@ -83,9 +79,7 @@ def resolve_axis(part, space, poses: Float[Array, "k 7"]):
 
 
 def resolve_references(part, space, poses: Float[Array, "k 7"]):
-    """Fill `x_a` and `x_b`, the directions between which an angle about `axis_a` is measured, so that it is zero at the
-    given poses; or check them.
-    """
+    """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, or check them."""
     if (part.x_a is None) != (part.x_b is None):
         raise ValueError(
             f"{label(part)}: give both x_a and x_b (body-fixed), or neither to measure from the given poses."

@@ -45,8 +45,7 @@ class Torque(AbstractForce):
 
 
 class TorsionalSpringDamper(AbstractForce):
-    """A linear spring and damper on an angle: moment `−stiffness (angle − free_angle) − damping rate` about the axis on
-    B.
+    """A linear spring and damper on an angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
 
     The angle is that from `x_a` to `x_b` about `axis_a`, in (−π, π]: it jumps half a turn away from `x_a`, so it suits
     joints that turn less than that to either side. It should be that of a joint which lets B turn about the axis only;

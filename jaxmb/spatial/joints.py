@@ -34,9 +34,9 @@ def _separation(space, part, poses):
     return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
 
 
-def _across(axis_a, v):
-    """The components `u·v`, `v·v` of a vector in A across the axis: zero where it is parallel to the axis."""
-    return jnp.stack([jnp.dot(w, v) for w in perpendiculars(axis_a)])
+def _across(axis_a, w):
+    """The components `u·w`, `v·w` of a vector in A across the axis: zero where it is parallel to the axis."""
+    return jnp.stack([jnp.dot(across, w) for across in perpendiculars(axis_a)])
 
 
 def _parallel(space, part, poses):
@@ -100,8 +100,7 @@ class Revolute(AbstractConstraint):
 
 
 class Universal(AbstractConstraint):
-    """A Cardan joint: two points coincide, and an axis of each body stays perpendicular to the other. Rows 4: `d`,
-    `a·b`.
+    """A Cardan joint: two points coincide and two axes stay perpendicular. Rows 4: `d`, `a·b`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), the arms of the cross, fixed in
     `body_a` and in `body_b`; each may be given in the world instead, as `axis_a_W` and `axis_b_W`.
@@ -183,8 +182,7 @@ class Cylindrical(AbstractConstraint):
 
 
 class Screw(AbstractConstraint):
-    """A screw: two axes stay on one line, and a turn advances B. Rows 5: those of `Cylindrical`, and `advance = pitch ·
-    turn`.
+    """A screw: two axes stay on one line and a turn advances B. Rows 5: those of `Cylindrical`, and the thread.
 
     With the angle θ from `x_a` to `x_b` about the axis and the shift s = a·d, the last row is `pitch/2π · sin(θ − 2π (s
     − offset)/pitch) = 0`, written with products of direction components: it is periodic in θ and in s as the screw
@@ -234,8 +232,7 @@ class Screw(AbstractConstraint):
 
 
 class Prismatic(AbstractConstraint):
-    """A slide: B stays on the line through A and the relative attitude is constant. Rows 5: `u·d`, `v·d`, and the turn
-    (3).
+    """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the turn (3).
 
     The turn is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the rotation
     vector [rad] when small, and zero only there, whichever sign the bodies' Euler parameters have.
@@ -269,8 +266,7 @@ class Prismatic(AbstractConstraint):
 
 
 class Planar(AbstractConstraint):
-    """A sliding face: B stays in the plane through A normal to the axis, and the axes stay parallel. Rows 3: `u·b`,
-    `v·b`, `a·d`.
+    """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: `u·b`, `v·b`, `a·d`.
 
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
@@ -300,8 +296,7 @@ class Planar(AbstractConstraint):
 
 
 class Fixed(AbstractConstraint):
-    """A weld: two points coincide and the relative attitude is constant. Rows 6: `d`, and the turn (3) as in
-    `Prismatic`.
+    """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the turn (3) as in `Prismatic`.
 
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """
@@ -328,8 +323,9 @@ class Fixed(AbstractConstraint):
 
 
 class Distance(AbstractConstraint):
-    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length)`; the multiplier is the rod
-    force [N].
+    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length)`.
+
+    The multiplier is the rod force [N].
 
     **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; `length` [m] > 0, default that of the given poses.
     """

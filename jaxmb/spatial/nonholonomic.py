@@ -16,10 +16,10 @@ from ._axes import perpendiculars
 
 
 class KnifeEdge(AbstractVelocityConstraint):
-    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`, v the velocity of the
-    contact point, h the direction of the blade.
+    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`.
 
-    It does not hold the body on the plane; a `Planar` or `PointOnPlane` joint does.
+    Here v is the velocity of the contact point and h the direction of the blade. It does not hold the body
+    on the plane; a `Planar` or `PointOnPlane` joint does.
 
     **Arguments:** `point` [m], shape (3,), contact point fixed in the body; `axis`, unit, shape (3,), direction of the
     blade fixed in the body; `normal`, unit, shape (3,), of the plane in the world.
@@ -50,8 +50,7 @@ class KnifeEdge(AbstractVelocityConstraint):
 
 
 def _lowest_rim_point(space, part, pose):
-    """From the centre of a disk to the point of its rim that is lowest over the plane, `ρ = −r m/|m|`, `m = n × (e ×
-    n)` [m].
+    """From the centre of a disk to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`, `m = n × (e × n)`.
 
     The direction does not depend on the lengths of e and n. For a disk that lies flat, which has no lowest point, ρ =
     0.
@@ -67,8 +66,7 @@ def _tangential(normal, v):
 
 
 class RollingDisk(AbstractLink):
-    """A thin disk that rolls on a plane without slipping: contact (1 row between positions) and rolling (2 rows between
-    velocities).
+    """A thin disk that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, n the
     axle. A disk must not come to lie flat.
@@ -126,9 +124,7 @@ class DiskContact(AbstractConstraint):
 
 
 class DiskRolling(AbstractVelocityConstraint):
-    """A disk whose contact point does not slip. Rows 2: the components in the plane of `Ċ + ω × ρ`; arguments as in
-    `RollingDisk`.
-    """
+    """A disk whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisk`."""
 
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)
@@ -150,8 +146,7 @@ class DiskRolling(AbstractVelocityConstraint):
 
 
 class RollingSphere(AbstractLink):
-    """A sphere that rolls on a plane without slipping: contact (1 row between positions) and rolling (2 rows between
-    velocities).
+    """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     **Arguments:** `radius` [m] > 0; `center` [m], shape (3,), of the sphere, fixed in the body, default the mass
     centre; `point` [m] and `normal` (unit), shape (3,), of the plane in the world; `spin` [rad/s], of a turntable: the
@@ -188,9 +183,7 @@ class RollingSphere(AbstractLink):
 
 
 class SphereContact(AbstractConstraint):
-    """A sphere that touches a plane. Rows 1: `e·(C − point) − radius = 0`, C its centre; arguments as in
-    `RollingSphere`.
-    """
+    """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C its centre; else as in `RollingSphere`."""
 
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)
@@ -211,8 +204,7 @@ class SphereContact(AbstractConstraint):
 
 
 class SphereRolling(AbstractVelocityConstraint):
-    """A sphere whose contact point moves with the plane. Rows 2: the components in the plane of `Ċ − r ω × e − spin e ×
-    (C − point)`.
+    """A sphere that moves with the plane where they touch. Rows 2: `Ċ − r ω × e − spin e × (C − point)` in the plane.
 
     Arguments as in `RollingSphere`; with a turntable the rows do not vanish at rest.
     """

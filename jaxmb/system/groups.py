@@ -91,11 +91,11 @@ class ConstraintGroup(eqx.Module):
         """Derivative along unit velocities: `Φ_q N`, body by body."""
 
         def single(part, poses):
-            shape = (poses.shape[0], self._space.velocity_size)
-            along = lambda v: jax.jvp(
-                lambda x: part.residual(self._space, x, t), (poses,), (self.group.rates(poses, v),)
-            )[1]
-            return jax.jacfwd(along)(jnp.zeros(shape, poses.dtype))
+            residual = lambda x: part.residual(self._space, x, t)
+            along = lambda v: jax.jvp(residual, (poses,), (self.group.rates(poses, v),))[1]
+            k, size = poses.shape[0], self._space.velocity_size
+            unit = jnp.eye(k * size, dtype=poses.dtype).reshape(-1, k, size)
+            return jax.vmap(along, out_axes=-1)(unit).reshape(-1, k, size)
 
         return self._map(single, extended_q)
 

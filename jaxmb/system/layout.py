@@ -37,6 +37,11 @@ class Layout:
         """Index of every velocity entry, shape (bodies + 1, velocity size), into the velocities followed by a zero."""
         return self._index(self.space.velocity_size, [self.nu] * self.space.velocity_size)
 
+    @functools.cached_property
+    def velocity_place(self) -> np.ndarray:
+        """Where each velocity stands among all bodies' velocities, body by body, shape (nu,)."""
+        return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu)
+
     @property
     def nq(self) -> int:
         return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)

@@ -226,8 +226,7 @@ class RigidBodySystem(AbstractSystem):
         bodies = jnp.concatenate([jnp.repeat(self.mass[:, None], 2, axis=1), self.rotary[:, None]], axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
-        order = self.layout.velocity_index[:-1].ravel()
-        return DiagonalInertia(bodies.reshape(-1)[[list(order).index(k) for k in range(self.nu)]])
+        return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
 
     def force(self, t, q, u):
         extended, extended_u = self.extend_q(q), self.extend_u(u)
@@ -319,8 +318,7 @@ class _MixedInertia(AbstractInertia):
         index = self.layout.velocity_index[:-1].ravel()
         columns = v.reshape(v.shape[0], -1)
         full = jnp.pad(columns, ((0, 1), (0, 0)))[index]
-        own = [list(index).index(k) for k in range(self.layout.nu)]
-        return apply(full)[jnp.array(own)].reshape(v.shape)
+        return apply(full)[self.layout.velocity_place].reshape(v.shape)
 
 
 def _join(blocks, dtype):

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._figure import new_figure
@@ -29,17 +30,22 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     system = trajectory.system
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
-    poses = np.asarray(jax.vmap(system.poses)(trajectory.ys.q))
+    poses = jax.vmap(system.poses)(trajectory.ys.q)
+    world = lambda pose, point: np.asarray(system.layout.space.point(pose, jnp.asarray(point)))
     figure = new_figure(6.0, 6.0)
     axes = figure.add_subplot(projection="3d" if system.spatial else None)
     for k, (name, points) in enumerate(zip(system.body_names, _attachments(system), strict=True)):
-        centre = poses[:, k, : system.layout.space.dimension]
+        centre = np.asarray(poses[:, k, : system.layout.space.dimension])
         axes.plot(*centre.T, color=f"C{k % 10}", linewidth=0.8, alpha=0.5)
         for order, time in enumerate(shown):
             fade = (order + 1) / len(shown)
             for point in points:
-                end = np.asarray(system.layout.space.point(poses[time, k], point))
-                axes.plot(*np.stack([centre[time], end]).T, color=f"C{k % 10}", linewidth=2, alpha=fade)
+                axes.plot(
+                    *np.stack([centre[time], world(poses[time, k], point)]).T,
+                    color=f"C{k % 10}",
+                    linewidth=2,
+                    alpha=fade,
+                )
             last = order == len(shown) - 1
             axes.plot(*centre[time], "o", color=f"C{k % 10}", markersize=4, alpha=fade, label=name if last else None)
     axes.set_aspect("equal")

@@ -24,8 +24,9 @@ def plot_motion(trajectory: Trajectory, bodies: Sequence[str] | None = None) -> 
 
     **Arguments:** `trajectory`: a motion saved at several times; `bodies`: names of the bodies to show, default all.
 
-    **Returns:** a matplotlib `Figure` [s; m or rad and their rates; J]: angles for rigid bodies of the plane, positions of the mass
-    centres for point masses and in space. `figure.savefig(path)` writes it; in a notebook, `%matplotlib inline` shows it.
+    **Returns:** a matplotlib `Figure` [s; m or rad and their rates; J]: angles for rigid bodies of the plane, positions
+    of the mass centres for point masses and in space. `figure.savefig(path)` writes it; in a notebook, `%matplotlib
+    inline` shows it.
 
     **Raises:** `ValueError` for an unknown body or fewer than two times; `ImportError` without matplotlib.
     """

@@ -1,10 +1,10 @@
 """Non-stiff problems with accurate solutions, and curves of work against precision.
 
-Sources: Kepler's problem, the Pleiades and Arenstorf's orbit are stated in E. Hairer, S. P. Nørsett and G. Wanner, *Solving
-Ordinary Differential Equations I*, 2nd ed., sections II.0 and II.10 (the Pleiades also in the Bari test set for initial
-value problem solvers). Reference values: Kepler from the closed form in 50 digits; the others from the Gragg-Bulirsch-Stoer
-method in 200-bit arithmetic, confirmed in long double by a second run and by the published end values. All printed digits
-are correct.
+Sources: Kepler's problem, the Pleiades and Arenstorf's orbit are stated in E. Hairer, S. P. Nørsett and G. Wanner,
+*Solving Ordinary Differential Equations I*, 2nd ed., sections II.0 and II.10 (the Pleiades also in the Bari test set
+for initial value problem solvers). Reference values: Kepler from the closed form in 50 digits; the others from the
+Gragg-Bulirsch-Stoer method in 200-bit arithmetic, confirmed by a second run in long double and by the published end
+values.
 """
 
 from typing import NamedTuple

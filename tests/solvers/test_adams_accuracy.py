@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxmb.solvers import Adams, MultistepController
 from ode_problems import PROBLEMS, evaluations_at, kepler, work_precision
+
+from jaxmb.solvers import Adams, MultistepController
 
 TOLERANCES = 10.0 ** -np.arange(4.5, 12.01, 0.125)
 ERRORS = np.array([1e-6, 1e-7, 1e-8, 1e-9])
@@ -102,7 +103,7 @@ def test_saving_at_times_uses_dense_output():
 
 
 def _mesh(h, t1):
-    """Equal steps of about `h`, after an opening fine enough for order one, which grows so gently that high orders bear it."""
+    """Equal steps of about `h`, after an opening fine enough for order one, and gentle enough for high orders."""
     first = 1e-5
     count = int(np.ceil(np.log(h / first) / np.log(1.06)))
     opening = np.cumsum(np.concatenate([[0.0, first, first], h * 1.06 ** -np.arange(count, 0, -1.0)]))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-import pytest
+
 from jaxmb.solvers import Adams, MultistepController
 
 CONTROLLER = MultistepController(1e-8, 1e-8)
@@ -23,6 +23,7 @@ def _exact(t, omega=1.0):
 def _solve(t0=0.0, t1=4.0, *, y0=None, omega=1.0, vector_field=_oscillator, controller=CONTROLLER, dt0=None, **kwargs):
     y0 = _exact(jnp.asarray(t0)) if y0 is None else y0
     term = diffrax.ODETerm(vector_field)
+    kwargs = {"adjoint": diffrax.ForwardMode(), **kwargs}
     return diffrax.diffeqsolve(term, Adams(), t0, t1, dt0, y0, omega, stepsize_controller=controller, **kwargs)
 
 
@@ -76,7 +77,7 @@ def test_event_is_located():
     def time_of_event(omega):
         return _solve(omega=omega, event=event, y0={"x": jnp.array(1.0), "v": jnp.array(0.0)}).ts[0]
 
-    np.testing.assert_allclose(jax.grad(time_of_event)(jnp.array(1.0)), -np.pi / 2, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(time_of_event))(jnp.array(1.0)), -np.pi / 2, atol=1e-5)
 
 
 def test_batch_equals_loop():
@@ -93,12 +94,6 @@ def test_batch_equals_loop():
     np.testing.assert_array_equal(batch[1], loop[1])
     np.testing.assert_array_equal(batch[2], loop[2])
     _assert_close(batch[0], loop[0], atol=1e-12)
-
-
-def test_jit_changes_nothing():
-    with jax.disable_jit(False):
-        inside = jax.jit(lambda: _solve().ys)()
-    _assert_close(inside, _solve().ys, atol=1e-13)
 
 
 def test_continuation_repeats_the_unbroken_solve():
@@ -143,34 +138,22 @@ def _pulse(t, y, args):
     return jnp.where(t < 1.0, -y, -y + 3.0 * jnp.cos(t))
 
 
-def _steps(solution):
-    n = int(solution.stats["num_accepted_steps"])
-    return np.diff(np.asarray(solution.ts[:n]))
-
-
 def test_restart_after_a_jump_repeats_an_opening():
-    y1, steps = jnp.array([2.0]), diffrax.SaveAt(steps=True, solver_state=True)
-    jumping = diffrax.ClipStepSizeController(CONTROLLER, jump_ts=jnp.array([1.0]))
-    whole = _solve(0.0, 3.0, y0=y1, vector_field=_pulse, controller=jumping, saveat=steps, max_steps=256)
+    saveat = diffrax.SaveAt(steps=True, solver_state=True)
+    # So coarse that rounding errors have no say in the size of steps.
+    controller = MultistepController(1e-4, 1e-4)
+    common = {"vector_field": _pulse, "saveat": saveat, "max_steps": 64}
+    jumping = diffrax.ClipStepSizeController(controller, jump_ts=jnp.array([1.0]))
+    whole = _solve(0.0, 3.0, y0=jnp.array([2.0]), controller=jumping, **common)
     at_jump = int(np.argmin(np.abs(np.asarray(whole.ts) - 1.0)))
-    after = float(whole.ts[at_jump])
     assert whole.solver_state.tally[0] == 2
     # The same, started after the jump with the first step that the restart settled for.
-    t0 = jnp.nextafter(jnp.nextafter(after, 2.0), 2.0)
-    first = whole.ts[at_jump + 1] - t0
-    fresh = _solve(
-        t0,
-        3.0,
-        y0=whole.ys[at_jump],
-        dt0=first,
-        vector_field=_pulse,
-        controller=CONTROLLER,
-        saveat=steps,
-        max_steps=256,
-    )
+    t0 = np.nextafter(1.0, 2.0)
+    fresh = _solve(t0, 3.0, y0=whole.ys[at_jump], dt0=whole.ts[at_jump + 1] - t0, controller=controller, **common)
     n = int(fresh.stats["num_accepted_steps"])
-    np.testing.assert_allclose(whole.ts[at_jump + 1 : at_jump + 1 + n], fresh.ts[:n], rtol=1e-12)
-    np.testing.assert_allclose(whole.ys[at_jump + 1 : at_jump + 1 + n], fresh.ys[:n], rtol=1e-12)
+    assert n == whole.stats["num_accepted_steps"] - at_jump - 1 and fresh.stats["num_rejected_steps"] == 0
+    np.testing.assert_allclose(whole.ts[at_jump + 1 :][:n], fresh.ts[:n], rtol=1e-9)
+    np.testing.assert_allclose(whole.ys[at_jump + 1 :][:n], fresh.ys[:n], rtol=1e-9)
 
 
 def test_jumps_in_a_batch_and_their_cost():
@@ -252,7 +235,7 @@ def test_evaluations_are_counted():
 
 
 def test_plain_terms_trace_no_manifold():
-    jaxpr = str(jax.make_jaxpr(lambda: _solve(adjoint=diffrax.ForwardMode()).ys)())
+    jaxpr = str(jax.make_jaxpr(lambda: _solve().ys)())
     state = eqx.filter_eval_shape(lambda: _solve(saveat=diffrax.SaveAt(solver_state=True))).solver_state
     assert state.chart is None
     # Without jumps, events and charts nothing is left to branch on within a step.

@@ -1,0 +1,5 @@
+"""`python -m jaxmb`, the same as `jaxmb`."""
+
+from .cli import main
+
+raise SystemExit(main())

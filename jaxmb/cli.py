@@ -1,0 +1,265 @@
+"""The command line: `jaxmb mechanisms | run | report`."""
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .mechanisms import Mechanism
+    from .trajectory import Trajectory
+
+# What `run` does: saved times, tolerances of the table, and the fit of one parameter to the first part of the motion,
+# sampled at some times with noise, from a start that is off.
+_TIMES = 401
+_TOLERANCES = (1e-5, 1e-7, 1e-9)
+_FIT_SHARE, _FIT_TIMES, _NOISE, _START = 0.2, 50, 1e-3, 1.1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    **Arguments:** `argv`: the words after `jaxmb`, default those of the process.
+
+    **Returns:** the exit code: 0, 1 if a simulation failed, or 2 for a name or number that does not fit, with a message
+    on stderr.
+    """
+    arguments = _parser().parse_args(argv)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        arguments.command(arguments)
+    except (ValueError, RuntimeError) as error:
+        print(f"jaxmb: {error}", file=sys.stderr)
+        return 2 if isinstance(error, ValueError) else 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jaxmb", description="Accurate, differentiable dynamics of constrained mechanical systems."
+    )
+    commands = parser.add_subparsers(required=True, metavar="command")
+
+    listing = commands.add_parser("mechanisms", help="list the mechanisms of the library")
+    listing.set_defaults(command=_mechanisms)
+
+    run = commands.add_parser(
+        "run", help="simulate a mechanism, compare it with its reference values, and fit one of its parameters"
+    )
+    run.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
+    run.add_argument("--rtol", type=float, default=1e-9, help="relative tolerance of a step (default %(default)g)")
+    run.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
+    run.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
+    run.set_defaults(command=_run)
+
+    report = commands.add_parser("report", help="measure error against run time for several solvers")
+    report.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
+    report.add_argument("--tolerances", type=float, nargs="+", metavar="RTOL", help="default 1e-4 1e-6 1e-8 1e-10")
+    report.add_argument("--repeats", type=int, default=5, help="timed runs of each solver (default %(default)d)")
+    report.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
+    report.add_argument("--out", type=Path, help="folder for the table and the figure (default jaxmb-output/NAME)")
+    report.set_defaults(command=_report)
+    return parser
+
+
+def _mechanisms(arguments: argparse.Namespace) -> None:
+    del arguments
+    from . import mechanisms
+
+    width = max(map(len, mechanisms.names()))
+    for name in mechanisms.names():
+        summary = " ".join((getattr(mechanisms, name).__doc__ or "").split("\n\n")[0].split())
+        print(f"{name:{width}}  {summary}")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from .report import work_precision
+    from .report.work_precision import default_solvers
+
+    mechanism = _mechanism(arguments)
+    print(f"{mechanism.name}: {mechanism.description}\n\n{mechanism.system}\n")
+
+    trajectory, seconds = _simulate(mechanism, arguments.rtol)
+    stats = {name: int(trajectory.stats[name]) for name in ("num_steps", "num_rejected_steps", "num_evaluations")}
+    violation = max(float(trajectory.constraint_violation.position.max()), 0.0)
+    print(
+        f"Motion over {mechanism.t1:g} s at rtol {arguments.rtol:g}: {stats['num_steps']} steps "
+        f"({stats['num_rejected_steps']} rejected), {stats['num_evaluations']} evaluations, "
+        f"{seconds:.1f} s with compiling; largest constraint residual {violation:.1e}."
+    )
+    _compare(mechanism, trajectory)
+
+    print("\nError against run time:")
+    chosen = {name: solver for name, solver in default_solvers().items() if name != "Tsit5"}
+    precision = work_precision(mechanism, chosen, _TOLERANCES)
+    print(precision)
+
+    _fit(mechanism, arguments.rtol)
+
+    out = _folder(arguments)
+    trajectory.save(out / "motion.npz")
+    print(f"\nWrote {out / 'motion.npz'}")
+    _write_figures(out, precision, trajectory)
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    from .report import work_precision
+
+    mechanism = _mechanism(arguments)
+    precision = work_precision(mechanism, tolerances=arguments.tolerances, repeats=arguments.repeats)
+    print(precision)
+    out = _folder(arguments)
+    (out / "work_precision.json").write_text(json.dumps(precision.to_dict(), indent=1))
+    print(f"\nWrote {out / 'work_precision.json'}")
+    _write_figures(out, precision, None)
+
+
+def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
+    """The mechanism, ending at `--t1` with the reference values up to there."""
+    from . import mechanisms
+
+    mechanism = mechanisms.get(arguments.mechanism)
+    t1, known = arguments.t1, mechanism.references
+    if t1 is None:
+        return mechanism
+    if not 0 < t1 < float("inf"):
+        raise ValueError(f"--t1 must be positive and finite, got {t1:g}.")
+    if known is not None:
+        keep = known.times <= t1
+        known = dataclasses.replace(known, times=known.times[keep], values=known.values[keep]) if keep.any() else None
+    return dataclasses.replace(mechanism, t1=t1, references=known)
+
+
+def _simulate(mechanism: "Mechanism", rtol: float) -> "tuple[Trajectory, float]":
+    import diffrax
+    import jax
+    import numpy as np
+
+    from .simulate import simulate
+
+    ts = np.linspace(0.0, mechanism.t1, _TIMES)
+    if mechanism.references is not None:
+        times = mechanism.references.times
+        apart = np.min(np.abs(ts[:, None] - times[None, :]), axis=1) > 1e-9 * mechanism.t1
+        ts = np.sort(np.concatenate([ts[apart], times[times <= mechanism.t1]]))
+    meter = diffrax.TqdmProgressMeter() if sys.stderr.isatty() else diffrax.NoProgressMeter()
+    begin = time.perf_counter()
+    trajectory = simulate(mechanism.system, mechanism.state, t1=ts[-1], rtol=rtol, saveat=ts, progress_meter=meter)
+    jax.block_until_ready(trajectory.ys)
+    return trajectory, time.perf_counter() - begin
+
+
+def _compare(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
+    known = mechanism.references
+    if known is None:
+        print("There are no reference values for this motion.")
+        return
+    print(f"Relative error at {known.times[-1]:g} s against reference values:")
+    print(f"  {known.source}; good to {known.tolerance:.0e}")
+    errors = mechanism.errors(trajectory)
+    width = max(map(len, errors))
+    for k, (label, error) in enumerate(errors.items()):
+        print(f"  {label:{width}}  {known.values[-1, k]:20.12g}  {error[-1]:.1e}")
+
+
+def _fit(mechanism: "Mechanism", rtol: float) -> None:
+    """Estimate the parameter that the motion feels most from a noisy sample of it."""
+    import numpy as np
+
+    from .identify import identify
+    from .simulate import simulate
+    from .system import parameters
+
+    system = mechanism.system
+    ts = np.linspace(0.0, _FIT_SHARE * mechanism.t1, _FIT_TIMES + 1)[1:]
+    name = _most_felt(mechanism, ts)
+    if name is None:
+        print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
+        return
+    motion = simulate(system, mechanism.state, t1=ts[-1], saveat=ts, rtol=rtol)
+    random = np.random.default_rng(0)
+    measured, sigma = {}, {}
+    for body in system.body_names:
+        exact = np.asarray(motion[body].position)
+        noise = _NOISE * np.ptp(exact)
+        if noise > 0:
+            measured[f"{body}.position"] = exact + noise * random.standard_normal(exact.shape)
+            sigma[f"{body}.position"] = noise
+    true = float(parameters(system)[name])
+    print(
+        f"\nIdentifying {name} from positions at {ts.size} times up to {ts[-1]:g} s, "
+        f"with noise of {_NOISE:.1%} of their range, from a start {_START - 1:.0%} off:"
+    )
+    start = {name: _START * true}
+    fit = identify(
+        system,
+        measured,
+        ts=ts,
+        free=start,
+        state=mechanism.state,
+        fix=mechanism.fix,
+        rates=mechanism.rates,
+        sigma=sigma,
+    )
+    print(f"{fit}\ntrue value {true:.6g}")
+
+
+def _most_felt(mechanism: "Mechanism", ts) -> str | None:
+    """The scalar parameter, in relative terms, that moves the positions most; None if none does."""
+    import diffrax
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from .assembly import assemble
+    from .simulate import simulate
+    from .system import parameters, with_parameters
+
+    known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
+    if not known:
+        return None
+
+    @eqx.filter_jit
+    def sensitivities(system, state):
+        def positions(scale):
+            values = {name: value * factor for (name, value), factor in zip(known.items(), scale, strict=True)}
+            changed = with_parameters(system, values)
+            start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
+            adjoint = diffrax.ForwardMode()
+            motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, adjoint=adjoint, throw=False)
+            return jnp.concatenate([motion[body].position.reshape(-1) for body in system.body_names])
+
+        return jax.jacfwd(positions)(jnp.ones(len(known)))
+
+    felt = np.linalg.norm(sensitivities(mechanism.system, mechanism.state), axis=0)
+    size = float(mechanism.system.length)
+    return list(known)[int(np.argmax(felt))] if np.max(felt) > 1e-6 * size else None
+
+
+def _folder(arguments: argparse.Namespace) -> Path:
+    out = Path("jaxmb-output") / arguments.mechanism if arguments.out is None else arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def _write_figures(out: Path, precision, trajectory: "Trajectory | None") -> None:
+    from .viz import plot_mechanism, plot_motion
+
+    try:
+        precision.figure(out / "work_precision.png")
+        written = [out / "work_precision.png"]
+        if trajectory is not None:
+            for name, plot in (("motion.png", plot_motion), ("mechanism.png", plot_mechanism)):
+                plot(trajectory).savefig(out / name, dpi=150)
+                written.append(out / name)
+    except ImportError as error:
+        print(error)
+        return
+    print("Wrote " + ", ".join(map(str, written)))

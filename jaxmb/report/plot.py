@@ -1,0 +1,31 @@
+"""The picture of a work–precision report."""
+
+from typing import TYPE_CHECKING
+
+from .._figure import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .work_precision import WorkPrecision
+
+
+def plot_work_precision(report: "WorkPrecision") -> "Figure":
+    """Error against run time and against evaluations, both axes logarithmic; failed runs are left out."""
+    figure = new_figure(9.0, 4.0)
+    panels = figure.subplots(1, 2, sharey=True)
+    quantities = (("run time, warm [ms]", lambda run: 1e3 * run.shortest), ("evaluations", lambda run: run.evaluations))
+    for axes, (label, quantity) in zip(panels, quantities, strict=True):
+        for k, solver in enumerate(dict.fromkeys(run.solver for run in report.runs)):
+            points = [(quantity(run), run.error) for run in report.runs if run.solver == solver and not run.message]
+            points = [(x, error) for x, error in points if x is not None]
+            if points:
+                axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
+        if report.disagreement > 0:
+            axes.axhline(report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
+        axes.set_xlabel(label)
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize="small")
+    panels[0].set_ylabel("relative error at the end")
+    figure.suptitle(f"{report.mechanism}, {report.t1:g} s")
+    return figure

@@ -1,0 +1,36 @@
+"""Run times that can be compared with each other on a machine that does other things as well."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+
+
+def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
+    """Trace and compile a function for its arguments.
+
+    **Returns:** the compiled function, and how long that took [s].
+    """
+    begin = time.perf_counter()
+    compiled = eqx.filter_jit(fn).lower(*args).compile()  # pyright: ignore[reportFunctionMemberAccess]
+    return compiled, time.perf_counter() - begin
+
+
+def interleaved(runs: Sequence[Callable[[], Any]], repeats: int) -> list[tuple[float, ...]]:
+    """Time several functions in turns, so that whatever else the machine does hits all of them alike.
+
+    Each is called once before, without being timed.
+
+    **Returns:** for every function its `repeats` times [s].
+    """
+    for run in runs:
+        jax.block_until_ready(run())
+    times: list[list[float]] = [[] for _ in runs]
+    for _ in range(repeats):
+        for own, run in zip(times, runs, strict=True):
+            begin = time.perf_counter()
+            jax.block_until_ready(run())
+            own.append(time.perf_counter() - begin)
+    return [tuple(own) for own in times]

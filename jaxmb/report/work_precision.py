@@ -1,0 +1,180 @@
+"""Error against run time and against evaluations, over solvers and tolerances."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import numpy as np
+
+from .._results import RESULTS
+from ..mechanisms import Mechanism, References
+from ..simulate import simulate
+from ..solvers import Adams
+from .evaluations import evaluations
+from .plot import plot_work_precision
+from .reference import reference
+from .timing import interleaved, timed_compile
+
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+
+
+def default_solvers() -> dict[str, diffrax.AbstractSolver]:
+    """Adams on independent coordinates, and Runge–Kutta methods of orders 5 and 8 with projection."""
+    return {"Adams": Adams(), "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One solver at one tolerance.
+
+    **Fields:** `solver`; `rtol`; `error`: the largest relative error at the end, NaN if the run failed; `times` [s] of
+    the warm runs; `compile_time` [s]; `steps`, accepted and rejected together, and `rejected`; `evaluations` of the
+    accelerations, None where they are not known; `message`: why it failed, or empty.
+    """
+
+    solver: str
+    rtol: float
+    error: float
+    times: tuple[float, ...]
+    compile_time: float
+    steps: int
+    rejected: int
+    evaluations: int | None
+    message: str = ""
+
+    @property
+    def shortest(self) -> float:
+        """The shortest warm run time [s], the one least disturbed by what else the machine did."""
+        return min(self.times)
+
+    @property
+    def median(self) -> float:
+        """The median warm run time [s]."""
+        return float(np.median(self.times))
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkPrecision:
+    """What `work_precision` returns; `print` shows a table, a notebook too.
+
+    **Fields:** `mechanism`: its name; `t1` [s]; `runs`; `source` of the reference values, and `disagreement`, the
+    relative error up to which they can be trusted: as published, or the difference of the two methods that computed
+    them.
+    """
+
+    mechanism: str
+    t1: float
+    runs: tuple[Run, ...]
+    source: str
+    disagreement: float
+
+    def __str__(self) -> str:
+        lines = [f"{self.mechanism}, {self.t1:g} s; largest relative error at the end, against reference values:"]
+        lines += [f"  {self.source}; good to {self.disagreement:.0e}"]
+        rows = [_HEADER, *map(_cells, self.runs)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        return "\n".join(lines + [f"{run.solver} at {run.rtol:.0e}: {run.message}" for run in self.runs if run.message])
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{cell}</th>" for cell in _HEADER)
+        body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in _cells(run))}</tr>" for run in self.runs)
+        caption = f"{self.mechanism}, {self.t1:g} s; reference: {self.source}, good to {self.disagreement:.1e}"
+        return f"<table><caption>{caption}</caption><tr>{head}</tr>{body}</table>"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists, for JSON."""
+        return dataclasses.asdict(self)
+
+    def figure(self, path: str | Path) -> None:
+        """Write a picture (PNG, SVG or PDF by the path's ending): error against run time and against evaluations.
+
+        **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
+        """
+        plot_work_precision(self).savefig(path, dpi=150)
+
+
+_HEADER = ("solver", "rtol", "error", "run [ms]", "median", "compile [s]", "steps", "rejected", "evaluations")
+
+
+def _cells(run: Run) -> tuple[str, ...]:
+    return (
+        run.solver,
+        f"{run.rtol:.0e}",
+        "failed" if run.message else f"{run.error:.1e}",
+        f"{1e3 * run.shortest:.2f}",
+        f"{1e3 * run.median:.2f}",
+        f"{run.compile_time:.1f}",
+        str(run.steps),
+        str(run.rejected),
+        "–" if run.evaluations is None else str(run.evaluations),
+    )
+
+
+def work_precision(
+    mechanism: Mechanism,
+    solvers: Mapping[str, diffrax.AbstractSolver] | None = None,
+    tolerances: Sequence[float] | None = None,
+    *,
+    repeats: int = 5,
+) -> WorkPrecision:
+    """Measure the error that solvers make on a mechanism, and what it costs.
+
+    Every run is compiled first, apart from what is timed; then all of them run in turns `repeats` times. Only the end
+    of the motion is saved, so that no solver pays for interpolation.
+
+    **Arguments:** `mechanism`: of the library; `solvers` by name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax
+    with projection; `tolerances`: values of `rtol`, with `atol` one hundredth of it, default 1e-4 … 1e-10; `repeats`:
+    at least 1.
+
+    **Returns:** a `WorkPrecision`. A run that fails keeps its row and says why.
+
+    **Raises:** `ValueError` for no solvers, no tolerances or no repeats.
+    """
+    solvers = default_solvers() if solvers is None else solvers
+    tolerances = TOLERANCES if tolerances is None else tolerances
+    if not solvers or not tolerances or repeats < 1:
+        raise ValueError("work_precision needs at least one solver, one tolerance and one repeat.")
+    known = reference(mechanism, min(tolerances))
+    t1 = float(known.times[-1])
+    compiled, costs = [], []
+    for solver in solvers.values():
+        for rtol in tolerances:
+            fn, seconds = timed_compile(_simulation(solver, rtol, t1), mechanism.system, mechanism.state)
+            compiled.append(lambda fn=fn: fn(mechanism.system, mechanism.state))
+            costs.append(seconds)
+    times = interleaved(compiled, repeats)
+    cases = [(name, rtol) for name in solvers for rtol in tolerances]
+    runs = []
+    for (name, rtol), run, own, seconds in zip(cases, compiled, times, costs, strict=True):
+        trajectory = run()
+        ok = bool(trajectory.result == RESULTS.successful)
+        runs.append(
+            Run(
+                solver=name,
+                rtol=rtol,
+                error=_error(mechanism, known, trajectory) if ok else float("nan"),
+                times=own,
+                compile_time=seconds,
+                steps=int(trajectory.stats["num_steps"]),
+                rejected=int(trajectory.stats["num_rejected_steps"]),
+                evaluations=evaluations(solvers[name], trajectory.stats),
+                message="" if ok else _text(trajectory.result),
+            )
+        )
+    return WorkPrecision(mechanism.name, t1, tuple(runs), known.source, known.tolerance)
+
+
+def _text(result: RESULTS) -> str:
+    return RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
+
+
+def _simulation(solver, rtol, t1):
+    return lambda system, state: simulate(system, state, t1=t1, rtol=rtol, solver=solver, throw=False)
+
+
+def _error(mechanism: Mechanism, known: References, trajectory) -> float:
+    errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
+    return max(float(error[-1]) for error in errors.values())

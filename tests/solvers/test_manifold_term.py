@@ -1,0 +1,177 @@
+"""The solver on a term with a manifold: a point on the unit circle, one coordinate free and the other solved for."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmb.solvers import AbstractManifoldTerm, Adams, MultistepController
+
+_AXES = np.arange(2, dtype=np.int32)
+
+
+class Circle(AbstractManifoldTerm):
+    """`angle' = rate (1 + sin(t) / 2)`. Charts change where the free coordinate is not the smaller one by far.
+
+    With `fail`, evaluations within a step longer than `fail` after a time of one go wrong.
+    """
+
+    rate: jax.Array
+    fail: float | None = None
+
+    def vf(self, t, y, args):
+        return self.rate * (1 + 0.5 * jnp.sin(t)) * jnp.stack([-y[1], y[0]])
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf, control):
+        return vf * control
+
+    def init_chart(self, t, y, args):
+        return {
+            "free": jnp.argmin(jnp.abs(y)).astype(jnp.int32),
+            "changes": jnp.array(0, jnp.int32),
+            "at": jnp.asarray(t, y.dtype),
+        }
+
+    def evaluate(self, t, y, chart, args):
+        kept = y[chart["free"]]
+        room = 1 - kept**2
+        failed = room < 0.01
+        other = y[1 - chart["free"]]
+        solved = jnp.sign(other) * jnp.sqrt(jnp.where(failed, 1.0, room))
+        y = jnp.where(self._is_free(chart), y, solved)
+        if self.fail is not None:
+            failed = failed | ((t > 1.0) & (t - chart["at"] > self.fail))
+        return y, self.vf(t, y, args), chart, failed
+
+    def free(self, chart):
+        return self._is_free(chart)
+
+    def update_chart(self, t, y, chart, args):
+        worse = jnp.abs(y[chart["free"]]) > 0.8
+        free = jnp.where(worse, 1 - chart["free"], chart["free"])
+        return {"free": free, "changes": chart["changes"] + worse.astype(jnp.int32), "at": jnp.asarray(t, y.dtype)}
+
+    def _is_free(self, chart):
+        return chart["free"] == _AXES
+
+
+def _exact(t, rate=1.0):
+    angle = rate * (t + 0.5 * (1 - np.cos(t)))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _solve(term, t1=12.0, tolerance=1e-8, **kwargs):
+    kwargs = {"saveat": diffrax.SaveAt(t1=True, solver_state=True), "adjoint": diffrax.ForwardMode(), **kwargs}
+    controller = MultistepController(tolerance, tolerance)
+    y0 = jnp.array([1.0, 0.0])
+    return diffrax.diffeqsolve(term, Adams(), 0.0, t1, None, y0, stepsize_controller=controller, **kwargs)
+
+
+@pytest.mark.parametrize("t1", [12.0, -12.0])
+def test_state_stays_on_the_manifold(t1):
+    saveat = diffrax.SaveAt(steps=True, solver_state=True)
+    solution = _solve(Circle(jnp.array(1.0)), t1, saveat=saveat, max_steps=512)
+    n = int(solution.stats["num_accepted_steps"])
+    np.testing.assert_allclose(jnp.sum(solution.ys[:n] ** 2, axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(solution.ys[:n], _exact(np.asarray(solution.ts[:n])), atol=1e-6)
+    assert solution.solver_state.chart["changes"] > 5
+
+
+def test_change_of_chart_keeps_the_order():
+    """Neither restarts nor low orders after the start, and no more steps than without a manifold."""
+    term = Circle(jnp.array(1.0))
+    charted = _solve(term)
+    plain = _solve(diffrax.ODETerm(term.vf))
+    tally = charted.solver_state.tally
+    assert charted.solver_state.chart["changes"] > 5
+    assert tally[0] == 1
+    assert tally[1:6].sum() < 14
+    assert charted.stats["num_steps"] < 1.3 * plain.stats["num_steps"]
+
+
+def test_other_solvers_run_without_charts():
+    solution = diffrax.diffeqsolve(
+        Circle(jnp.array(1.0)),
+        diffrax.Dopri8(),
+        0.0,
+        12.0,
+        None,
+        jnp.array([1.0, 0.0]),
+        stepsize_controller=diffrax.PIDController(1e-9, 1e-9),
+    )
+    np.testing.assert_allclose(solution.ys[-1], _exact(12.0), atol=1e-6)
+
+
+def test_failed_evaluation_retries_the_step():
+    whole = _solve(Circle(jnp.array(1.0)), 3.0)
+    retried = _solve(Circle(jnp.array(1.0), fail=0.02), 3.0)
+    assert retried.result == diffrax.RESULTS.successful
+    assert retried.stats["num_rejected_steps"] > whole.stats["num_rejected_steps"]
+    assert retried.stats["num_accepted_steps"] > 2.0 / 0.02
+    np.testing.assert_allclose(retried.ys[-1], _exact(3.0), atol=1e-6)
+
+
+def test_hopeless_evaluation_ends_the_solve():
+    solution = _solve(Circle(jnp.array(1.0), fail=0.0), 3.0, throw=False)
+    assert solution.result == diffrax.RESULTS.dt_min_reached
+
+
+def test_failed_evaluation_under_fixed_steps_is_an_error():
+    solution = diffrax.diffeqsolve(
+        Circle(jnp.array(1.0), fail=0.001),
+        Adams(rtol=1e-6, atol=1e-6),
+        0.0,
+        3.0,
+        0.01,
+        jnp.array([1.0, 0.0]),
+        throw=False,
+    )
+    assert solution.result == diffrax.RESULTS.nonlinear_divergence
+
+
+def test_batch_with_charts_and_failures_equals_loop():
+    rates = jnp.array([0.6, 1.0, 2.3])
+
+    def run(rate):
+        solution = _solve(Circle(rate, fail=0.1), 4.0)
+        return solution.ys[-1], solution.stats["num_steps"], solution.solver_state.chart["changes"]
+
+    batch = jax.jit(jax.vmap(run))(rates)
+    single = jax.jit(run)
+    loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(rate) for rate in rates])
+    np.testing.assert_allclose(batch[0], loop[0], atol=1e-12)
+    np.testing.assert_array_equal(batch[1], loop[1])
+    np.testing.assert_array_equal(batch[2], loop[2])
+
+
+def test_jump_on_the_manifold():
+    controller = diffrax.ClipStepSizeController(MultistepController(1e-8, 1e-8), jump_ts=jnp.array([2.0]))
+    saveat = diffrax.SaveAt(t1=True, solver_state=True)
+    solution = diffrax.diffeqsolve(
+        Circle(jnp.array(1.0)),
+        Adams(),
+        0.0,
+        4.0,
+        None,
+        jnp.array([1.0, 0.0]),
+        stepsize_controller=controller,
+        saveat=saveat,
+    )
+    assert solution.solver_state.tally[0] == 2
+    assert solution.solver_state.chart["changes"] > 1
+    np.testing.assert_allclose(solution.ys[-1], _exact(4.0), atol=1e-7)
+
+
+def test_gradients_through_charts():
+    loss = lambda rate, adjoint: jnp.sum(_solve(Circle(rate), 4.0, adjoint=adjoint).ys[-1] * jnp.array([1.0, 0.5]))
+    rate = jnp.array(1.0)
+    forward = jax.jit(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
+    reverse = jax.jit(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
+    angle_rate = 4.0 + 0.5 * (1 - np.cos(4.0))
+    x, y = _exact(4.0)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    np.testing.assert_allclose(forward, angle_rate * (-y + 0.5 * x), atol=1e-6)

@@ -1,0 +1,210 @@
+"""Parameters from measured motion: recovery, standard deviations, what the data do not determine, and trials that fail."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb._free import free_parameters
+from jaxmb._least_squares import levenberg_marquardt
+
+TS = jnp.linspace(0.0, 1.0, 31)[1:]
+TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
+SIGMA = {"rod.angle": 1e-3}
+
+
+def pendulum():
+    """A rod on a pin with a torsional spring and damper."""
+    rod = planar.Body("rod", mass=2.0, inertia=planar.rod(2.0, 1.0), position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=6.0, damping=0.3)
+    return mb.Scene([rod], joints=[pin], forces=[spring, mb.Gravity((0.0, -9.81))]).compile()
+
+
+@pytest.fixture(scope="module")
+def system():
+    return pendulum()
+
+
+@pytest.fixture(scope="module")
+def motion(system):
+    return mb.simulate(system, mb.assemble(system), t1=TS[-1], saveat=TS)
+
+
+def noisy(motion, seed):
+    noise = np.random.default_rng(seed).standard_normal(TS.shape)
+    return {"rod.angle": np.asarray(motion["rod"].angle) + SIGMA["rod.angle"] * noise}
+
+
+def test_recovers_parameters_with_honest_deviations(system, motion):
+    """Over many draws of the noise, errors divided by their standard deviations have unit size."""
+    scores = []
+    for seed in range(16):
+        start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
+        fit = mb.identify(system, noisy(motion, seed), ts=TS, free=start, sigma=SIGMA)
+        assert fit.success and not fit.undetermined
+        scores += [(fit.parameters[name] - true) / fit.deviations[name] for name, true in TRUE.items()]
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4
+
+
+def test_result(system, motion):
+    """The result carries the fitted system, its state, and a table; NaN samples are left out."""
+    measured = noisy(motion, 0)
+    measured["rod.angle"][[3, 7]] = np.nan
+    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
+    fit = mb.identify(system, measured, ts=TS, free=start, sigma=SIGMA)
+    assert fit.residuals.size == TS.size - 2
+    assert 0.5 < fit.rms < 1.5
+    again = mb.simulate(fit.system, fit.state, t1=TS[-1], saveat=TS)["rod"].angle
+    residuals = (np.asarray(again) - measured["rod.angle"]) / SIGMA["rod.angle"]
+    np.testing.assert_allclose(residuals[np.isfinite(residuals)], fit.residuals, atol=1e-4)
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.concatenate([[v] for v in fit.deviations.values()]))
+    assert "spring.stiffness" in str(fit) and "converged" in str(fit)
+
+
+def test_without_sigma_the_noise_is_estimated(system, motion):
+    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
+    known = mb.identify(system, noisy(motion, 1), ts=TS, free=start, sigma=SIGMA)
+    estimated = mb.identify(system, noisy(motion, 1), ts=TS, free=start)
+    for name in TRUE:
+        np.testing.assert_allclose(known.parameters[name], estimated.parameters[name], rtol=1e-5)
+        assert 0.6 < estimated.deviations[name] / known.deviations[name] < 1.5
+
+
+def test_names_what_the_data_do_not_determine(system, motion):
+    """Mass, inertia, stiffness and damping scaled together leave the motion as it is."""
+    free = ["rod.mass", "rod.inertia", "spring.stiffness", "spring.damping"]
+    fit = mb.identify(system, noisy(motion, 2), ts=TS, free=free, sigma=SIGMA)
+    assert "spring.stiffness" in fit.undetermined and "rod.mass" in fit.undetermined
+    assert np.isinf(fit.deviations["rod.mass"])
+    assert "do not determine" in str(fit)
+
+
+def test_lengths_and_forces_with_the_state_assembled_anew(system):
+    """A body-fixed point from the pin's force, with the initial angle and rate held."""
+    true = mb.with_parameters(system, {"pin.point_b": jnp.array([-0.45, 0.02])})
+    start = {"fix": {"rod.angle": 0.2}, "rates": {"rod.angle": 1.0}}
+    motion = mb.simulate(true, mb.assemble(true, **start), t1=TS[-1], saveat=TS)
+    measured = {"pin.force": motion.reactions["pin"].force, "rod.position": motion["rod"].position}
+    fit = mb.identify(system, measured, ts=TS, free=["pin.point_b"], **start)
+    np.testing.assert_allclose(fit.parameters["pin.point_b"], [-0.45, 0.02], atol=1e-6)
+    np.testing.assert_allclose(fit.state.u[2], 1.0)
+    assert fit.components == ("pin.point_b[0]", "pin.point_b[1]")
+
+
+def test_optax(system, motion):
+    fit = mb.identify(
+        system,
+        noisy(motion, 3),
+        ts=TS,
+        free={"spring.stiffness": 8.0},
+        sigma={"rod.angle": 0.1},
+        method=optax.adam(0.05),
+        max_iterations=60,
+        tol=1e-3,
+    )
+    np.testing.assert_allclose(fit.parameters["spring.stiffness"], 6.0, rtol=0.02)
+
+
+def test_residual_function_and_bounds(system, motion):
+    """The user's own residuals; the estimate stays within its bounds, at the end that fits best."""
+    exact = motion["rod"].angle
+    fit = mb.identify(
+        system,
+        ts=TS,
+        free={"spring.stiffness": 8.0},
+        bounds={"spring.stiffness": (7.0, 9.0)},
+        residual=lambda trajectory: (trajectory["rod"].angle - exact) / 1e-3,
+        max_iterations=30,
+    )
+    assert 7.0 <= fit.parameters["spring.stiffness"] < 7.01
+
+
+def test_start_that_cannot_be_assembled():
+    """A link too short for its loop, under derivatives as well."""
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 2.0), position=(1.0, 0.0))
+    link = planar.PointMass("tip", mass=1.0, position=(2.0, 1.0))
+    joints = [
+        planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-1.0, 0.0)),
+        planar.Distance("rope", "bar", "tip", length=1.0, point_a=(1.0, 0.0)),
+        planar.Distance("anchor", "ground", "tip", length=3.0, point_a=(0.0, 4.0)),
+    ]
+    system = mb.Scene([bar, link], joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+    with pytest.raises(ValueError, match="fails with the starting values"):
+        mb.identify(system, {"bar.angle": np.zeros(30)}, ts=TS, free={"anchor.length": 30.0})
+
+
+def test_no_effect(system, motion):
+    with pytest.raises(ValueError, match="'pin.point_a' has no effect"):
+        mb.identify(system, noisy(motion, 0), ts=TS, free=["pin.point_a"])
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"free": ["rod.mas"]}, "did you mean 'rod.mass'"),
+        ({"free": []}, "Nothing is free"),
+        ({"free": {"rod.mass": [1.0, 2.0]}}, "has shape"),
+        ({"free": {"rod.mass": -1.0}}, "strictly between"),
+        ({"bounds": {"rod.inertia": (0.0, 1.0)}}, "free parameter with bounds"),
+        ({"measured": {"rod.angl": np.zeros(30)}}, "did you mean 'rod.angle'"),
+        ({"measured": {"rod.angle": np.zeros(29)}}, "must have shape"),
+        ({"measured": {}}, "at least one quantity"),
+        ({"measured": None}, "either measured quantities"),
+        ({"sigma": {"rod.position": 1.0}}, "not for 'rod.angle'"),
+        ({"sigma": {"rod.angle": 0.0}}, "must be positive"),
+        ({"ts": TS[::-1]}, "increasing"),
+        ({"t0": 0.5}, "after t0"),
+        ({"method": "newton"}, "method must be"),
+        ({"saveat": TS}, "identify sets 'saveat'"),
+    ],
+)
+def test_messages(system, change, message):
+    arguments = {"measured": {"rod.angle": np.zeros(30)}, "ts": TS, "free": ["rod.mass"]} | change
+    with pytest.raises(ValueError, match=message):
+        mb.identify(system, **arguments)
+
+
+def test_free_parameters_start_where_they_should(system):
+    """Zero is the start; masses stay positive and bounded values within their bounds whatever the vector."""
+    free = free_parameters(system, ["rod.mass", "spring.stiffness", "pin.point_b"], {"spring.stiffness": (5.0, 9.0)})
+    for name, value in free(jnp.zeros(free.size)).items():
+        np.testing.assert_allclose(value, mb.parameters(system)[name], rtol=1e-12)
+    for z in np.random.default_rng(0).normal(scale=5.0, size=(20, free.size)):
+        values = free(jnp.asarray(z))
+        assert values["rod.mass"] > 0 and 5.0 <= values["spring.stiffness"] <= 9.0
+
+
+def test_inertia_matrices_stay_positive_definite():
+    from jaxmb import spatial
+
+    inertia = np.array([[2.0, 0.1, 0.0], [0.1, 1.5, 0.2], [0.0, 0.2, 1.0]])
+    system = mb.Scene([spatial.Body("top", mass=1.0, inertia=inertia)]).compile()
+    free = free_parameters(system, ["top.inertia"], None)
+    assert free.size == 6
+    np.testing.assert_allclose(free(jnp.zeros(6))["top.inertia"], inertia, rtol=1e-12)
+    for z in np.random.default_rng(0).normal(size=(10, 6)):
+        value = free(jnp.asarray(z))["top.inertia"]
+        np.testing.assert_allclose(value, value.T)
+        assert np.all(np.linalg.eigvalsh(value) > 0)
+    assert np.linalg.matrix_rank(jax.jacfwd(free.flat)(jnp.zeros(6))) == 6
+
+
+def test_least_squares_rejects_failed_trials():
+    """Rosenbrock's function from its usual start, undefined beyond a line that full steps cross."""
+    failed = 0
+
+    def linearise(z):
+        nonlocal failed
+        failed += z[0] > 1.05
+        r = np.array([10 * (z[1] - z[0] ** 2), 1 - z[0]]) if z[0] <= 1.05 else np.full(2, np.inf)
+        return r, np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
+
+    solution = levenberg_marquardt(linearise, np.array([-1.2, -3.0]), tol=1e-10, limit=100, cut=1e-12)
+    assert solution.success
+    np.testing.assert_allclose(solution.z, [1.0, 1.0], atol=1e-8)
+    stuck = levenberg_marquardt(lambda z: (np.array([z[0] + 2]), np.eye(1)), np.zeros(1), tol=1e-10, limit=1, cut=1e-12)
+    assert not stuck.success
