@@ -8,6 +8,11 @@ from .assembly import nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
 from .system.rigid_bodies import Implied, Ranks, RigidBodySystem
 
+# Singular values of the equilibrated Jacobian of a part without freedom: below the first it does move, and between the two it
+# would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place: 6e-5.)
+_MOVES = 1e-8
+_LOCKED = 5e-3
+
 
 def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]:
     """Assemble from the given poses on concrete numbers, and eliminate.
@@ -23,6 +28,7 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
         )
     for what in ("velocities", "accelerations"):
         _check_left_over(system, what, *map(np.asarray, found[what]))
+    _check_locked(system, np.asarray(found["jacobian"])[: system.position_rows])
     position, velocity = int(found["holonomic"].rank), int(found["everything"].rank)
     coordinate = position + system.coordinate_rows - system.position_rows
     implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
@@ -69,6 +75,50 @@ def _check_left_over(system, what, left, asked):
             f"The {what} asked for by {', '.join(names)} contradict each other (largest residual {np.abs(left).max():.3g}). "
             "Remove one of them, or make their motions agree."
         )
+
+
+def _check_locked(system, jacobian):
+    """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
+
+    Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble, if at all,
+    where they lock. No row is implied there, but some nearly are.
+    """
+    scaled = jacobian * np.asarray(system.velocity_scale())[None, :]
+    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
+    for bodies, rows in _connected(system):
+        columns = system.layout.velocity_index[bodies].ravel()
+        columns = columns[columns < system.nu]
+        if len(rows) < len(columns):
+            continue
+        left, sizes, _ = np.linalg.svd(scaled[np.ix_(rows, columns)])
+        if _MOVES < sizes[-1] < _LOCKED:
+            share = np.abs(left[:, len(columns) - 1])
+            names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
+            raise ValueError(
+                f"{', '.join(system.body_names[k] for k in bodies)} cannot move: {', '.join(names)} leave no degree of freedom, but "
+                f"with dimensions that differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). Make "
+                "the points and lengths of redundant joints agree, or remove one of them."
+            )
+
+
+def _connected(system):
+    """Bodies that joints connect other than through the ground, with their rows; none that are driven in time."""
+    ground, row = system.layout.bodies, 0
+    label = list(range(ground))
+    parts = []
+    for g in system.constraints:
+        for own in g.group.bodies:
+            moving = [k for k in own if k != ground]
+            label = [label[moving[0]] if x in [label[k] for k in moving] else x for x in label] if moving else label
+            parts.append((moving, range(row, row + g.rows), g.group.part.rheonomic))
+            row += g.rows
+    out = []
+    for first in dict.fromkeys(label):
+        bodies = [k for k, x in enumerate(label) if x == first]
+        mine = [(rows, driven) for moving, rows, driven in parts if moving and moving[0] in bodies]
+        if mine and not any(driven for _, driven in mine):
+            out.append((bodies, [r for rows, _ in mine for r in rows]))
+    return out
 
 
 def _implied(system, jacobian, order, rank):

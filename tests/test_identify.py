@@ -1,5 +1,6 @@
-"""Parameters from measured motion: recovery, standard deviations, what the data do not determine, and trials that fail."""
+"""Parameters from measured motion: recovery, deviations, what the data do not determine, and trials that fail."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +11,13 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb._free import free_parameters
 from jaxmb._least_squares import levenberg_marquardt
+from jaxmb.identify import _quantities, _quantity
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
 SIGMA = {"rod.angle": 1e-3}
+# Compiles faster than Adams, where the solver does not matter.
+TSIT5 = diffrax.Tsit5()
 
 
 def pendulum():
@@ -77,69 +81,65 @@ def test_without_sigma_the_noise_is_estimated(system, motion):
 def test_names_what_the_data_do_not_determine(system, motion):
     """Mass, inertia, stiffness and damping scaled together leave the motion as it is."""
     free = ["rod.mass", "rod.inertia", "spring.stiffness", "spring.damping"]
-    fit = mb.identify(system, noisy(motion, 2), ts=TS, free=free, sigma=SIGMA)
+    fit = mb.identify(system, noisy(motion, 2), ts=TS, free=free, sigma=SIGMA, solver=TSIT5)
     assert "spring.stiffness" in fit.undetermined and "rod.mass" in fit.undetermined
     assert np.isinf(fit.deviations["rod.mass"])
     assert "do not determine" in str(fit)
 
 
-def test_lengths_and_forces_with_the_state_assembled_anew(system):
-    """A body-fixed point from the pin's force, with the initial angle and rate held."""
+def test_lengths_with_the_state_assembled_anew(system):
+    """A body-fixed point, with the initial angle and rate held."""
     true = mb.with_parameters(system, {"pin.point_b": jnp.array([-0.45, 0.02])})
     start = {"fix": {"rod.angle": 0.2}, "rates": {"rod.angle": 1.0}}
     motion = mb.simulate(true, mb.assemble(true, **start), t1=TS[-1], saveat=TS)
-    measured = {"pin.force": motion.reactions["pin"].force, "rod.position": motion["rod"].position}
-    fit = mb.identify(system, measured, ts=TS, free=["pin.point_b"], **start)
+    measured = {"rod.velocity": motion["rod"].velocity, "rod.position": motion["rod"].position}
+    fit = mb.identify(system, measured, ts=TS, free=["pin.point_b"], **start, solver=TSIT5)
     np.testing.assert_allclose(fit.parameters["pin.point_b"], [-0.45, 0.02], atol=1e-6)
     np.testing.assert_allclose(fit.state.u[2], 1.0)
     assert fit.components == ("pin.point_b[0]", "pin.point_b[1]")
 
 
-def test_optax(system, motion):
-    fit = mb.identify(
-        system,
-        noisy(motion, 3),
-        ts=TS,
-        free={"spring.stiffness": 8.0},
-        sigma={"rod.angle": 0.1},
-        method=optax.adam(0.05),
-        max_iterations=60,
-        tol=1e-3,
-    )
-    np.testing.assert_allclose(fit.parameters["spring.stiffness"], 6.0, rtol=0.02)
+def test_everything_listed_can_be_measured(system, motion):
+    for name, shape in _quantities(system, TS.size).items():
+        assert _quantity(motion, name).shape == shape
 
 
-def test_residual_function_and_bounds(system, motion):
-    """The user's own residuals; the estimate stays within its bounds, at the end that fits best."""
+def test_optax_with_own_residuals_and_bounds(system, motion):
+    """An optimiser on the user's residuals; the estimate ends at the bound that is nearest to the truth."""
     exact = motion["rod"].angle
     fit = mb.identify(
         system,
         ts=TS,
         free={"spring.stiffness": 8.0},
         bounds={"spring.stiffness": (7.0, 9.0)},
-        residual=lambda trajectory: (trajectory["rod"].angle - exact) / 1e-3,
-        max_iterations=30,
+        residual=lambda trajectory: (trajectory["rod"].angle - exact) / 0.01,
+        method=optax.adam(0.2),
+        max_iterations=40,
+        solver=TSIT5,
     )
-    assert 7.0 <= fit.parameters["spring.stiffness"] < 7.01
+    assert fit.iterations == 40 and not fit.success
+    assert 7.0 <= fit.parameters["spring.stiffness"] < 7.05
 
 
 def test_start_that_cannot_be_assembled():
-    """A link too short for its loop, under derivatives as well."""
-    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 2.0), position=(1.0, 0.0))
-    link = planar.PointMass("tip", mass=1.0, position=(2.0, 1.0))
-    joints = [
-        planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-1.0, 0.0)),
-        planar.Distance("rope", "bar", "tip", length=1.0, point_a=(1.0, 0.0)),
-        planar.Distance("anchor", "ground", "tip", length=3.0, point_a=(0.0, 4.0)),
+    """A rope too long for its loop, under derivatives as well."""
+    bodies = [
+        planar.PointMass("a", mass=1.0, position=(0.0, -1.0)),
+        planar.PointMass("b", mass=1.0, position=(1.0, -1.0)),
     ]
-    system = mb.Scene([bar, link], joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+    ropes = [
+        planar.Distance("left", "ground", "a", length=1.0),
+        planar.Distance("middle", "a", "b", length=1.0),
+        planar.Distance("right", "ground", "b", length=2.0, point_a=(2.0, 0.0)),
+    ]
+    system = mb.Scene(bodies, joints=ropes, forces=[mb.Gravity((0.0, -9.81))]).compile()
     with pytest.raises(ValueError, match="fails with the starting values"):
-        mb.identify(system, {"bar.angle": np.zeros(30)}, ts=TS, free={"anchor.length": 30.0})
+        mb.identify(system, {"a.position": np.zeros((30, 2))}, ts=TS, free={"right.length": 30.0}, solver=TSIT5)
 
 
-def test_no_effect(system, motion):
-    with pytest.raises(ValueError, match="'pin.point_a' has no effect"):
-        mb.identify(system, noisy(motion, 0), ts=TS, free=["pin.point_a"])
+def test_no_effect(system):
+    with pytest.raises(ValueError, match=r"'rod.mass' has no effect"):
+        mb.identify(system, ts=TS, free=["rod.mass"], residual=lambda trajectory: trajectory.ts, solver=TSIT5)
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
     solver: diffrax.AbstractSolver
     system: AbstractSystem
+    scan_kind: Any = None  # set by diffrax's adjoints, for the loop over stages
 
     @property
     def term_structure(self):
@@ -62,7 +63,10 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, dense_info, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        solver = self.solver
+        if self.scan_kind is not None:
+            solver = eqx.tree_at(lambda s: s.scan_kind, solver, self.scan_kind, is_leaf=lambda x: x is None)
+        y1, error, dense_info, solver_state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         direction = getattr(terms, "direction", 1)
         return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
 

@@ -50,7 +50,7 @@ class References:
 
     @property
     def scales(self) -> np.ndarray:
-        """The size that errors of each label are relative to: its largest value, 1 where that is zero; shape (labels,)."""
+        """The size that errors of a label are relative to: its largest value, or 1 if that is zero; shape (labels,)."""
         largest = np.max(np.abs(self.values), axis=0)
         return np.where(largest > 1e-12, largest, 1.0)
 
@@ -66,7 +66,8 @@ class Mechanism:
     - `system`, `state`: the compiled scene, and a consistent state of it at t = 0.
     - `t1`: the end of the motion that it is known for [s].
     - `references`: values to compare with, or None where there are none (other parameters than the published ones).
-    - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the references.
+    - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the
+        references.
     - `description`: what it is and where its data come from.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
     """

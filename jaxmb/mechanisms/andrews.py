@@ -63,20 +63,21 @@ def andrews(
     free_length: float = 0.07785,
     angle: float | None = None,
 ) -> Mechanism:
-    """Andrews' squeezing mechanism: seven bodies K1 … K7, ten pins, one degree of freedom, driven by a constant torque against a
-    spring; no gravity.
+    """Andrews' squeezing mechanism: seven bodies K1 … K7, ten pins, one degree of freedom, driven by a constant torque
+    against a spring; no gravity.
 
     Source: G. C. Andrews and M. K. Ormrod, "Advent: a simulation program for constrained planar kinematic and dynamic
-    systems", ASME 86-DET-97, 1986; data of W. Schiehlen (ed.), "Multibody Systems Handbook", Springer 1990, as in F. Mazzia and
-    C. Magherini, "Test Set for Initial Value Problem Solvers", 2008. The reference values were recomputed in extended precision in
-    two formulations: the end values printed in the test set are right to ten digits in the angles and to seven in their rates.
+    systems", ASME 86-DET-97, 1986; data of W. Schiehlen (ed.), "Multibody Systems Handbook", Springer 1990, as in F.
+    Mazzia and C. Magherini, "Test Set for Initial Value Problem Solvers", 2008. The reference values were recomputed in
+    extended precision in two formulations: the end values printed in the test set are right to ten digits in the angles
+    and to seven in their rates.
 
-    **Arguments:** `problem`: `"ivp"`, the test set's start and 0.03 s, or `"iftomm"`, problem A03 of the IFToMM library with 0.05 s;
-    `torque` [N m] on K1; `stiffness` [N/m] and `free_length` [m] of the spring; `angle` [rad] of K1 at the start, default that of
-    the problem (−0.0617… or −0.0620).
+    **Arguments:** `problem`: `"ivp"`, the test set's start and 0.03 s, or `"iftomm"`, problem A03 of the IFToMM library
+    with 0.05 s; `torque` [N m] on K1; `stiffness` [N/m] and `free_length` [m] of the spring; `angle` [rad] of K1 at the
+    start, default that of the problem (−0.0617… or −0.0620).
 
-    **Labels:** the test set's angles [rad] `beta`, `Theta`, `gamma`, `Phi`, `delta`, `Omega`, `epsilon` and their rates [rad/s]
-    `d_beta`, …; `F_x`, `F_y` [m], the crank's pin.
+    **Labels:** the test set's angles [rad] `beta`, `Theta`, `gamma`, `Phi`, `delta`, `Omega`, `epsilon` and their rates
+    [rad/s] `d_beta`, …; `F_x`, `F_y` [m], the crank's pin.
     """
     if problem not in _REFERENCES:
         raise ValueError(f"andrews: problem must be 'ivp' or 'iftomm', got {problem!r}.")

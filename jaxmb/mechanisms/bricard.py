@@ -12,13 +12,15 @@ _AXES = ("y", "z", "x", "y", "z", "x")
 
 @mechanism()
 def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gravity: float = 9.81) -> Mechanism:
-    """Six hinges P0 … P5 and five equal bars along the edges of a cube, a closed loop with one degree of freedom although counting
-    rows leaves none; y up, released from rest.
+    """Six hinges P0 … P5 and five equal bars along the edges of a cube, a closed loop with one degree of freedom
+    although counting rows leaves none; y up, released from rest.
 
-    Source: problem A04 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics. The reference values were
-    computed in two joint angles with the loop closed in closed form, in extended precision, and with all five.
+    Source: problem A04 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics. The reference
+    values were computed in two joint angles with the loop closed in closed form, in extended precision, and with all
+    five.
 
-    **Arguments:** `length` [m] and `mass` [kg] of a bar, `section` [m], edge of its square cross-section; `gravity` [m/s²].
+    **Arguments:** `length` [m] and `mass` [kg] of a bar, `section` [m], edge of its square cross-section; `gravity`
+    [m/s²].
 
     **Labels:** `x`, `y`, `z` [m] and `vx`, `vy`, `vz` [m/s] of the watched point, the hinge P2 between bars 2 and 3.
     """

@@ -24,17 +24,19 @@ def car_axis(
 ) -> Mechanism:
     """A chassis on two stiff springs, one wheel on a flat road and the other on a bumpy one.
 
-    Two point masses `left` and `right` of `mass epsilon² / 2`, joined by a massless bar, on springs of unit stiffness over the wheels
-    (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`; the left spring stays perpendicular to the
-    line between the wheels: `x_l x_b + y_l y_b = 0`, a constraint that depends on time.
+    Two point masses `left` and `right` of `mass epsilon² / 2`, joined by a massless bar, on springs of unit stiffness
+    over the wheels (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`; the left
+    spring stays perpendicular to the line between the wheels: `x_l x_b + y_l y_b = 0`, a constraint that depends on
+    time.
 
-    Source: S. Schneider, "Intégration de systèmes d'équations différentielles raides et différentielles-algébriques par des
-    méthodes de collocations et méthodes générales linéaires", thesis, Genève 1994, as in F. Mazzia and C. Magherini, "Test Set for
-    Initial Value Problem Solvers", 2008; all quantities without units. The reference values were recomputed in extended precision,
-    with multipliers and in two minimal coordinates; the test set's agree to 12 digits in positions and to 9 in velocities.
+    Source: S. Schneider, "Intégration de systèmes d'équations différentielles raides et différentielles-algébriques par
+    des méthodes de collocations et méthodes générales linéaires", thesis, Genève 1994, as in F. Mazzia and C.
+    Magherini, "Test Set for Initial Value Problem Solvers", 2008; all quantities without units. The reference values
+    were recomputed in extended precision, with multipliers and in two minimal coordinates; the test set's agree to 12
+    digits in positions and to 9 in velocities.
 
-    **Arguments:** as in the source, `mass` M, `epsilon` ε, `length` L of the axle and `free_length` L₀ of the springs, `amplitude` r and
-    `frequency` ω of the road, `gravity` g.
+    **Arguments:** as in the source, `mass` M, `epsilon` ε, `length` L of the axle and `free_length` L₀ of the springs,
+    `amplitude` r and `frequency` ω of the road, `gravity` g.
 
     **Labels:** `xl`, `yl`, `xr`, `yr`; `xl1`, … their rates; `lam1`, `lam2`, the source's multipliers.
     """

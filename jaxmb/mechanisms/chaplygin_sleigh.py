@@ -12,15 +12,18 @@ from ._base import Mechanism, References, build, mechanism, point_motion
 def chaplygin_sleigh(
     *, mass: float = 2.0, inertia: float = 0.5, distance: float = 0.3, speed: float = 1.0, spin: float = 2.0
 ) -> Mechanism:
-    """A sleigh on a horizontal plane with one blade behind its mass centre: it straightens out although nothing dissipates.
+    """A sleigh on a horizontal plane with one blade behind its mass centre: it straightens out although nothing
+    dissipates.
 
-    Source: S. A. Chaplygin, "On the theory of motion of nonholonomic systems. The reducing-multiplier theorem", Mat. Sb. 28(2),
-    1911. The reference values are the closed form `v = V tanh(kt + c)`, `ω = V/√J sech(kt + c)`, `k = aV/J`, `J = (I + m a²)/m`.
+    Source: S. A. Chaplygin, "On the theory of motion of nonholonomic systems. The reducing-multiplier theorem", Mat.
+    Sb. 28(2), 1911. The reference values are the closed form `v = V tanh(kt + c)`, `ω = V/√J sech(kt + c)`, `k = aV/J`,
+    `J = (I + m a²)/m`.
 
-    **Arguments:** `mass` m [kg]; `inertia` I [kg m²] about the mass centre; `distance` a [m] from the blade forward to the mass
-    centre; `speed` [m/s] of the blade and `spin` [rad/s] at the start, with the blade in the origin, along x.
+    **Arguments:** `mass` m [kg]; `inertia` I [kg m²] about the mass centre; `distance` a [m] from the blade forward to
+    the mass centre; `speed` [m/s] of the blade and `spin` [rad/s] at the start, with the blade in the origin, along x.
 
-    **Labels:** `x_blade`, `y_blade` [m]; `theta` [rad], heading from x; `v` [m/s] of the blade, forward; `omega` [rad/s].
+    **Labels:** `x_blade`, `y_blade` [m]; `theta` [rad], heading from x; `v` [m/s] of the blade, forward; `omega`
+    [rad/s].
     """
     sleigh = planar.Body("sleigh", mass=mass, inertia=inertia, position=(distance, 0.0))
     blade = planar.KnifeEdge("blade", "sleigh", point=(-distance, 0.0))

@@ -16,13 +16,14 @@ def free_body(
 ) -> Mechanism:
     """A rigid body without forces, spinning about its middle axis, which is unstable: it turns over again and again.
 
-    The reference values are Jacobi's elliptic functions (angular velocity), and a quaternion solution in extended precision.
+    The reference values are Jacobi's elliptic functions (angular velocity), and a quaternion solution in extended
+    precision.
 
-    **Arguments:** `mass` [kg]; `inertia` [kg m²], principal moments, shape (3,); `angular_velocity` [rad/s] at the start, body frame,
-    shape (3,).
+    **Arguments:** `mass` [kg]; `inertia` [kg m²], principal moments, shape (3,); `angular_velocity` [rad/s] at the
+    start, body frame, shape (3,).
 
-    **Labels:** `q0` … `q3`, Euler parameters, scalar first, from (1, 0, 0, 0); `w1`, `w2`, `w3` [rad/s], angular velocity in the
-    body frame.
+    **Labels:** `q0` … `q3`, Euler parameters, scalar first, from (1, 0, 0, 0); `w1`, `w2`, `w3` [rad/s], angular
+    velocity in the body frame.
     """
     body = spatial.Body("body", mass=mass, inertia=np.asarray(inertia, dtype=float))
     return build(

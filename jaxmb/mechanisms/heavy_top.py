@@ -21,15 +21,15 @@ def heavy_top(
 ) -> Mechanism:
     """A symmetric top whose tip is held in the origin by a ball joint; z up.
 
-    Its axis is `e₃ = (sin ψ sin θ, −cos ψ sin θ, cos θ)`, θ the tilt from the vertical and ψ the precession angle. The reference
-    values are Lagrange's solution in elliptic functions.
+    Its axis is `e₃ = (sin ψ sin θ, −cos ψ sin θ, cos θ)`, θ the tilt from the vertical and ψ the precession angle. The
+    reference values are Lagrange's solution in elliptic functions.
 
-    **Arguments:** `mass` [kg]; `distance` [m] from the tip to the mass centre; `inertia` [kg m²] about the mass centre, across and
-    along the axis, shape (2,); `tilt` θ [rad], `precession` dψ/dt [rad/s] and `spin` ω₃ [rad/s] about its own axis at the start, with
-    dθ/dt = 0; `gravity` [m/s²].
+    **Arguments:** `mass` [kg]; `distance` [m] from the tip to the mass centre; `inertia` [kg m²] about the mass centre,
+    across and along the axis, shape (2,); `tilt` θ [rad], `precession` dψ/dt [rad/s] and `spin` ω₃ [rad/s] about its
+    own axis at the start, with dθ/dt = 0; `gravity` [m/s²].
 
-    **Labels:** `xc`, `yc`, `zc` [m], the mass centre; `e0` … `e3`, Euler parameters from the body frame, whose third axis is
-    that of the top; `w1`, `w2`, `w3` [rad/s], angular velocity in the body frame.
+    **Labels:** `xc`, `yc`, `zc` [m], the mass centre; `e0` … `e3`, Euler parameters from the body frame, whose third
+    axis is that of the top; `w1`, `w2`, `w3` [rad/s], angular velocity in the body frame.
     """
     across, along = inertia
     p = np.asarray(rotations.from_axis_angle((1.0, 0.0, 0.0), tilt))

@@ -22,11 +22,12 @@ def parallelogram(
 ) -> Mechanism:
     """Parallel rockers of equal length that carry a coupler: every rocker after the second is redundant; y up.
 
-    It moves only because the rockers agree exactly. With `offset`, the last rocker's ground pin is moved, and three rockers lock.
+    It moves only because the rockers agree exactly. With `offset`, the last rocker's ground pin is moved, and three
+    rockers lock.
 
-    **Arguments:** `rockers` ≥ 2; `offset` [m] of the last ground pin along x; length of a `rocker` and `spacing` of the pins [m];
-    `masses` [kg] of one rocker and of the coupler, uniform rods, shape (2,); `angle` [rad] of the rockers from the x axis and their
-    `speed` [rad/s] at the start; `gravity` [m/s²].
+    **Arguments:** `rockers` ≥ 2; `offset` [m] of the last ground pin along x; length of a `rocker` and `spacing` of the
+    pins [m]; `masses` [kg] of one rocker and of the coupler, uniform rods, shape (2,); `angle` [rad] of the rockers
+    from the x axis and their `speed` [rad/s] at the start; `gravity` [m/s²].
 
     **Labels:** `angle` [rad], `rate` [rad/s] of the first rocker; `x`, `y` [m] of the coupler's centre.
     """
@@ -35,7 +36,9 @@ def parallelogram(
     along = rocker * np.array([np.cos(angle), np.sin(angle)])
     width = spacing * (rockers - 1)
     bodies = [
-        planar.Body("coupler", mass=masses[1], inertia=planar.rod(masses[1], width), position=along + (width / 2, 0))
+        planar.Body(
+            "coupler", mass=masses[1], inertia=planar.rod(masses[1], width), position=along + np.array([width / 2, 0.0])
+        )
     ]
     joints = []
     for k in range(rockers):

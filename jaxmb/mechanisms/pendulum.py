@@ -19,11 +19,11 @@ def pendulum(
 ) -> Mechanism:
     """A point mass on a massless bar, released at the side; x to the right, y up, the pivot in the origin.
 
-    Source: problem A01 of the IFToMM Library of Computational Benchmark Problems (1 kg, 1 m, released at (−1, 0)). The reference
-    values are Jacobi's elliptic functions in 22 digits.
+    Source: problem A01 of the IFToMM Library of Computational Benchmark Problems (1 kg, 1 m, released at (−1, 0)). The
+    reference values are Jacobi's elliptic functions in 22 digits.
 
-    **Arguments:** `mass` [kg]; `length` [m]; `angle` [rad] from the downward vertical, counter-clockwise, and its `rate` [rad/s], at
-    the start; `gravity` [m/s²].
+    **Arguments:** `mass` [kg]; `length` [m]; `angle` [rad] from the downward vertical, counter-clockwise, and its
+    `rate` [rad/s], at the start; `gravity` [m/s²].
 
     **Labels:** `x`, `y` [m], `vx`, `vy` [m/s] of the mass.
     """

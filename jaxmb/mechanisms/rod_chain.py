@@ -10,15 +10,16 @@ from ._base import Mechanism, References, build, mechanism, point_motion
 
 @mechanism(variants=("n",))
 def rod_chain(*, n: int = 10, length: float = 1.0, mass: float = 1.0, gravity: float = 9.81) -> Mechanism:
-    """A hanging chain of n equal uniform slender rods, released from rest with all links horizontal; y up, the pin in the origin.
+    """A hanging chain of n equal uniform slender rods, released from rest with all links horizontal; y up, the pin in
+    the origin.
 
-    The motion is chaotic: errors grow by orders of magnitude a second. The reference values, for n = 2, 5, 10 and 50, are
-    solutions in absolute angles in extended precision, checked by a solution with Lagrange multipliers.
+    The motion is chaotic: errors grow by orders of magnitude a second. The reference values, for n = 2, 5, 10 and 50,
+    are solutions in absolute angles in extended precision, checked by a solution with Lagrange multipliers.
 
     **Arguments:** `n` ≥ 1, the number of links; `length` [m] and `mass` [kg] of the whole chain; `gravity` [m/s²].
 
-    **Labels:** `tip_x`, `tip_y` [m], of the free end; `th1`, `th2`, … [rad], angles of the links from the downward vertical,
-    counter-clockwise; `w1`, `w2`, … [rad/s], their rates.
+    **Labels:** `tip_x`, `tip_y` [m], of the free end; `th1`, `th2`, … [rad], angles of the links from the downward
+    vertical, counter-clockwise; `w1`, `w2`, … [rad/s], their rates.
     """
     if n < 1:
         raise ValueError(f"rod_chain needs n ≥ 1 links, got {n}.")

@@ -5,7 +5,7 @@ import numpy as np
 from .. import planar
 from .._forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, build, mechanism
+from ._base import Mechanism, References, build, mechanism
 
 
 @mechanism()
@@ -21,15 +21,16 @@ def slider_crank(
 ) -> Mechanism:
     """Crank, connecting rod and slider on the x axis, all mass centres in the middle, spun up and left alone; y up.
 
-    Source: the data of P. Flores, R. Leine and C. Glocker, "Modeling and analysis of planar rigid multibody systems with
-    translational clearance joints based on the non-smooth dynamics approach", Multibody Syst. Dyn. 23, 2010, without clearance. The
-    reference values come from an independent model with one coordinate.
+    Source: the data of P. Flores, R. Leine and C. Glocker, "Modeling and analysis of planar rigid multibody systems
+    with translational clearance joints based on the non-smooth dynamics approach", Multibody Syst. Dyn. 23, 2010,
+    without clearance. The reference values come from an independent model with one coordinate.
 
-    **Arguments:** lengths of `crank` and `rod` [m]; `masses` [kg] and `inertias` [kg m²], about the mass centres, of crank, rod and
-    slider, shape (3,); `angle` [rad] of the crank from the x axis and its `speed` [rad/s] at the start; `gravity` [m/s²].
+    **Arguments:** lengths of `crank` and `rod` [m]; `masses` [kg] and `inertias` [kg m²], about the mass centres, of
+    crank, rod and slider, shape (3,); `angle` [rad] of the crank from the x axis and its `speed` [rad/s] at the start;
+    `gravity` [m/s²].
 
-    **Labels:** `crank`, `rod` [rad], angles of crank and rod from the x axis; `x` [m] of the slider; `crank_rate`, `rod_rate`
-    [rad/s]; `x_dot` [m/s].
+    **Labels:** `crank`, `rod` [rad], angles of crank and rod from the x axis; `x` [m] of the slider; `crank_rate`,
+    `rod_rate` [rad/s]; `x_dot` [m/s].
     """
     B = crank * np.array([np.cos(angle), np.sin(angle)])
     C = np.array([B[0] + np.sqrt(max(rod**2 - B[1] ** 2, 0.0)), 0.0])
@@ -72,4 +73,29 @@ def _observe(trajectory):
     }
 
 
-_REFERENCES = None
+_REFERENCES = References(
+    times=np.array([0.1, 0.2]),
+    labels=("crank", "rod", "x", "crank_rate", "rod_rate", "x_dot"),
+    values=np.array(
+        [
+            [
+                9.140152416941632,
+                -0.14086443541998273,
+                0.15612473949874364,
+                144.40633208906323,
+                69.99147193939002,
+                -3.19701913171785,
+            ],
+            [
+                18.39445098299742,
+                0.22158719468433913,
+                0.43594513401230367,
+                97.13941142358507,
+                -44.71943058886019,
+                9.54031293880763,
+            ],
+        ]
+    ),
+    source="one coordinate, with equations of its own, extrapolation method in extended precision",
+    tolerance=1e-12,
+)

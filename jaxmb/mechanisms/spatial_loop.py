@@ -21,10 +21,11 @@ def spatial_loop(
 ) -> Mechanism:
     """The linkage of `four_bar` in space, with four parallel hinges and a base that is a body welded to the ground.
 
-    Hinges in space hold the bars in their plane more often than needed: of the 30 rows between 28 coordinates (26 of joints, 4 of
-    Euler parameters) three follow from the others, and one degree of freedom is left.
+    Hinges in space hold the bars in their plane more often than needed: of the 30 rows between 28 coordinates (26 of
+    joints, 4 of Euler parameters) three follow from the others, and one degree of freedom is left.
 
-    Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, example 10.1.1 (the count).
+    Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, example 10.1.1 (the
+    count).
 
     **Arguments:** as in `four_bar`; `section` [m], edge of the bars' square cross-section. y up, hinges along z.
 

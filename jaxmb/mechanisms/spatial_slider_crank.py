@@ -18,18 +18,18 @@ def spatial_slider_crank(
     speed: float = 6.0,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """A crank that turns about an axis parallel to x, a rod with a ball joint B at the crank and a Cardan joint C at a slider on
-    the x axis; z up.
+    """A crank that turns about an axis parallel to x, a rod with a ball joint B at the crank and a Cardan joint C at a
+    slider on the x axis; z up.
 
-    The crank's centre is A = (0, y, z); at the start B is above A and the rod points towards +x. One axis of the Cardan joint is
-    the slide, the other is across it and the rod.
+    The crank's centre is A = (0, y, z); at the start B is above A and the rod points towards +x. One axis of the Cardan
+    joint is the slide, the other is across it and the rod.
 
-    Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, §10.2, with the masses of the test
-    `sliderCrank3Dbenchmark` of EXUDYN. The reference values come from a model with one coordinate, checked by one with four
-    coordinates and three multipliers, in extended precision.
+    Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, §10.2, with the masses of
+    the test `sliderCrank3Dbenchmark` of EXUDYN. The reference values come from a model with one coordinate, checked by
+    one with four coordinates and three multipliers, in extended precision.
 
-    **Arguments:** lengths of `crank` and `rod` [m]; `center` [m], y and z of A, shape (2,); `masses` [kg] of crank, rod and slider, shape
-    (3,); `speed` [rad/s] of the crank at the start; `gravity` [m/s²].
+    **Arguments:** lengths of `crank` and `rod` [m]; `center` [m], y and z of A, shape (2,); `masses` [kg] of crank, rod
+    and slider, shape (3,); `speed` [rad/s] of the crank at the start; `gravity` [m/s²].
 
     **Labels:** `x` [m] and `x_dot` [m/s] of the slider; `cos`, `sin` of the crank's angle θ about x, zero at the start;
     `theta_dot` [rad/s].

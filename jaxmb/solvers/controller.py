@@ -193,20 +193,27 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
 
     def _first_step(self, terms, t0, t1, y0, args, func) -> Any:
         """The step of order one that would just meet the tolerance, from one trial evaluation."""
+        frozen = lambda tree: jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+        terms, t0, t1, y0, args = frozen((terms, t0, t1, y0, args))
         flat = ravel(y0)
         with jax.numpy_dtype_promotion("standard"):
             scale = (self.atol + self.rtol * jnp.abs(flat)).astype(flat.dtype)
         size = lambda x: norm_of(self.norm, x / scale, y0)
-        f = ravel(func(terms, t0, y0, args), flat.dtype)
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
-        # Within this time the state changes by its own size, or at least by the tolerance.
-        reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
-        trial = reach / 100
-        f_trial = ravel(func(terms, t0 + trial.astype(t0.dtype), unravel_like(y0, flat + trial * f), args), flat.dtype)
+
+        def trial(carry, _):
+            # At the start, then where the first derivative leads: a loop, so that the vector field is compiled once.
+            t, y = carry
+            f = ravel(func(terms, t, unravel_like(y0, y), args), flat.dtype)
+            # Within this time the state changes by its own size, or at least by the tolerance.
+            reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
+            return (t0 + (reach / 100).astype(t0.dtype), flat + reach / 100 * f), (f, reach)
+
+        _, (f, (reach, _)) = lax.scan(trial, (t0, flat), None, length=2)
         # The local error of order one is h^2/2 times the change of the derivative.
-        change = size(f_trial - f) / trial
+        change = size(f[1] - f[0]) / (reach / 100)
         step = jnp.minimum(1 / jnp.sqrt(change), reach)
-        return lax.stop_gradient(jnp.where(jnp.isfinite(step), step, span / 1000).astype(t0.dtype))
+        return jnp.where(jnp.isfinite(step), step, span / 1000).astype(t0.dtype)
 
 
 def _is_known(x: Any) -> bool:

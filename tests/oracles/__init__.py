@@ -1,0 +1,1 @@
+"""Models that share no code with the package."""

@@ -1,0 +1,63 @@
+"""The command line, run in this process."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import jaxmb as mb
+from jaxmb.cli import main
+
+
+def test_mechanisms(capsys):
+    assert main(["mechanisms"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert tuple(line.split()[0] for line in lines) == mb.mechanisms.names()
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_run(capsys, tmp_path):
+    """A run prints errors against reference values and a fit next to the truth, and writes its files."""
+    assert main(["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for text in ("pendulum", "elliptic functions", "Error against run time", "Identifying bar.length", "true value 1"):
+        assert text in out
+    motion = mb.load(tmp_path / "motion.npz")
+    assert motion["t"][-1] == 1.0 and motion["bob.position"].shape == (motion["t"].size, 2)
+    for name in ("work_precision.png", "motion.png", "mechanism.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_report(capsys, tmp_path):
+    words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("Adams", "Tsit5", "Dopri8"))
+    assert len(json.loads((tmp_path / "work_precision.json").read_text())["runs"]) == 3
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["run", "pendulm"], "did you mean 'pendulum'"),
+        (["report", "pendulm"], "did you mean 'pendulum'"),
+        (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
+        (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
+    ],
+)
+def test_wrong_words(words, message, capsys, tmp_path):
+    assert main([*words, "--out", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_no_command(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    assert "usage: jaxmb" in capsys.readouterr().err
+
+
+def test_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "jaxmb", "--help"], capture_output=True, text=True, check=True)
+    assert "mechanisms" in done.stdout

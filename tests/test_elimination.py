@@ -1,0 +1,106 @@
+"""Full-pivot elimination against NumPy's ranks, inverses and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxmb.elimination import factor, full_pivot, gauss_jordan, solve_positive
+
+RNG = np.random.default_rng(0)
+
+
+def random_matrix(m, n, rank):
+    return jnp.asarray(RNG.normal(size=(m, rank)) @ RNG.normal(size=(rank, n)))
+
+
+@pytest.mark.parametrize(("m", "n", "rank"), [(1, 3, 1), (4, 9, 4), (8, 9, 8), (9, 7, 7), (12, 14, 9), (30, 35, 28), (5, 5, 0)])
+def test_rank_orders_and_influence(m, n, rank):
+    A = random_matrix(m, n, rank)
+    pivots = full_pivot(A)
+    assert int(pivots.rank) == rank
+    order = pivots.order
+    assert sorted(np.asarray(order.rows)) == list(range(m))
+    assert sorted(np.asarray(order.columns)) == list(range(n))
+    np.testing.assert_array_equal(np.asarray(order.rows)[np.asarray(order.row_place)], np.arange(m))
+    np.testing.assert_array_equal(np.asarray(order.columns)[np.asarray(order.column_place)], np.arange(n))
+    solved = factor(A, order, rank)
+    np.testing.assert_allclose(A @ solved.basis, 0, atol=1e-11 * max(1, float(jnp.max(jnp.abs(A)))))
+    independent = np.asarray(order.columns)[rank:]
+    np.testing.assert_allclose(solved.basis[independent], np.eye(n - rank), atol=0)
+    # The correction solves consistent equations and leaves independent columns alone.
+    x = jnp.asarray(RNG.normal(size=n))
+    moved = solved.correction @ (A @ x)
+    np.testing.assert_allclose(A @ moved, A @ x, atol=1e-10 * max(1, float(jnp.max(jnp.abs(A @ x)))))
+    np.testing.assert_allclose(moved[independent], 0, atol=0)
+
+
+def test_influence_is_of_order_one():
+    for _ in range(20):
+        A = random_matrix(8, 12, 8)
+        pivots = full_pivot(A)
+        influence = factor(A, pivots.order, 8).basis
+        assert float(jnp.max(jnp.abs(influence))) < 10
+
+
+def test_scale_decides_between_units():
+    # One row, a length of 1000 against an angle: in scaled units the angle counts more.
+    A = jnp.array([[1.0, 0.1]])
+    assert int(full_pivot(A).order.columns[0]) == 0
+    assert int(full_pivot(A, scale=jnp.array([1e-3, 1.0])).order.columns[0]) == 1
+
+
+def test_stages_nest():
+    A = jnp.concatenate([0.1 * random_matrix(2, 6, 2), random_matrix(2, 6, 2)])
+    order = full_pivot(A, stage=jnp.array([0, 0, 1, 1])).order
+    assert set(np.asarray(order.rows[:2]).tolist()) == {0, 1}
+    np.testing.assert_array_equal(order.columns[:2], full_pivot(A[:2]).order.columns[:2])
+
+
+def test_rank_tolerance_between_rounding_and_near_toggle():
+    rows = random_matrix(3, 6, 3)
+    implied = jnp.concatenate([rows, (rows[0] + rows[1] + 1e-15)[None]])
+    assert int(full_pivot(implied).rank) == 3
+    near = implied.at[3, 2].add(1e-5)
+    assert int(full_pivot(near).rank) == 4
+
+
+def test_jit_vmap_equal_loop():
+    batch = jnp.stack([random_matrix(5, 8, 5) for _ in range(4)])
+    together = jax.jit(jax.vmap(full_pivot))(batch)
+    for k in range(4):
+        alone = full_pivot(batch[k])
+        np.testing.assert_array_equal(together.order.packed[k], alone.order.packed)
+
+
+@pytest.mark.parametrize("n", [3, 8, 30])
+def test_gauss_jordan_values_and_derivatives(n):
+    B = jnp.asarray(RNG.normal(size=(n, n + 3)) + np.eye(n, n + 3) * 10)
+    swept = gauss_jordan(B, n)
+    inverse = np.linalg.inv(B[:, :n])
+    np.testing.assert_allclose(swept, np.concatenate([inverse, inverse @ B[:, n:]], axis=1), rtol=0, atol=1e-12)
+    weights = jnp.asarray(RNG.normal(size=swept.shape))
+    loss = lambda B: jnp.sum(weights * jnp.sin(gauss_jordan(B, n)))
+    gradient = jax.grad(loss)(B)
+    direction = jnp.asarray(RNG.normal(size=B.shape))
+    forward = jax.jvp(loss, (B,), (direction,))[1]
+    central = (loss(B + 1e-5 * direction) - loss(B - 1e-5 * direction)) / 2e-5
+    np.testing.assert_allclose(jnp.vdot(gradient, direction), forward, rtol=1e-10)
+    np.testing.assert_allclose(forward, central, rtol=1e-6)
+
+
+def test_factor_second_derivative():
+    A = random_matrix(4, 6, 4)
+    order = full_pivot(A).order
+    direction = random_matrix(4, 6, 4)
+    curve = lambda s: jnp.sum(factor(A + s * direction, order, 4).basis ** 2)
+    second = jax.grad(jax.grad(curve))(0.0)
+    h = 1e-4
+    np.testing.assert_allclose(second, (curve(h) - 2 * curve(0.0) + curve(-h)) / h**2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("n", [0, 1, 5, 30])
+def test_solve_positive(n):
+    root = jnp.asarray(RNG.normal(size=(n, n)))
+    M = root @ root.T + jnp.eye(n)
+    b = jnp.asarray(RNG.normal(size=n))
+    np.testing.assert_allclose(M @ solve_positive(M, b), b, atol=1e-10)

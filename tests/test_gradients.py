@@ -1,0 +1,111 @@
+"""Gradients of motions: forward mode = reverse mode, and both = central differences of a tighter solution.
+
+Every mechanism gets a driven anchor and a spring from the anchor to one of its bodies, so that parameters of every kind are
+there: mass, inertia, body-fixed point, stiffness, a driver's parameter, and an initial rate.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jaxmb as mb
+import numpy as np
+import pytest
+from jaxmb import planar, spatial
+
+TIME = 0.4
+
+
+def planar_anchor(body, point):
+    anchor = planar.Body("anchor", mass=1.0, inertia=1.0, position=(0.5, 2.0))
+    swing = lambda t, p: 0.5 + p["amplitude"] * jnp.sin(p["rate"] * t)
+    joints = [
+        planar.Prismatic("rail", "ground", "anchor", point=(0.5, 2.0), axis=(1.0, 0.0)),
+        planar.Driver("drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}),
+    ]
+    spring = planar.SpringDamper(
+        "spring", "anchor", body, stiffness=20.0, damping=0.5, free_length=0.4, point_a=(0.1, 0.0), point_b=point
+    )
+    return anchor, joints, spring
+
+
+def spatial_anchor(body, point):
+    anchor = spatial.Body("anchor", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.5, 0.2, 0.9))
+    swing = lambda t, p: 0.5 + p["amplitude"] * jnp.sin(p["rate"] * t)
+    joints = [
+        spatial.Prismatic("rail", "ground", "anchor", point=(0.5, 0.2, 0.9), axis=(1.0, 0.0, 0.0)),
+        spatial.Driver("drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}),
+    ]
+    spring = spatial.SpringDamper(
+        "spring", "anchor", body, stiffness=5.0, damping=0.1, free_length=0.4, point_a=(0.1, 0.0, 0.0), point_b=point
+    )
+    return anchor, joints, spring
+
+
+CASES = {
+    # mechanism: (body of the spring, its point, more fixed coordinates, rate that is differentiated, other parameters)
+    "four_bar": ("rocker", (0.3, 0.1), "crank.angle", ["crank.mass", "rocker.inertia", "spring.point_b"]),
+    "bricard": ("bar3", (0.1, 0.0, 0.2), "bar1.wy", ["bar2.mass", "bar3.inertia", "spring.point_b"]),
+    "rolling_disk": ("disk", (0.05, 0.02, 0.1), "disk.wy", ["disk.mass", "disk.inertia", "spring.point_b", "plane.radius"]),
+    "heavy_top": ("top", (0.02, 0.01, 0.05), "top.wz", ["top.mass", "top.inertia", "tip.point_b", "spring.point_b"]),
+}
+
+
+def build(name):
+    """A scalar of the motion as a function of parameters by name, at a given tolerance and adjoint."""
+    body, point, rate, names = CASES[name]
+    mechanism = mb.mechanisms.get(name)
+    space = planar_anchor if name == "four_bar" else spatial_anchor
+    anchor, joints, spring = space(body, point)
+    scene = mechanism.scene
+    system = mb.Scene(
+        (*scene.bodies, anchor), joints=(*scene.joints, *joints), forces=(*scene.forces, spring)
+    ).compile()
+    rates = dict(mechanism.rates) or {rate: 0.0}
+    start = {k: v for k, v in mb.parameters(system).items() if k in [*names, "spring.stiffness", "drive.rate"]}
+    whole = rate.rsplit(".", 1)[0] + ".angular_velocity"
+
+    def observe(parameters, rtol, adjoint):
+        parameters = dict(parameters)
+        spin = parameters.pop("initial rate")
+        own = dict(rates)
+        if whole in own:
+            k = {"x": 0, "y": 1, "z": 2}[rate[-1]]
+            own[whole] = jnp.asarray(own[whole], float).at[k].add(spin)
+        else:
+            own[rate] = jnp.asarray(own[rate], float) + spin
+        changed = mb.with_parameters(system, parameters)
+        state = mb.assemble(changed, fix=mechanism.fix, rates=own, throw=False)
+        sol = mb.simulate(changed, state, t1=TIME, rtol=rtol, adjoint=adjoint, max_steps=1024, throw=False)
+        weights = jnp.cos(jnp.arange(system.nq + system.nu, dtype=float))
+        return jnp.sum(weights * jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]))
+
+    return observe, {**start, "initial rate": jnp.array(0.1)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_forward_reverse_and_central_differences(name):
+    observe, start = build(name)
+    flat, unravel = jax.flatten_util.ravel_pytree(start)
+    loss = lambda x, rtol, adjoint: observe(unravel(x), rtol, adjoint)
+    forward = jax.jit(jax.jacfwd(lambda x: loss(x, 1e-9, diffrax.ForwardMode())))(flat)
+    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-9, None)))(flat)
+    scale = np.max(np.abs(forward))
+    assert np.all(np.isfinite(forward))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
+
+    tight = jax.jit(jax.vmap(lambda x: loss(x, 1e-12, None)))
+    h = 1e-4 * np.maximum(np.abs(flat), 1e-2)
+    # Richardson's extrapolation of central differences, so that their own error is below the one tested.
+    steps = np.concatenate([np.diag(k * h) for k in (1.0, -1.0, 2.0, -2.0)])
+    n = len(h)
+    values = np.asarray(tight(flat[None, :] + steps))
+    plain, double = (values[:n] - values[n : 2 * n]) / (2 * h), (values[2 * n : 3 * n] - values[3 * n :]) / (4 * h)
+    central = (4 * plain - double) / 3
+    np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-7 * scale)
+
+
+def test_every_parameter_is_felt():
+    """The gradients compared above are not all zeros."""
+    observe, start = build("four_bar")
+    gradient = jax.grad(lambda p: observe(p, 1e-6, None))(start)
+    assert all(np.all(np.abs(v) > 1e-8) for k, v in gradient.items() if k != "spring.point_b")
