@@ -77,9 +77,9 @@ class SpringDamper(AbstractForce):
     body_b: str = eqx.field(static=True)
     stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    free_length: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_a: Float[Array, "d"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "d"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    free_length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = True
 
     @property
@@ -121,8 +121,8 @@ class Damper(AbstractForce):
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
     damping: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    point_a: Float[Array, "d"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "d"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = False
 
     @property
@@ -148,7 +148,7 @@ class PointForce(AbstractForce):
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)
     force: Float[Array, "d"] = eqx.field(converter=number, kw_only=True)
-    point: Float[Array, "d"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     frame: Literal["world", "body"] = eqx.field(static=True, default="world", kw_only=True)
     conservative: ClassVar[bool] = False
 

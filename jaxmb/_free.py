@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -13,13 +13,18 @@ from jaxtyping import Array, ArrayLike, Float
 from ._names import unknown
 from .system import RigidBodySystem, parameters
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
 
 class AbstractRange(eqx.Module):
     """The values that one parameter may take, as the image of a vector `z`."""
 
-    start: eqx.AbstractVar[Array]
+    start: AbstractVar[Array]
 
     @property
     def size(self) -> int:

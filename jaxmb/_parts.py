@@ -6,7 +6,7 @@ stacked and `vmap`ped, so a kernel here is written for a single part and for the
 """
 
 import abc
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,11 @@ from jaxtyping import Array, Float
 
 from ._space import AbstractSpace
 from ._types import Scalar
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 Poses = Float[Array, "k p"]
 Velocities = Float[Array, "k v"]
@@ -31,21 +36,21 @@ def number(value: Any) -> Array:
     return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
-def optional_number(value: Any) -> Array | None:
-    """A strongly typed float array, or None where the value is to be worked out later."""
+def optional_number(value: Any) -> Any:
+    """A strongly typed float array, or None where `resolve` is to work the value out; fields have the type they have after that."""
     return None if value is None else number(value)
 
 
 class AbstractPart(eqx.Module):
     """Anything with a name in a scene."""
 
-    name: eqx.AbstractVar[str]
+    name: AbstractVar[str]
 
 
 class AbstractLink(AbstractPart):
     """A part that acts between bodies."""
 
-    bodies: eqx.AbstractVar[tuple[str, ...]]
+    bodies: AbstractVar[tuple[str, ...]]
 
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
         """The same part with every number filled in: world points and axes turned into body-fixed ones at the given poses."""
@@ -63,8 +68,8 @@ class AbstractConstraint(AbstractLink):
     `rows` is the static number of scalar equations; `rheonomic` says whether the residual depends on time.
     """
 
-    rows: eqx.AbstractVar[int]
-    rheonomic: eqx.AbstractVar[bool]
+    rows: AbstractVar[int]
+    rheonomic: AbstractVar[bool]
 
     @abc.abstractmethod
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
@@ -78,9 +83,9 @@ class AbstractVelocityConstraint(AbstractLink):
     vanishes at rest.
     """
 
-    rows: eqx.AbstractVar[int]
-    linear: eqx.AbstractVar[bool]
-    homogeneous: eqx.AbstractVar[bool]
+    rows: AbstractVar[int]
+    linear: AbstractVar[bool]
+    homogeneous: AbstractVar[bool]
 
     @abc.abstractmethod
     def residual(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Float[Array, "rows"]:
@@ -93,7 +98,7 @@ class AbstractForce(AbstractLink):
     `conservative` says whether `energy` holds a potential energy of this part; the rest of its power is dissipated or supplied.
     """
 
-    conservative: eqx.AbstractVar[bool]
+    conservative: AbstractVar[bool]
 
     @abc.abstractmethod
     def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:

@@ -77,6 +77,6 @@ def fill(part, field: str, value: Array):
 
 def positive(part: AbstractPart, field: str, value: Array, *, zero: bool = False) -> None:
     """Check the sign of a number or of every component of an array."""
-    value = np.asarray(value)
-    if not np.all(np.isfinite(value)) or np.any(value < 0) or (not zero and np.any(value == 0)):
-        raise ValueError(f"{label(part)}: {field} must be {'non-negative' if zero else 'positive'}, got {value}.")
+    given = np.asarray(value)
+    if not np.all(np.isfinite(given)) or np.any(given < 0) or (not zero and np.any(given == 0)):
+        raise ValueError(f"{label(part)}: {field} must be {'non-negative' if zero else 'positive'}, got {given}.")

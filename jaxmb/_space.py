@@ -9,9 +9,16 @@ A `pose` is what positions a body, a `velocity` what moves it, a `wrench` what d
 """
 
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 from jaxtyping import Array, Float
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 
 Pose = Float[Array, "p"]
 Velocity = Float[Array, "v"]
@@ -22,10 +29,10 @@ Point = Float[Array, "d"]
 class AbstractSpace(eqx.Module):
     """Kinematics of one rigid body in the plane or in space; without data."""
 
-    dimension: eqx.AbstractClassVar[int]
-    pose_size: eqx.AbstractClassVar[int]
-    velocity_size: eqx.AbstractClassVar[int]
-    ground: eqx.AbstractClassVar[tuple[float, ...]]
+    dimension: AbstractVar[int]
+    pose_size: AbstractVar[int]
+    velocity_size: AbstractVar[int]
+    ground: AbstractVar[tuple[float, ...]]
 
     @abc.abstractmethod
     def point(self, pose: Pose, s: Point) -> Point:

@@ -8,8 +8,8 @@ from .assembly import nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
 from .system.rigid_bodies import Implied, Ranks, RigidBodySystem
 
-# Singular values of the equilibrated Jacobian of a part without freedom: below the first it does move, and between the two it
-# would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place: 6e-5.)
+# Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and between
+# the two it would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
 
@@ -95,9 +95,9 @@ def _check_locked(system, jacobian):
             share = np.abs(left[:, len(columns) - 1])
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
             raise ValueError(
-                f"{', '.join(system.body_names[k] for k in bodies)} cannot move: {', '.join(names)} leave no degree of freedom, but "
-                f"with dimensions that differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). Make "
-                "the points and lengths of redundant joints agree, or remove one of them."
+                f"{', '.join(system.body_names[k] for k in bodies)} cannot move: {', '.join(names)} leave no degree of "
+                "freedom, but with dimensions that differ only slightly from these they would (smallest singular value "
+                f"{sizes[-1]:.1e}). Make the points and lengths of redundant joints agree, or remove one of them."
             )
 
 

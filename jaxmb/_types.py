@@ -1,13 +1,13 @@
 """Names of types that many files share."""
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
 Scalar: TypeAlias = ArrayLike
-Vector: TypeAlias = Float[Array, "n"]
-Time: TypeAlias = Any
+VectorLike: TypeAlias = ArrayLike | Sequence[Any]
 
 
 class State(eqx.Module):

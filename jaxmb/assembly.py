@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
 
-from ._types import Scalar, State
+from ._types import Scalar, State, VectorLike
 from .elimination import full_pivot
 from .rotations import normalize
 from .system import AbstractSystem, RigidBodySystem
@@ -28,8 +29,8 @@ def assemble(
     system: RigidBodySystem,
     guess: State | None = None,
     *,
-    fix: Mapping[str, ArrayLike] | None = None,
-    rates: Mapping[str, ArrayLike] | None = None,
+    fix: Mapping[str, VectorLike] | None = None,
+    rates: Mapping[str, VectorLike] | None = None,
     t: Scalar = 0.0,
     throw: bool = True,
 ) -> State:
@@ -55,9 +56,10 @@ def assemble(
     t = jnp.asarray(t, guess.q.dtype)
     q, fixed = prescribe("coordinate", coordinate_names(system), fix or {}, guess.q)
     u, fixed_rates = prescribe("rate", rate_names(system), rates or {}, guess.u)
-    concrete = not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((system, q, u, t)))
+    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, q, u, t)))
     if concrete:
-        _check_finite(q, "coordinates"), _check_finite(u, "rates")
+        _check_finite(q, "coordinates")
+        _check_finite(u, "rates")
 
     q, whole = _normalize_fixed(system, q, fixed)
     q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
@@ -135,11 +137,10 @@ def velocities(
     if system.velocity_rows == 0:
         return guess, jnp.array(True)
     scale = jnp.where(np.array(held), 0.0, system.velocity_scale())
-    u = guess
-    rank = system.velocity_rank
-    ok = jnp.array(True)
-    for _ in range(1 if system.linear else 8):
-        jacobian = system.jacobian(t, q, u)
+    u, rank, ok = guess, system.velocity_rank, jnp.array(True)
+    jacobian = system.jacobian(t, q, u)
+    for step in range(1 if system.linear else 8):
+        jacobian = jacobian if step == 0 else system.jacobian(t, q, u)
         pivots = full_pivot(jacobian, scale=scale)
         ok = ok & (pivots.rank == rank)
         rows = pivots.order.rows[:rank]
@@ -201,7 +202,11 @@ def tolerance(dtype) -> float:
 
 def _normalize_fixed(system, q, fixed):
     """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of those."""
-    whole = [row[3:] for row in system.layout.pose_index[:-1] if system.spatial and row[-1] < system.nq and fixed[row[3:]].all()]
+    whole = [
+        row[3:]
+        for row in system.layout.pose_index[:-1]
+        if system.spatial and row[-1] < system.nq and fixed[row[3:]].all()
+    ]
     for index in whole:
         q = q.at[index].set(normalize(q[index]))
     return q, len(whole)

@@ -66,12 +66,13 @@ class Factor(eqx.Module):
 
     **Fields:** `correction` (n × m): `δx = −correction @ residual` makes `A δx = −residual` while the independent columns keep
     their values; columns of implied rows are zero. `basis` (n × (n − r)): `δx = basis @ δx_i` spans the null space of A, with
-    the identity on the independent rows and the influence matrix H on the dependent ones. `rows` (r,): the rows kept.
+    the identity on the independent rows and the influence matrix H on the dependent ones. `rows` (r,): the rows kept, which
+    tangents have not.
     """
 
     correction: Float[Array, "n m"]
     basis: Float[Array, "n f"]
-    rows: Int[Array, "r"]
+    rows: Int[Array, "r"] | None
 
 
 def full_pivot(
@@ -95,7 +96,7 @@ def full_pivot(
     m, n = A.shape
     A = lax.stop_gradient(A)
     eps = jnp.finfo(A.dtype).eps
-    tol = float(eps) ** 0.5 if tol is None else tol
+    zero = float(eps) ** 0.5 if tol is None else tol
     work = A if scale is None else A * scale[None, :]
     size = jnp.sqrt(jnp.sum(work * work, axis=1))
     # A row of rounding errors must not be blown up to a row of unit norm.
@@ -109,7 +110,7 @@ def full_pivot(
         work, row_order, column_order, smallest, largest, rank = carry
         open_ = (row_order == unused)[:, None] & (column_order == unused)[None, :]
         candidates = jnp.where(open_, jnp.abs(work), 0.0)
-        candidates = jnp.where(candidates > tol, candidates, 0.0)
+        candidates = jnp.where(candidates > zero, candidates, 0.0)
         first = jnp.where((stage == 0)[:, None], candidates, 0.0)
         candidates = jnp.where(jnp.any(first > 0), first, candidates)
         best = jnp.argmax(candidates)

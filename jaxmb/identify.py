@@ -81,15 +81,15 @@ class Identification:
 
 def identify(
     system: RigidBodySystem,
-    measured: Mapping[str, ArrayLike] | None = None,
+    measured: Mapping[str, VectorLike] | None = None,
     *,
     ts: ArrayLike,
-    free: Mapping[str, ArrayLike] | Sequence[str],
+    free: Mapping[str, VectorLike] | Sequence[str],
     state: State | None = None,
-    fix: Mapping[str, ArrayLike] | None = None,
-    rates: Mapping[str, ArrayLike] | None = None,
+    fix: Mapping[str, VectorLike] | None = None,
+    rates: Mapping[str, VectorLike] | None = None,
     t0: Scalar = 0.0,
-    sigma: Mapping[str, ArrayLike] | None = None,
+    sigma: Mapping[str, VectorLike] | None = None,
     bounds: Mapping[str, Bounds] | None = None,
     residual: Callable[[Trajectory], Array] | None = None,
     method: str | optax.GradientTransformation = "lm",
@@ -252,7 +252,7 @@ def _times(ts: ArrayLike, t0: Scalar) -> Float[Array, "times"]:
     return jnp.asarray(times, dtype=jnp.result_type(float))
 
 
-def _arrays(values: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
+def _arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Array]:
     return {name: jnp.asarray(value, jnp.result_type(float)) for name, value in (values or {}).items()}
 
 
@@ -295,7 +295,7 @@ def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
     return _Measured(values, weights, present)
 
 
-def _weights(name: str, data: np.ndarray, sigma: Mapping[str, ArrayLike] | None) -> np.ndarray:
+def _weights(name: str, data: np.ndarray, sigma: Mapping[str, VectorLike] | None) -> np.ndarray:
     if sigma is None:
         size = np.nanmax(data) - np.nanmin(data)
         return np.full(data.shape, 1.0 / size if size > 0 else 1.0, data.dtype)

@@ -32,17 +32,15 @@ def reaction(system: RigidBodySystem, name: str, t: Scalar, y: State, multiplier
     """Reaction of one joint at one state from the multipliers of all rows."""
     extended_q, extended_u = system.extend_q(y.q), system.extend_u(y.u)
     row, force, moment, own = 0, 0.0, 0.0, []
-    for holonomic, groups in ((True, system.constraints), (False, system.velocity_constraints)):
-        for group in groups:
-            if name in group.group.names:
-                k = group.group.names.index(name)
-                blocks = group.jacobian(t, extended_q) if holonomic else group.jacobian(t, extended_q, extended_u)
-                values = multipliers[row + k * group.rows : row + (k + 1) * group.rows]
-                wrenches = jnp.einsum("r,rkv->kv", values, blocks[k])
-                f, m = _on_last_body(system, group.group, k, extended_q, wrenches)
-                force, moment = force + f, moment + m
-                own.append(values)
-            row += len(group.group.names) * group.rows
+    for group in (*system.constraints, *system.velocity_constraints):
+        if name in group.group.names:
+            k = group.group.names.index(name)
+            values = multipliers[row + k * group.rows : row + (k + 1) * group.rows]
+            wrenches = jnp.einsum("r,rkv->kv", values, group.jacobian(t, extended_q, extended_u)[k])
+            f, m = _on_last_body(system, group.group, k, extended_q, wrenches)
+            force, moment = force + f, moment + m
+            own.append(values)
+        row += len(group.group.names) * group.rows
     return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(own))
 
 

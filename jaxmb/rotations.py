@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ._types import Scalar, VectorLike
 
 # Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would make a
 # kernel of every slice and every stack of components.
@@ -116,7 +117,7 @@ def normalize(p: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     return p / norm(p)[..., None]
 
 
-def from_axis_angle(axis: Float[ArrayLike, "3"], angle: Float[ArrayLike, ""]) -> Float[Array, "4"]:
+def from_axis_angle(axis: VectorLike, angle: Scalar) -> Float[Array, "4"]:
     """Euler parameters of a turn by `angle` [rad] about the unit vector `axis`."""
     axis, half = jnp.asarray(axis, float), jnp.asarray(angle, float) / 2
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])

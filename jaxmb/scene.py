@@ -13,13 +13,15 @@ from ._parts import GROUND, AbstractConstraint, AbstractForce, AbstractLink, Abs
 from ._resolve import label, vector
 from ._structure import find_structure
 from ._types import State
-from .planar import Body as PlanarBody, PointMass as PlanarPointMass
+from .planar import Body as PlanarBody
+from .planar import PointMass as PlanarPointMass
 from .planar._space import PLANE
-from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
+from .spatial import Body as SpatialBody
+from .spatial import PointMass as SpatialPointMass
 from .spatial._space import SPACE
 from .system import RigidBodySystem
-from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
 from .system.describe import Description
+from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
 from .system.layout import Layout
 from .system.rigid_bodies import Ranks
 

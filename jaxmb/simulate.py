@@ -1,6 +1,5 @@
 """From a system and a state to a motion."""
 
-import math
 import warnings
 from typing import Any
 
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from ._results import RESULTS
@@ -127,7 +127,7 @@ def _integrate(
     system, formulation, term, solver, times, state, saveat, controller, adjoint, event, max_steps, meter, *, restore
 ):
     t0, t1, dt0 = times
-    solution = diffrax.diffeqsolve(
+    solution: Any = diffrax.diffeqsolve(
         term,
         solver,
         t0,
@@ -144,7 +144,7 @@ def _integrate(
     )
     ts, saved = solution.ts[0], solution.ys[0]
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
-    if isinstance(saved, State) and (restore or saveat.subs is not None and saveat.subs.ts is not None):
+    if isinstance(saved, State) and (restore or (saveat.subs is not None and saveat.subs.ts is not None)):
         saved = _restore(system, ts, saved)
     return Trajectory(
         system=system,
@@ -160,11 +160,11 @@ def _integrate(
 
 def _check_tolerances(rtol: Any, atol: Any, dtype) -> None:
     for name, value in (("rtol", rtol), ("atol", atol)):
-        if value is None or isinstance(value, jax.core.Tracer):
+        if value is None or isinstance(value, Tracer):
             continue
         if not np.all(np.isfinite(value)) or np.any(np.asarray(value) < 0) or np.any(np.asarray(value) >= 1):
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
-    if isinstance(rtol, jax.core.Tracer):
+    if isinstance(rtol, Tracer):
         return
     smallest = 10 * float(jnp.finfo(dtype).eps)
     if rtol < smallest:
@@ -238,7 +238,7 @@ def _diagnose(system, start, end, solution):
     return RESULTS.where(newton, RESULTS.newton_failed, result)
 
 
-def _chart(solution):
+def _chart(solution) -> Any:
     return getattr(solution.solver_state, "chart", None)
 
 

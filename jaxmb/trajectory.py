@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._names import unknown
@@ -96,10 +97,11 @@ class Trajectory(eqx.Module):
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints."""
-        if self.interpolation is None:
+        interpolation = self.interpolation
+        if interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
         t = jnp.asarray(t, self.ys_dtype)
-        single = lambda t: self._restored(t, self.interpolation.evaluate(t))
+        single = lambda t: self._restored(t, interpolation.evaluate(t))
         out = jax.vmap(single)(t.reshape(-1))
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
 
@@ -168,7 +170,7 @@ class Trajectory(eqx.Module):
 
     def trimmed(self) -> "Trajectory":
         """Without the padding of `SaveAt(steps=True)` and of runs that ended early; unchanged under `jit` and `vmap`."""
-        if isinstance(self.ts, jax.core.Tracer) or self.ts is None or self.ts.ndim != 1:
+        if isinstance(self.ts, Tracer) or self.ts is None or self.ts.ndim != 1:
             return self
         finite = np.isfinite(np.asarray(self.ts))
         if finite.all():
@@ -191,7 +193,7 @@ class Trajectory(eqx.Module):
 
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`."""
-        np.savez_compressed(path, **self.to_dict())
+        np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:

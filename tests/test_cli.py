@@ -17,8 +17,9 @@ def test_mechanisms(capsys):
     assert all(len(line.split()) > 3 for line in lines)
 
 
-def test_run(capsys, tmp_path):
+def test_run(capsys, tmp_path, monkeypatch):
     """A run prints errors against reference values and a fit next to the truth, and writes its files."""
+    monkeypatch.setattr("jaxmb.cli._TOLERANCES", (1e-6,))
     assert main(["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     for text in ("pendulum", "elliptic functions", "Error against run time", "Identifying bar.length", "true value 1"):

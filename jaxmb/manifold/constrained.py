@@ -44,15 +44,16 @@ class Split(eqx.Module):
 class Evaluation(eqx.Module):
     """A state on the manifold and what was computed there.
 
-    **Fields:** `q`, `u`, `udot`; the velocity `factor`; `iterations` of the position Newton; `failed`.
+    **Fields:** `q`, `u`, `udot`; the velocity `factor`; `iterations` of the position Newton and
+    `failed`, which tangents have not.
     """
 
     q: Float[Array, "nq"]
     u: Float[Array, "nu"]
     udot: Float[Array, "nu"]
     factor: Factor
-    iterations: Int[Array, ""]
-    failed: Bool[Array, ""]
+    iterations: Int[Array, ""] | None
+    failed: Bool[Array, ""] | None
 
 
 def shared(system: AbstractSystem) -> bool:

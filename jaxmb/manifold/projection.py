@@ -14,7 +14,6 @@ from jaxtyping import Array
 
 from .._types import Scalar, State
 from ..elimination import full_pivot, solve_positive
-from ..formulations import AbstractFormulation
 from ..solvers import Adams
 from ..system import AbstractSystem
 from ._base import AbstractManifold

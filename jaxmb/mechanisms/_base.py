@@ -9,9 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jax.core import Tracer
+from jaxtyping import Array
 
-from .._types import Scalar, State
+from .._types import State, VectorLike
 from ..assembly import assemble
 from ..scene import Scene
 from ..system import RigidBodySystem, with_parameters
@@ -80,8 +81,8 @@ class Mechanism:
     references: References | None
     observe: Callable[[Trajectory], Observation]
     description: str
-    fix: Mapping[str, ArrayLike] = dataclasses.field(default_factory=dict)
-    rates: Mapping[str, ArrayLike] = dataclasses.field(default_factory=dict)
+    fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
+    rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
@@ -106,7 +107,7 @@ class Mechanism:
             for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
         }
 
-    def with_parameters(self, values: Mapping[str, ArrayLike]) -> "Mechanism":
+    def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
         """The same mechanism with some parameters replaced, assembled again near its present state; also under `jit`.
 
         **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
@@ -137,12 +138,12 @@ def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mech
 
 
 def _same(value: Any, default: Any) -> bool:
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return False
     return value is default or (default is not None and value is not None and np.array_equal(value, default))
 
 
-def point_motion(trajectory: Trajectory, body: str, s: ArrayLike) -> tuple[Array, Array]:
+def point_motion(trajectory: Trajectory, body: str, s: VectorLike) -> tuple[Array, Array]:
     """Position [m] and velocity [m/s] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
     system = trajectory.system
     space, k = system.layout.space, system.body_names.index(body)
@@ -159,12 +160,12 @@ def build(
     name: str,
     scene: Scene,
     *,
-    t1: Scalar,
+    t1: float,
     observe: Callable[[Trajectory], Observation],
     description: str,
     references: References | None = None,
-    fix: Mapping[str, ArrayLike] | None = None,
-    rates: Mapping[str, ArrayLike] | None = None,
+    fix: Mapping[str, VectorLike] | None = None,
+    rates: Mapping[str, VectorLike] | None = None,
 ) -> Mechanism:
     """Compile and assemble a scene into a mechanism."""
     fix, rates = fix or {}, rates or {}

@@ -48,7 +48,7 @@ class TorsionalSpringDamper(AbstractForce):
     body_b: str = eqx.field(static=True)
     stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    free_angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = True
 
     @property
@@ -85,10 +85,10 @@ class Bushing(AbstractForce):
     body_b: str = eqx.field(static=True)
     stiffness: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
     damping: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    free_angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = True
 
     @property

@@ -35,9 +35,9 @@ class Revolute(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 2
     rheonomic: ClassVar[bool] = False
 
@@ -61,10 +61,10 @@ class Fixed(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 3
     rheonomic: ClassVar[bool] = False
 
@@ -90,11 +90,11 @@ class PointOnLine(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -118,12 +118,12 @@ class Prismatic(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 2
     rheonomic: ClassVar[bool] = False
 
@@ -166,7 +166,7 @@ class Distance(AbstractConstraint):
     body_b: str = eqx.field(static=True)
     point_a: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
     point_b: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    length: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -229,7 +229,7 @@ class Gear(AbstractConstraint):
     body_b: str = eqx.field(static=True)
     ratio: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     carrier: str = eqx.field(static=True, default="ground", kw_only=True)
-    offset: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    offset: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -263,7 +263,7 @@ class RackAndPinion(AbstractConstraint):
     axis_b: Float[Array, "2"] = eqx.field(converter=number, default=(1.0, 0.0), kw_only=True)
     point_a: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
     point_b: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    offset: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    offset: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 

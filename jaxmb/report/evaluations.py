@@ -12,9 +12,9 @@ _FIRST_STEP = 2
 def evaluations(solver: diffrax.AbstractSolver, stats: Mapping[str, Any]) -> int | None:
     """Evaluations of the vector field in a run with adaptive steps and a first step of its own choosing.
 
-    Rejected steps count like accepted ones. A Runge–Kutta method whose first stage is the last of the step before evaluates
-    it once; evaluations to choose the first step, and again of its first stage if it is rejected, are left out for these, which
-    flatters them by one or two. None for solvers that iterate, which count nothing.
+    Rejected steps count like accepted ones. A Runge–Kutta method whose first stage is the last of the step before
+    evaluates it once; evaluations to choose the first step, and again of its first stage if it is rejected, are left
+    out for these, which flatters them by one or two. None for solvers that iterate, which count nothing.
     """
     if "num_evaluations" in stats:
         return int(stats["num_evaluations"]) + _FIRST_STEP

@@ -43,12 +43,12 @@ class Driver(AbstractConstraint):
     quantity: Quantity = eqx.field(static=True, kw_only=True)
     motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
     parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
 

@@ -61,11 +61,11 @@ class TorsionalSpringDamper(AbstractForce):
     body_b: str = eqx.field(static=True)
     stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    free_angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = True
 
     @property
@@ -105,10 +105,10 @@ class Bushing(AbstractForce):
     body_b: str = eqx.field(static=True)
     stiffness: Float[Array, "6"] = eqx.field(converter=number, kw_only=True)
     damping: Float[Array, "6"] = eqx.field(converter=number, default=(0.0,) * 6, kw_only=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     conservative: ClassVar[bool] = True
 
     @property

@@ -52,9 +52,9 @@ class Spherical(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 3
     rheonomic: ClassVar[bool] = False
 
@@ -79,12 +79,12 @@ class Revolute(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 5
     rheonomic: ClassVar[bool] = False
 
@@ -109,13 +109,13 @@ class Universal(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a_W: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b_W: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a_W: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b_W: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 4
     rheonomic: ClassVar[bool] = False
 
@@ -160,12 +160,12 @@ class Cylindrical(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 4
     rheonomic: ClassVar[bool] = False
 
@@ -198,15 +198,15 @@ class Screw(AbstractConstraint):
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
     pitch: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    offset: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    offset: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 5
     rheonomic: ClassVar[bool] = False
 
@@ -245,12 +245,12 @@ class Prismatic(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 5
     rheonomic: ClassVar[bool] = False
 
@@ -274,12 +274,12 @@ class Planar(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 3
     rheonomic: ClassVar[bool] = False
 
@@ -304,10 +304,10 @@ class Fixed(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 6
     rheonomic: ClassVar[bool] = False
 
@@ -335,7 +335,7 @@ class Distance(AbstractConstraint):
     body_b: str = eqx.field(static=True)
     point_a: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
     point_b: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    length: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -365,11 +365,11 @@ class PointOnPlane(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -394,11 +394,11 @@ class PointOnLine(AbstractConstraint):
     name: str = eqx.field(static=True)
     body_a: str = eqx.field(static=True)
     body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 2
     rheonomic: ClassVar[bool] = False
 

@@ -159,7 +159,7 @@ class RollingSphere(AbstractLink):
     center: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
     point: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
     normal: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 1.0), kw_only=True)
-    spin: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    spin: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
 
     @property
     def bodies(self):
@@ -215,7 +215,7 @@ class SphereRolling(AbstractVelocityConstraint):
     center: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
     point: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
     normal: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    spin: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, kw_only=True)
+    spin: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
 

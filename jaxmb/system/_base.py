@@ -9,12 +9,18 @@ invariants of their own (unit Euler parameters): `coordinate_residual` is `Φ` f
 """
 
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._types import Scalar
 from .inertia import AbstractInertia
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class AbstractSystem(eqx.Module):
@@ -30,17 +36,17 @@ class AbstractSystem(eqx.Module):
     - `linear`: whether ψ is linear in u up to a constant term; `homogeneous`: whether that term is zero.
     """
 
-    nq: eqx.AbstractVar[int]
-    nu: eqx.AbstractVar[int]
-    position_rows: eqx.AbstractVar[int]
-    position_rank: eqx.AbstractVar[int]
-    coordinate_rows: eqx.AbstractVar[int]
-    coordinate_rank: eqx.AbstractVar[int]
-    velocity_rows: eqx.AbstractVar[int]
-    velocity_rank: eqx.AbstractVar[int]
-    rates_are_velocities: eqx.AbstractVar[bool]
-    linear: eqx.AbstractVar[bool]
-    homogeneous: eqx.AbstractVar[bool]
+    nq: AbstractVar[int]
+    nu: AbstractVar[int]
+    position_rows: AbstractVar[int]
+    position_rank: AbstractVar[int]
+    coordinate_rows: AbstractVar[int]
+    coordinate_rank: AbstractVar[int]
+    velocity_rows: AbstractVar[int]
+    velocity_rank: AbstractVar[int]
+    rates_are_velocities: AbstractVar[bool]
+    linear: AbstractVar[bool]
+    homogeneous: AbstractVar[bool]
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from .._names import unknown
+from .._types import VectorLike
 from .rigid_bodies import RigidBodySystem
 
 
@@ -40,7 +41,7 @@ def _names(system, index, fields, groups):
 
 
 def prescribe(
-    what: str, names: Mapping[str, list[int]], values: Mapping[str, ArrayLike], vector: Float[Array, "n"]
+    what: str, names: Mapping[str, list[int]], values: Mapping[str, VectorLike], vector: Float[Array, "n"]
 ) -> tuple[Float[Array, "n"], Bool[np.ndarray, "n"]]:
     """Write values by name into a vector.
 

@@ -76,9 +76,7 @@ def describe(system: RigidBodySystem) -> Description:
     forces = [(type(g.group.part).__name__, _shorten(g.group.names), "") for g in system.forces]
     if system.gravity is not None:
         forces.insert(0, ("Gravity", system.gravity_name, ""))
-    implied = [
-        f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied
-    ]
+    implied = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
     return Description(
         tuple(facts), tuple(bodies), tuple(joints), tuple(forces), tuple(implied), tuple(_left_out(system))
     )

@@ -87,8 +87,11 @@ class ConstraintGroup(eqx.Module):
     def coordinate_jacobian(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows k p"]:
         return self._map(lambda part, poses: jax.jacfwd(lambda x: part.residual(self._space, x, t))(poses), extended_q)
 
-    def jacobian(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows k v"]:
+    def jacobian(
+        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+    ) -> Float[Array, "parts rows k v"]:
         """Derivative along unit velocities: `Φ_q N`, body by body."""
+        del extended_u
 
         def single(part, poses):
             residual = lambda x: part.residual(self._space, x, t)

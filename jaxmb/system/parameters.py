@@ -5,9 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from .._names import unknown
+from .._types import VectorLike
 from .rigid_bodies import RigidBodySystem
 
 
@@ -25,7 +26,7 @@ def parameters(system: RigidBodySystem) -> dict[str, Array]:
     return leaves
 
 
-def with_parameters(system: RigidBodySystem, values: Mapping[str, ArrayLike]) -> RigidBodySystem:
+def with_parameters(system: RigidBodySystem, values: Mapping[str, VectorLike]) -> RigidBodySystem:
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
 
     Ranks and index sets are kept: a change that makes rows independent that were implied needs a new `compile`.

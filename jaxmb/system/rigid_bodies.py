@@ -199,12 +199,10 @@ class RigidBodySystem(AbstractSystem):
         return _join([g.velocity(t, extended, extended_u) for g in groups], q.dtype)
 
     def jacobian(self, t, q, u):
-        extended = self.extend_q(q)
-        blocks = [g.jacobian(t, extended) for g in self.constraints]
-        if self.velocity_constraints:
-            extended_u = self.extend_u(u)
-            blocks += [g.jacobian(t, extended, extended_u) for g in self.velocity_constraints]
-        return self._assemble(blocks, (*self.constraints, *self.velocity_constraints), q.dtype, of_poses=False)
+        extended, extended_u = self.extend_q(q), self.extend_u(u)
+        groups = (*self.constraints, *self.velocity_constraints)
+        blocks = [g.jacobian(t, extended, extended_u) for g in groups]
+        return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)

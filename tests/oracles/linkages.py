@@ -1,6 +1,7 @@
-"""Planar linkages in one generalized coordinate, with equations of their own: no code of the package, NumPy and SciPy only.
+"""Planar linkages in one generalized coordinate, with equations of their own: NumPy and SciPy only.
 
-With the crank angle θ as the coordinate, every velocity is a known function of θ times θ̇, so the kinetic energy is `½ I(θ) θ̇²` and
+With the crank angle θ as the coordinate, every velocity is a known function of θ times θ̇, so the kinetic energy is
+`½ I(θ) θ̇²` and
 
     I θ̈ + ½ I′ θ̇² = −V′.
 
@@ -29,7 +30,7 @@ def four_bar(times, *, lengths=(1.0, 3.0, 2.5), base=2.5, masses=(1.0, 3.0, 2.5)
         return toward + at_B, toward + np.pi - at_D
 
     def kinematics(theta):
-        """Angles, and their first and second derivatives with respect to θ, from the closed loop a + b − c − base = 0."""
+        """Angles, and two derivatives with respect to θ, from the closed loop a + b − c − base = 0."""
         p, r = angles(theta)
         # b sin p p′ − c sin r r′ = −a sin θ,   b cos p p′ − c cos r r′ = −a cos θ
         matrix = np.array([[b * np.sin(p), -c * np.sin(r)], [b * np.cos(p), -c * np.cos(r)]])
@@ -44,15 +45,14 @@ def four_bar(times, *, lengths=(1.0, 3.0, 2.5), base=2.5, masses=(1.0, 3.0, 2.5)
     def acceleration(theta, rate):
         p, r, p1, r1, p2, r2 = kinematics(theta)
         # The coupler's centre is at a e(θ) + b/2 e(p); |v|² = a² + b²/4 p′² + a b cos(θ − p) p′, times θ̇².
-        inertia = m1 * a**2 / 3 + m2 * (a**2 + b**2 * p1**2 / 3 + a * b * np.cos(theta - p) * p1) + m3 * c**2 * r1**2 / 3
+        inertia = (
+            m1 * a**2 / 3 + m2 * (a**2 + b**2 * p1**2 / 3 + a * b * np.cos(theta - p) * p1) + m3 * c**2 * r1**2 / 3
+        )
         half_slope = (
-            m2 * (b**2 * p1 * p2 / 3 + 0.5 * a * b * (np.cos(theta - p) * p2 - np.sin(theta - p) * (1 - p1) * p1))
-            + m3 * c**2 * r1 * r2 / 3
+            m2 * (b**2 * p1 * p2 / 3 + 0.5 * a * b * (cosine * p2 - sine * (1 - p1) * p1)) + m3 * c**2 * r1 * r2 / 3
         )
         slope = g * (
-            m1 * a / 2 * np.cos(theta)
-            + m2 * (a * np.cos(theta) + b / 2 * np.cos(p) * p1)
-            + m3 * c / 2 * np.cos(r) * r1
+            m1 * a / 2 * np.cos(theta) + m2 * (a * np.cos(theta) + b / 2 * np.cos(p) * p1) + m3 * c / 2 * np.cos(r) * r1
         )
         return -(half_slope * rate**2 + slope) / inertia
 

@@ -1,0 +1,292 @@
+"""The library of mechanisms against published and independent values, their structure, and the behaviour of charts."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import linkages
+from scipy.optimize import curve_fit
+
+import jaxmb as mb
+from jaxmb import mechanisms
+
+RTOL = 1e-10
+
+
+@functools.cache
+def library(name, **parameters):
+    return mechanisms.get(name, **parameters)
+
+
+@functools.cache
+def run(name, **parameters):
+    """The mechanism, and its motion saved at the times of its references; one compilation for all tests."""
+    mechanism = library(name, **parameters)
+    times = mechanism.references.times
+    return mechanism, mb.simulate(mechanism.system, mechanism.state, t1=times[-1], rtol=RTOL, saveat=times)
+
+
+ANGLES = ("beta", "Theta", "gamma", "Phi", "delta", "Omega", "epsilon")
+CASES = [
+    ("pendulum", {}, 1e-8),
+    ("rod_chain", {"n": 2}, 1e-6),
+    ("rod_chain", {"n": 5}, 1e-6),
+    ("rod_chain", {"n": 10}, 1e-6),
+    pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.slow),
+    ("four_bar", {}, 1e-7),
+    ("slider_crank", {}, 1e-7),
+    ("andrews", {}, 1e-8),
+    ("car_axis", {}, 1e-8),
+    ("knife_edge", {}, 1e-8),
+    ("chaplygin_sleigh", {}, 1e-8),
+    ("free_body", {}, 1e-7),
+    ("heavy_top", {}, 1e-7),
+    ("rolling_disk", {}, 1e-8),
+    pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.slow),
+    pytest.param("bricard", {}, 1e-6, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("name, parameters, bound", CASES)
+def test_motion_agrees_with_reference_values_on_the_constraints(name, parameters, bound):
+    mechanism, trajectory = run(name, **parameters)
+    assert bound >= 10 * mechanism.references.tolerance
+    errors = mechanism.errors(trajectory)
+    assert set(errors) == set(mechanism.references.labels)
+    labels = ANGLES if name == "andrews" else errors
+    assert {label: errors[label][-1] for label in labels if not errors[label][-1] <= bound} == {}
+    assert np.all(trajectory.constraint_violation.position <= 1e-10)
+    assert np.all(trajectory.constraint_violation.velocity <= 1e-10)
+
+
+CONSERVATIVE = ["pendulum", "four_bar", "slider_crank", "chaplygin_sleigh", "free_body", "heavy_top", "rolling_disk"]
+
+
+@pytest.mark.parametrize("name", CONSERVATIVE)
+def test_energy_is_conserved(name):
+    mechanism, trajectory = run(name)
+    system, state = mechanism.system, mechanism.state
+    start = system.kinetic_energy(0.0, state.q, state.u) + system.potential_energy(0.0, state.q)
+    size = np.max(np.abs(trajectory.kinetic_energy))
+    np.testing.assert_allclose(trajectory.energy, start, rtol=0, atol=1e-8 * size)
+
+
+def test_work_of_the_torque_is_the_energy_of_andrews_mechanism():
+    mechanism, trajectory = run("andrews")
+    system, state = mechanism.system, mechanism.state
+    start = system.kinetic_energy(0.0, state.q, state.u) + system.potential_energy(0.0, state.q)
+    turned = trajectory["K1"].angle - state.q[2]
+    np.testing.assert_allclose(trajectory.energy - start, 0.033 * turned, rtol=1e-8)
+
+
+def test_free_body_keeps_its_angular_momentum():
+    mechanism, trajectory = run("free_body")
+    start = mechanism.system.angular_momentum(mechanism.state.q, mechanism.state.u)
+    np.testing.assert_allclose(trajectory.angular_momentum, np.tile(start, (3, 1)), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["four_bar", "slider_crank"])
+def test_carried_values_are_those_of_a_model_with_one_coordinate(name):
+    references = library(name).references
+    np.testing.assert_allclose(getattr(linkages, name)(references.times), references.values, rtol=1e-9)
+
+
+# Structure
+
+
+def test_andrews_mechanism_has_one_degree_of_freedom():
+    system = library("andrews").system
+    assert (system.nu, system.velocity_rows, system.velocity_rank) == (21, 20, 20)
+
+
+def test_bricard_linkage_moves_although_counting_rows_forbids_it():
+    system = library("bricard").system
+    assert (system.nu, system.velocity_rows, system.velocity_rank) == (30, 30, 29)
+    (implied,) = system.implied
+    assert {implied.name, *implied.by} == {"P0", "P1", "P2", "P3", "P4", "P5"}
+
+
+def test_planar_loop_in_space_has_27_independent_rows_of_30():
+    system = library("spatial_loop").system
+    assert (system.nq, system.coordinate_rows, system.coordinate_rank) == (28, 30, 27)
+    assert system.nu - system.velocity_rank == 1
+    assert len(system.implied) == 3
+    for implied in system.implied:
+        assert {implied.name, *implied.by} <= {"A", "B", "C", "D"}
+
+
+def test_rolling_disk_has_five_coordinates_and_three_velocities():
+    system = library("rolling_disk").system
+    assert (system.nq - system.coordinate_rank, system.nu - system.velocity_rank) == (5, 3)
+
+
+# Redundant rockers
+
+
+def test_a_redundant_rocker_does_not_change_the_motion():
+    three, twin = library("parallelogram"), library("parallelogram", rockers=2, spacing=2.0)
+    # Two rockers carry the share of the third.
+    own = {f"rocker{k}.{field}" for k in (1, 2) for field in ("mass", "inertia")}
+    twin = twin.with_parameters({name: 1.5 * mb.parameters(twin.system)[name] for name in own})
+    times = jnp.linspace(0.0, 2.0, 41)
+    moved = lambda m: mb.simulate(m.system, m.state, t1=2.0, rtol=1e-12, saveat=times)
+    trajectory = moved(three)
+    expected = twin.observe(moved(twin))
+    for label, value in three.observe(trajectory).items():
+        np.testing.assert_allclose(value, expected[label], rtol=0, atol=1e-10, err_msg=label)
+
+    system = three.system
+    assert (system.nu, system.velocity_rows, system.velocity_rank) == (12, 12, 11)
+    (implied,) = system.implied
+    residual = jax.vmap(lambda y: system.position_residual(0.0, y.q))(trajectory.ys)
+    assert np.max(np.abs(residual[:, system.rows.index((implied.name, implied.row))])) <= 1e-12
+
+
+PINS = {f"{end}{k}" for end in ("foot", "head") for k in (1, 2, 3)}
+
+
+@pytest.mark.parametrize("offset, angle", [(1e-3, np.pi / 3), (-1e-3, np.pi / 3), (1e-3, 1.5), (1e-2, 1.5)])
+def test_a_misplaced_pin_is_refused_with_the_names_of_the_joints(offset, angle):
+    with pytest.raises(ValueError, match=r"cannot (move|be assembled)") as error:
+        mechanisms.parallelogram(offset=offset, angle=angle)
+    assert all(pin in str(error.value) for pin in PINS)
+
+
+def test_a_rigid_frame_with_a_load_is_not_refused():
+    corner = (0.5, 0.8)
+    angle = np.arctan2(corner[1], 0.5)
+    bars = [
+        mb.planar.Body(f"bar{k}", mass=1.0, inertia=0.1, position=(x, 0.4), angle=a)
+        for k, x, a in ((1, 0.25, angle), (2, 0.75, np.pi - angle))
+    ]
+    pins = [
+        mb.planar.Revolute("left", "ground", "bar1", point=(0.0, 0.0)),
+        mb.planar.Revolute("right", "ground", "bar2", point=(1.0, 0.0)),
+        mb.planar.Revolute("top", "bar1", "bar2", point=corner),
+    ]
+    system = mb.Scene(bars, joints=pins).compile()
+    assert system.nu == system.velocity_rank
+
+
+# Charts
+
+
+def test_charts_change_without_a_restart():
+    mechanism = library("free_body")
+    saved = mb.simulate(
+        mechanism.system,
+        mechanism.state,
+        t1=20.0,
+        rtol=RTOL,
+        manifold=mb.manifold.Partition(max_influence=2.0),
+        saveat=diffrax.SaveAt(ts=mechanism.references.times),
+    )
+    assert max(float(error[-1]) for error in mechanism.errors(saved).values()) <= 1e-7
+    stats, (_, free) = saved.stats, run("free_body")
+    assert stats["charts"] - 1 >= 5
+    # Evaluations beyond two a step are starts: there was the first, and no other.
+    assert stats["num_evaluations"] - 2 * stats["num_steps"] == 1
+    # Low orders belong to the start. The motion without charts visits them as often.
+    low = slice(0, 7)
+    assert np.sum(stats["orders"][low]) <= np.sum(free.stats["orders"][low]) + 2
+    assert stats["num_steps"] <= 1.1 * free.stats["num_steps"]
+
+
+def test_steps_do_not_shrink_where_the_chart_changes():
+    mechanism = library("pendulum")
+    trajectory = mb.simulate(
+        mechanism.system, mechanism.state, t1=9.99, rtol=RTOL, saveat=diffrax.SaveAt(steps=True, t0=True)
+    )
+    assert trajectory.stats["charts"] - 1 >= 10
+    steps = np.diff(trajectory.ts)[30:-1]
+    assert np.min(steps[1:] / steps[:-1]) > 0.4
+    low = int(np.sum(trajectory.stats["orders"][:6]))
+    assert low <= 20
+
+
+# The rolling disk beyond steady motion
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spin, frequency", [(3.0, 2.429815), (5.0, 6.656125), (8.0, 11.743253)])
+def test_an_upright_rolling_disk_wobbles_at_the_frequency_of_small_oscillations(spin, frequency):
+    mechanism = mechanisms.rolling_disk(radius=0.5, lean=1e-4, roll=spin, turn=0.0)
+    times = jnp.linspace(0.0, 4.0, 101)
+    trajectory = mb.simulate(mechanism.system, mechanism.state, t1=4.0, rtol=1e-11, atol=1e-15, saveat=times)
+    lean = 1e4 * np.asarray(mechanism.observe(trajectory)["theta"])
+    wave = lambda t, middle, size, omega: middle + size * np.cos(omega * t)
+    (_, _, omega), _ = curve_fit(wave, np.asarray(times), lean, p0=(0.5, 0.5, frequency))
+    assert omega == pytest.approx(np.sqrt(0.8 * (3 * spin**2 - 9.81 / 0.5)), rel=1e-5)
+    assert omega == pytest.approx(frequency, rel=1e-5)
+
+
+def test_a_wobbling_disk_ends_where_an_independent_model_does():
+    lean, spin, yaw = 0.3, 5.0, 0.8
+    mechanism = mechanisms.rolling_disk(radius=0.5, lean=lean, roll=-spin + yaw * np.sin(lean), turn=yaw * np.cos(lean))
+    trajectory = mb.simulate(mechanism.system, mechanism.state, t1=4.0, rtol=RTOL, saveat=jnp.array([1.0, 2.0, 4.0]))
+    np.testing.assert_allclose(
+        trajectory["disk"].position[-1], [0.791621867, -5.441766623, 0.477285836], rtol=0, atol=1e-6
+    )
+    assert trajectory.stats["charts"] - 1 >= 3
+
+
+# The library itself
+
+
+@pytest.mark.parametrize("name", mechanisms.names())
+def test_every_mechanism_starts_on_its_constraints(name):
+    mechanism = library(name)
+    system, state = mechanism.system, mechanism.state
+    assert mechanism.name == name
+    assert mechanism.description and mechanism.t1 > 0
+    assert np.max(np.abs(system.coordinate_residual(0.0, state.q)), initial=0.0) <= 1e-12
+    assert np.max(np.abs(system.velocity_residual(0.0, state.q, state.u)), initial=0.0) <= 1e-11
+
+
+def test_names_are_checked():
+    with pytest.raises(ValueError, match="four_bar"):
+        mechanisms.get("four_bars")
+    with pytest.raises(TypeError, match="colour"):
+        mechanisms.get("pendulum", colour="red")
+    with pytest.raises(ValueError, match="iftomm"):
+        mechanisms.andrews(problem="ode")
+
+
+def test_references_hold_for_the_published_parameters_only():
+    assert mechanisms.pendulum(length=1.0).references is not None
+    other = mechanisms.pendulum(length=0.5)
+    assert other.references is None
+    with pytest.raises(ValueError, match="no reference values"):
+        other.errors(run("pendulum")[1])
+
+
+def test_errors_need_a_trajectory_saved_at_the_times():
+    mechanism, trajectory = run("pendulum")
+    with pytest.raises(ValueError, match=r"references\.times"):
+        mechanism.errors(eqx.tree_at(lambda t: t.ts, trajectory, trajectory.ts + 0.5))
+
+
+def test_references_of_the_wrong_shape_are_refused():
+    with pytest.raises(ValueError, match="shape"):
+        mechanisms.References([0.0, 1.0], ("x",), [[1.0]], "nowhere", 1e-10)
+
+
+def test_mechanisms_are_rebuilt_with_other_parameters_under_jit():
+    mechanism = library("four_bar")
+    longer = mb.parameters(mechanism.system)["C.point_a"] * 1.01
+
+    @jax.jit
+    def rebuilt(point):
+        return mechanism.with_parameters({"C.point_a": point}).state
+
+    state = rebuilt(longer)
+    again = mechanism.with_parameters({"C.point_a": longer})
+    np.testing.assert_allclose(state.q, again.state.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(state.u, again.state.u, rtol=0, atol=1e-12)
+    assert np.max(np.abs(again.system.position_residual(0.0, state.q))) <= 1e-12
+    assert float(state.q[2]) == pytest.approx(np.pi / 2)
+    assert float(state.u[2]) == pytest.approx(4.0)
