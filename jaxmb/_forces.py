@@ -25,8 +25,8 @@ class Gravity(AbstractPart):
 def generalized_force(space, coordinates, poses, velocities, law):
     """Wrenches of forces that act along coordinates.
 
-    `coordinates(poses)` has shape (n,), `law(value, rate)` gives the n forces that do work on them; the wrench on body k is
-    `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
+    `coordinates(poses)` has shape (n,), `law(value, rate)` gives the n forces that do work on them; the wrench on
+    body k is `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
     """
     pose_rates = jax.vmap(space.rates)(poses, velocities)
     value, rate = jax.jvp(coordinates, (poses,), (pose_rates,))
@@ -65,11 +65,11 @@ def _pair(space, part, poses, force_W):
 class SpringDamper(AbstractForce):
     """A linear spring and damper along the line between two points: tension `stiffness (l − free_length) + damping l̇`.
 
-    At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero free length
-    is linear there.
+    At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero
+    free length is linear there.
 
-    **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the given poses;
-    `point_a`, `point_b` [m], body-fixed, default the mass centres.
+    **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
+    given poses; `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
     name: str = eqx.field(static=True)
@@ -141,8 +141,8 @@ class Damper(AbstractForce):
 class PointForce(AbstractForce):
     """A constant force at a body-fixed point.
 
-    **Arguments:** `force` [N], in world axes or, with `frame="body"`, turning with the body; `point` [m], body-fixed, default
-    the mass centre.
+    **Arguments:** `force` [N], in world axes or, with `frame="body"`, turning with the body; `point` [m], body-fixed,
+    default the mass centre.
     """
 
     name: str = eqx.field(static=True)

@@ -37,7 +37,9 @@ def number(value: Any) -> Array:
 
 
 def optional_number(value: Any) -> Any:
-    """A strongly typed float array, or None where `resolve` is to work the value out; fields have the type they have after that."""
+    """A strongly typed float array, or None where `resolve` is to work the value out; fields have the type they have
+    after that.
+    """
     return None if value is None else number(value)
 
 
@@ -53,7 +55,9 @@ class AbstractLink(AbstractPart):
     bodies: AbstractVar[tuple[str, ...]]
 
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
-        """The same part with every number filled in: world points and axes turned into body-fixed ones at the given poses."""
+        """The same part with every number filled in: world points and axes turned into body-fixed ones at the given
+        poses.
+        """
         del space, poses
         return self
 
@@ -79,8 +83,8 @@ class AbstractConstraint(AbstractLink):
 class AbstractVelocityConstraint(AbstractLink):
     """A constraint between velocities that is not the derivative of one between positions, `residual = 0`.
 
-    `linear` says whether the residual is linear in the velocities (perhaps with a constant term), `homogeneous` whether it
-    vanishes at rest.
+    `linear` says whether the residual is linear in the velocities (perhaps with a constant term), `homogeneous`
+    whether it vanishes at rest.
     """
 
     rows: AbstractVar[int]
@@ -95,7 +99,8 @@ class AbstractVelocityConstraint(AbstractLink):
 class AbstractForce(AbstractLink):
     """A force law.
 
-    `conservative` says whether `energy` holds a potential energy of this part; the rest of its power is dissipated or supplied.
+    `conservative` says whether `energy` holds a potential energy of this part; the rest of its power is dissipated or
+    supplied.
     """
 
     conservative: AbstractVar[bool]

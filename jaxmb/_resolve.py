@@ -1,4 +1,6 @@
-"""Turning what a user may give (world points and axes) into what kernels need (body-fixed ones), with checks that name the part."""
+"""Turning what a user may give (world points and axes) into what kernels need (body-fixed ones), with checks that name
+the part.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -8,8 +8,9 @@ from .assembly import nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
 from .system.rigid_bodies import Implied, Ranks, RigidBodySystem
 
-# Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and between
-# the two it would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place: 6e-5.)
+# Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and
+# between the two it would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
+# 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
 
@@ -17,7 +18,8 @@ _LOCKED = 5e-3
 def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]:
     """Assemble from the given poses on concrete numbers, and eliminate.
 
-    **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or accelerations.
+    **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
+    accelerations.
     """
     found = _analyse(system)
     if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
@@ -57,7 +59,8 @@ def _analyse(system):
         "accelerations": (jnp.zeros(0), jnp.zeros(0)),
     }
     if system.velocity_rows and system.linear:
-        # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is contradiction.
+        # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is
+        # contradiction.
         solve = lambda b: jnp.linalg.lstsq(jacobian * scale[None, :], -b, rcond=1e-8)[0] * scale
         asked = system.velocity_residual(t, q, jnp.zeros_like(u))
         u = solve(asked)
@@ -80,8 +83,8 @@ def _check_left_over(system, what, left, asked):
 def _check_locked(system, jacobian):
     """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
 
-    Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble, if at all,
-    where they lock. No row is implied there, but some nearly are.
+    Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
+    if at all, where they lock. No row is implied there, but some nearly are.
     """
     scaled = jacobian * np.asarray(system.velocity_scale())[None, :]
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)

@@ -24,8 +24,8 @@ class Constraint(AbstractConstraint):
     **Arguments:**
 
     - `bodies`: one name or several; `"ground"` may be among them.
-    - `function(poses, t, parameters)`: returns shape `(rows,)`; `poses` has a row per body (plane: x, y, angle; space: r, Euler
-        parameters). It must be twice differentiable by JAX.
+    - `function(poses, t, parameters)`: returns shape `(rows,)`; `poses` has a row per body (plane: x, y, angle;
+        space: r, Euler parameters). It must be twice differentiable by JAX.
     - `rows`: the number of equations.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
     - `rheonomic`: whether the function depends on `t`.
@@ -45,9 +45,9 @@ class Constraint(AbstractConstraint):
 class VelocityConstraint(AbstractVelocityConstraint):
     """A nonholonomic constraint from a function, `function(poses, velocities, t, parameters) = 0`.
 
-    **Arguments:** as `Constraint`; `velocities` has a row per body (plane: ẋ, ẏ, angular rate; space: ṙ in the world, ω′ in the
-    body frame). `linear` says that the function is linear in the velocities up to a constant term (cheaper); `homogeneous` that
-    it also vanishes at rest.
+    **Arguments:** as `Constraint`; `velocities` has a row per body (plane: ẋ, ẏ, angular rate; space: ṙ in the world,
+    ω′ in the body frame). `linear` says that the function is linear in the velocities up to a constant term
+    (cheaper); `homogeneous` that it also vanishes at rest.
     """
 
     name: str = eqx.field(static=True)
@@ -71,8 +71,8 @@ class Force(AbstractForce):
     - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment about the mass centre [N m]) or
         `(len(bodies), 6)` in space (force in the world frame, moment in the body frame).
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
-    - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the energy
-        balance.
+    - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
+        energy balance.
     """
 
     name: str = eqx.field(static=True)

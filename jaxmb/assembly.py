@@ -1,8 +1,8 @@
 """Consistent initial states: the nearest configuration and velocities that satisfy every constraint.
 
-The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0` and to the coordinates fixed by name; then the
-velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0` and to the rates fixed by name. Derivatives are
-those of the minimisers, by the implicit function theorem.
+The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0` and to the coordinates fixed by
+name; then the velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0` and to the rates fixed by
+name. Derivatives are those of the minimisers, by the implicit function theorem.
 """
 
 from collections.abc import Mapping
@@ -41,16 +41,16 @@ def assemble(
     - `system`: a compiled scene.
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}`.
-    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"` (body frame)
-        and `"body.velocity"`.
+    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"`
+        (body frame) and `"body.velocity"`.
     - `t`: the time, for driven mechanisms [s].
-    - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so that one member
-        of a batch does not spoil the others.
+    - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
+        that one member of a batch does not spoil the others.
 
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
 
-    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, or the coordinates that
-    cannot be fixed together. Under `jit` the same as a run-time error without the names.
+    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, or the
+    coordinates that cannot be fixed together. Under `jit` the same as a run-time error without the names.
     """
     guess = system.guess if guess is None else guess
     t = jnp.asarray(t, guess.q.dtype)
@@ -81,7 +81,8 @@ def assemble(
 def positions(
     system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...], rank: int
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
-    """The configuration nearest to the guess with some coordinates held; and whether every residual is at rounding level.
+    """The configuration nearest to the guess with some coordinates held; and whether every residual is at rounding
+    level.
 
     `rank`: of the rows in the columns that are not held.
     """
@@ -201,7 +202,9 @@ def tolerance(dtype) -> float:
 
 
 def _normalize_fixed(system, q, fixed):
-    """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of those."""
+    """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of
+    those.
+    """
     whole = [
         row[3:]
         for row in system.layout.pose_index[:-1]

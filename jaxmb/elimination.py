@@ -1,14 +1,14 @@
 """Gaussian elimination with full pivoting inside `lax`: which columns depend on which, and the influence matrix.
 
-A constraint Jacobian `A` (m × n) of rank r splits its columns in r dependent and n − r independent ones,
-`A_d δx_d + A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for
+A constraint Jacobian `A` (m × n) of rank r splits its columns in r dependent and n − r independent ones, `A_d δx_d +
+A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for
 which H stays of order one, and leaves m − r rows that are implied by the others.
 
-Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other state the
-same split is used without search (`factor`). Pivots are integers and carry no derivative; values do.
+Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other
+state the same split is used without search (`factor`). Pivots are integers and carry no derivative; values do.
 
-Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension Reduction in Analysis of Constrained
-Dynamic Systems", J. Mech. Design 104(1), 1982.
+Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension Reduction in Analysis of
+Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
 """
 
 import equinox as eqx
@@ -24,8 +24,8 @@ _LOOP_SIZE = 24
 class Order(eqx.Module):
     """An order of elimination: two permutations and their inverses, packed in one array of integers.
 
-    **Fields:** `packed`; `m`, `n`: the matrix's shape, static. `rows` has pivot rows first and implied rows last, `columns` dependent
-    columns first and independent ones last; `row_place` and `column_place` are their inverses.
+    **Fields:** `packed`; `m`, `n`: the matrix's shape, static. `rows` has pivot rows first and implied rows last,
+    `columns` dependent columns first and independent ones last; `row_place` and `column_place` are their inverses.
     """
 
     packed: Int[Array, "both"]
@@ -64,10 +64,10 @@ class Pivots(eqx.Module):
 class Factor(eqx.Module):
     """The solved form of `A δx = −residual` in a given split; full-size matrices, so no index bookkeeping is left.
 
-    **Fields:** `correction` (n × m): `δx = −correction @ residual` makes `A δx = −residual` while the independent columns keep
-    their values; columns of implied rows are zero. `basis` (n × (n − r)): `δx = basis @ δx_i` spans the null space of A, with
-    the identity on the independent rows and the influence matrix H on the dependent ones. `rows` (r,): the rows kept, which
-    tangents have not.
+    **Fields:** `correction` (n × m): `δx = −correction @ residual` makes `A δx = −residual` while the independent
+    columns keep their values; columns of implied rows are zero. `basis` (n × (n − r)): `δx = basis @ δx_i` spans the
+    null space of A, with the identity on the independent rows and the influence matrix H on the dependent ones.
+    `rows` (r,): the rows kept, which tangents have not.
     """
 
     correction: Float[Array, "n m"]
@@ -87,11 +87,12 @@ def full_pivot(
     **Arguments:**
 
     - `A`: the matrix, m × n, any shape and rank.
-    - `scale`: size of a typical change of each column's coordinate (a length for translations, one for angles), shape (n,); the
-        matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
+    - `scale`: size of a typical change of each column's coordinate (a length for translations, one for angles), shape
+        (n,); the matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
     - `stage`: rows of stage 0 are eliminated before rows of stage 1, shape (m,). This nests the dependent columns of
         nonholonomic rows in the independent columns of the holonomic ones.
-    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, the nearest of true ranks 1e-4.
+    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, the nearest of true
+        ranks 1e-4.
     """
     m, n = A.shape
     A = lax.stop_gradient(A)

@@ -16,7 +16,7 @@ from ._free import Bounds, FreeParameters, free_parameters
 from ._least_squares import LeastSquares, levenberg_marquardt
 from ._names import unknown
 from ._results import RESULTS
-from ._types import Scalar, State
+from ._types import Scalar, State, VectorLike
 from .assembly import assemble
 from .reactions import joint_names
 from .simulate import simulate

@@ -14,8 +14,9 @@ from .system import RigidBodySystem
 class Reaction(NamedTuple):
     """What a joint does to the last of its bodies that is not the ground.
 
-    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where the joint has
-    none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body gets the opposite.
+    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where
+    the joint has none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body gets the
+    opposite.
     """
 
     force: Float[Array, "*times d"]

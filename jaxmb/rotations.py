@@ -1,8 +1,8 @@
 """Rotations: Euler parameters (unit quaternions, scalar first), planar rotations, and norms that differentiate at zero.
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
-components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p` are
-the same attitude. Angular velocities are in the body frame unless a name ends in `_W`.
+components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p`
+are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`.
 
 Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the Dynamic Analysis of Three-Dimensional
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
@@ -14,8 +14,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._types import Scalar, VectorLike
 
-# Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would make a
-# kernel of every slice and every stack of components.
+# Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would
+# make a kernel of every slice and every stack of components.
 
 
 def _tables():

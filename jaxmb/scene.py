@@ -13,11 +13,9 @@ from ._parts import GROUND, AbstractConstraint, AbstractForce, AbstractLink, Abs
 from ._resolve import label, vector
 from ._structure import find_structure
 from ._types import State
-from .planar import Body as PlanarBody
-from .planar import PointMass as PlanarPointMass
+from .planar import Body as PlanarBody, PointMass as PlanarPointMass
 from .planar._space import PLANE
-from .spatial import Body as SpatialBody
-from .spatial import PointMass as SpatialPointMass
+from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
 from .spatial._space import SPACE
 from .system import RigidBodySystem
 from .system.describe import Description
@@ -31,13 +29,15 @@ _BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
 class Scene(eqx.Module):
     """Bodies, joints and forces by name.
 
-    A scene is planar or spatial, never both; its bodies decide. Joints are constraints between positions or velocities, in any
-    order; closed loops and redundant joints are the normal case.
+    A scene is planar or spatial, never both; its bodies decide. Joints are constraints between positions or
+    velocities, in any order; closed loops and redundant joints are the normal case.
 
-    **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints, among them drivers
-    and rolling; `forces`: force elements and at most one `Gravity`. `"ground"` names the fixed world.
+    **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
+    among them drivers and rolling; `forces`: force elements and at most one `Gravity`. `"ground"` names the fixed
+    world.
 
-    **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message names the part.
+    **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
+    names the part.
     """
 
     bodies: tuple[Any, ...] = eqx.field(converter=tuple)
@@ -57,8 +57,8 @@ class Scene(eqx.Module):
 
         **Returns:** the system, a pytree whose leaves are the parameters.
 
-        **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given poses, and for
-        constraints that contradict each other; the message names the parts.
+        **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given
+        poses, and for constraints that contradict each other; the message names the parts.
         """
         for body in self.bodies:
             body.check()

@@ -57,27 +57,31 @@ def simulate(
 
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
-    - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows `Trajectory.at(t)`.
+    - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
+        `Trajectory.at(t)`.
     - `rtol`, `atol`: tolerances of the error of one step; `atol` defaults to `rtol` times one hundredth.
 
     **Other arguments, rarely needed:**
 
     - `solver`: default `Adams()`; any diffrax Runge–Kutta solver.
     - `formulation`: how accelerations are solved for, default `Partitioned()`.
-    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams`, `Projection()` for others, and
-        nothing of either for a system without constraints.
+    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams`, `Projection()` for
+        others, and nothing of either for a system without constraints.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams`.
-    - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of them computed twice. For few
-        parameters forward mode is faster and needs no memory: `jax.jacfwd` with `adjoint=diffrax.ForwardMode()`.
+    - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
+        them computed twice. For few parameters forward mode is faster and needs no memory: `jax.jacfwd` with
+        `adjoint=diffrax.ForwardMode()`.
     - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` for tolerances out of range and combinations that cannot work; `RuntimeError`, if `throw`, when the
-    integration fails: the text of its `RESULTS` says how. With `throw=False` the trajectory up to there is kept.
+    **Raises:** `ValueError` for tolerances out of range and combinations that cannot work; `RuntimeError`, if
+    `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the trajectory up to
+    there is kept.
 
-    Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true ones.
+    Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
+    ones.
     """
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
     if state.q.shape != (system.nq,) or state.u.shape != (system.nu,):

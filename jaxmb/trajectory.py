@@ -31,9 +31,9 @@ class ConstraintViolation(NamedTuple):
 class BodyMotion(NamedTuple):
     """Motion of one body; axis 0 is time.
 
-    **Fields:** `position` [m] of the mass centre and `velocity` [m/s], world axes, shape (times, 2) or (times, 3); in the plane
-    `angle` [rad] and `angular_velocity` [rad/s], shape (times,); in space `orientation` (Euler parameters, (times, 4)) and
-    `angular_velocity` [rad/s] in the body frame, (times, 3). A point mass has no attitude: None.
+    **Fields:** `position` [m] of the mass centre and `velocity` [m/s], world axes, shape (times, 2) or (times, 3); in
+    the plane `angle` [rad] and `angular_velocity` [rad/s], shape (times,); in space `orientation` (Euler parameters,
+    (times, 4)) and `angular_velocity` [rad/s] in the body frame, (times, 3). A point mass has no attitude: None.
     """
 
     position: Array
@@ -67,9 +67,9 @@ class Reactions(Mapping[str, Reaction]):
 class Trajectory(eqx.Module):
     """What `simulate` returns.
 
-    **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the integration
-    (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`: accepted steps at order 1, 2, …);
-    `result`, how it ended. `trajectory["crank"]` is the motion of a body.
+    **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
+    integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
+    accepted steps at order 1, 2, …); `result`, how it ended. `trajectory["crank"]` is the motion of a body.
     """
 
     system: RigidBodySystem

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jaxmb.elimination import factor, full_pivot, gauss_jordan, solve_positive
 
 RNG = np.random.default_rng(0)
@@ -13,7 +14,9 @@ def random_matrix(m, n, rank):
     return jnp.asarray(RNG.normal(size=(m, rank)) @ RNG.normal(size=(rank, n)))
 
 
-@pytest.mark.parametrize(("m", "n", "rank"), [(1, 3, 1), (4, 9, 4), (8, 9, 8), (9, 7, 7), (12, 14, 9), (30, 35, 28), (5, 5, 0)])
+@pytest.mark.parametrize(
+    ("m", "n", "rank"), [(1, 3, 1), (4, 9, 4), (8, 9, 8), (9, 7, 7), (12, 14, 9), (30, 35, 28), (5, 5, 0)]
+)
 def test_rank_orders_and_influence(m, n, rank):
     A = random_matrix(m, n, rank)
     pivots = full_pivot(A)

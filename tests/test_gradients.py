@@ -1,15 +1,16 @@
 """Gradients of motions: forward mode = reverse mode, and both = central differences of a tighter solution.
 
-Every mechanism gets a driven anchor and a spring from the anchor to one of its bodies, so that parameters of every kind are
-there: mass, inertia, body-fixed point, stiffness, a driver's parameter, and an initial rate.
+Every mechanism gets a driven anchor and a spring from the anchor to one of its bodies, so that parameters of every
+kind are there: mass, inertia, body-fixed point, stiffness, a driver's parameter, and an initial rate.
 """
 
 import diffrax
 import jax
 import jax.numpy as jnp
-import jaxmb as mb
 import numpy as np
 import pytest
+
+import jaxmb as mb
 from jaxmb import planar, spatial
 
 TIME = 0.4
@@ -20,7 +21,9 @@ def planar_anchor(body, point):
     swing = lambda t, p: 0.5 + p["amplitude"] * jnp.sin(p["rate"] * t)
     joints = [
         planar.Prismatic("rail", "ground", "anchor", point=(0.5, 2.0), axis=(1.0, 0.0)),
-        planar.Driver("drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}),
+        planar.Driver(
+            "drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}
+        ),
     ]
     spring = planar.SpringDamper(
         "spring", "anchor", body, stiffness=20.0, damping=0.5, free_length=0.4, point_a=(0.1, 0.0), point_b=point
@@ -33,7 +36,9 @@ def spatial_anchor(body, point):
     swing = lambda t, p: 0.5 + p["amplitude"] * jnp.sin(p["rate"] * t)
     joints = [
         spatial.Prismatic("rail", "ground", "anchor", point=(0.5, 0.2, 0.9), axis=(1.0, 0.0, 0.0)),
-        spatial.Driver("drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}),
+        spatial.Driver(
+            "drive", "ground", "anchor", quantity="x", motion=swing, parameters={"amplitude": 0.3, "rate": 4.0}
+        ),
     ]
     spring = spatial.SpringDamper(
         "spring", "anchor", body, stiffness=5.0, damping=0.1, free_length=0.4, point_a=(0.1, 0.0, 0.0), point_b=point
@@ -45,7 +50,12 @@ CASES = {
     # mechanism: (body of the spring, its point, more fixed coordinates, rate that is differentiated, other parameters)
     "four_bar": ("rocker", (0.3, 0.1), "crank.angle", ["crank.mass", "rocker.inertia", "spring.point_b"]),
     "bricard": ("bar3", (0.1, 0.0, 0.2), "bar1.wy", ["bar2.mass", "bar3.inertia", "spring.point_b"]),
-    "rolling_disk": ("disk", (0.05, 0.02, 0.1), "disk.wy", ["disk.mass", "disk.inertia", "spring.point_b", "plane.radius"]),
+    "rolling_disk": (
+        "disk",
+        (0.05, 0.02, 0.1),
+        "disk.wy",
+        ["disk.mass", "disk.inertia", "spring.point_b", "plane.radius"],
+    ),
     "heavy_top": ("top", (0.02, 0.01, 0.05), "top.wz", ["top.mass", "top.inertia", "tip.point_b", "spring.point_b"]),
 }
 

@@ -10,8 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 
-from jaxmb import rotations as rot
-from jaxmb import spatial
+from jaxmb import rotations as rot, spatial
 from jaxmb.spatial._space import SPACE
 
 POINT_A, POINT_B = (0.1, -0.2, 0.3), (0.4, 0.1, -0.2)

@@ -7,15 +7,15 @@ from ._base import AbstractFormulation
 class Partitioned(AbstractFormulation):
     """Reduced equations in the independent accelerations, `(EᵀME) u̇_i = Eᵀ(F − M c)`, `u̇ = E u̇_i + c`.
 
-    E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart. Cheapest where
-    the chart is there anyway and the degrees of freedom are few.
+    E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
+    Cheapest where the chart is there anyway and the degrees of freedom are few.
 
     ??? cite "Reference"
         ```bibtex
         @article{wehage1982generalized,
-          author = {Wehage, R. A. and Haug, E. J.},
-          title = {Generalized Coordinate Partitioning for Dimension Reduction in Analysis of Constrained Dynamic Systems},
-          journal = {Journal of Mechanical Design}, volume = {104}, number = {1}, pages = {247--255}, year = {1982},
+          author = {Wehage, R. A. and Haug, E. J.}, title = {Generalized Coordinate Partitioning for Dimension
+          Reduction in Analysis of Constrained Dynamic Systems}, journal = {Journal of Mechanical Design}, volume =
+          {104}, number = {1}, pages = {247--255}, year = {1982},
         }
         ```
     """

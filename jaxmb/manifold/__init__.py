@@ -3,5 +3,4 @@
 from ._base import AbstractManifold as AbstractManifold
 from .free import Free as Free
 from .partition import Partition as Partition
-from .projection import Projection as Projection
-from .projection import project as project
+from .projection import Projection as Projection, project as project

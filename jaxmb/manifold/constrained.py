@@ -1,12 +1,12 @@
 """One evaluation on the constraint manifold, with exact derivatives.
 
-Given a guess of the state and a chart, `evaluate` keeps the independent coordinates and velocities, solves `Φ = 0` and `ψ = 0`
-for the dependent ones, and the equations of motion for the accelerations. Jacobian, factor and influence matrix are computed
-once and shared.
+Given a guess of the state and a chart, `evaluate` keeps the independent coordinates and velocities, solves `Φ = 0`
+and `ψ = 0` for the dependent ones, and the equations of motion for the accelerations. Jacobian, factor and influence
+matrix are computed once and shared.
 
-Its derivative does not follow the algorithm but the equations (implicit function theorem), with the factors that are there
-anyway: it is cheap, independent of the formulation, and cannot pick up a frozen iterate. The factors' own derivatives are part
-of the rule, so higher derivatives are right as well.
+Its derivative does not follow the algorithm but the equations (implicit function theorem), with the factors that are
+there anyway: it is cheap, independent of the formulation, and cannot pick up a frozen iterate. The factors' own
+derivatives are part of the rule, so higher derivatives are right as well.
 """
 
 import equinox as eqx
@@ -26,9 +26,9 @@ _MAX_ITERATIONS = 12
 class Split(eqx.Module):
     """A chart's index sets and the carried matrix of its position Newton.
 
-    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `coordinate`: that of the coordinates' Jacobian, None
-    where one split serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq = −Φ` along dependent
-    columns, made at `time`.
+    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `coordinate`: that of the coordinates'
+    Jacobian, None where one split serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq =
+    −Φ` along dependent columns, made at `time`.
     """
 
     velocity: Order
@@ -79,8 +79,8 @@ def evaluate(
 ) -> Evaluation:
     """Restore a state to the manifold and evaluate the accelerations there.
 
-    **Arguments:** `q`, `u`: the state, independent entries exact, dependent ones a guess; `tol`: size of the last Newton
-    correction, relative to the system's size.
+    **Arguments:** `q`, `u`: the state, independent entries exact, dependent ones a guess; `tol`: size of the last
+    Newton correction, relative to the system's size.
     """
     q, iterations, failed = _restore_positions(system, t, q, split, tol)
     u, jacobian, solved, slow = _restore_velocities(system, t, q, u, split, tol)

@@ -12,8 +12,8 @@ from ._base import AbstractManifold
 class Free(AbstractManifold):
     """Integrate all coordinates and leave the constraints to themselves.
 
-    The policy of systems without constraints. With constraints the state drifts off them by the error of integration; that is
-    for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
+    The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
+    that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
     """
 
     def prepare(self, system, formulation, solver, rtol):

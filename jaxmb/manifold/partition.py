@@ -1,7 +1,7 @@
 """Generalized coordinate partitioning: integrate the independent coordinates and velocities, solve for the rest.
 
-Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikravesh and I. S. Chung, J. Mech. Design 104(4),
-1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
+Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikravesh and I. S. Chung, J. Mech. Design
+104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
 """
 
 import equinox as eqx
@@ -24,8 +24,9 @@ from .free import VectorField
 # A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
 _AGE = 4
 _SLOW = 3
-# A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten seconds:
-# 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts in 1200 steps.)
+# A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
+# seconds: 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts
+# in 1200 steps.)
 _GROWTH = 1.1
 
 
@@ -36,14 +37,15 @@ _evaluate = eqx.filter_jit(evaluate)
 class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
-    Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic constraints
-    these are two nested charts. Only independent components are integrated and error-controlled; the others satisfy the
-    constraints to Newton's tolerance at every evaluation. A chart is replaced when its influence matrix H has grown by the
-    factor `max_influence`; history is kept for all components, so that costs no restart.
+    Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic
+    constraints these are two nested charts. Only independent components are integrated and error-controlled; the
+    others satisfy the constraints to Newton's tolerance at every evaluation. A chart is replaced when its influence
+    matrix H has grown by the factor `max_influence`; history is kept for all components, so that costs no restart.
 
-    **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was made,
-    whichever is more: errors of the independent components reach the dependent ones multiplied by H and its rates; `newton_tol`:
-    size of the last Newton correction relative to the system's size, default tied to the tolerance of integration.
+    **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
+    made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its
+    rates; `newton_tol`: size of the last Newton correction relative to the system's size, default tied to the
+    tolerance of integration.
     """
 
     max_influence: float = eqx.field(static=True, default=_GROWTH)
@@ -66,8 +68,8 @@ class Partition(AbstractManifold):
 class Chart(eqx.Module):
     """A split with its quality and counters.
 
-    **Fields:** `split`; `influence`: largest scaled |H| at the last evaluation; `fresh`: the same when the chart was made;
-    `counters`: see the properties.
+    **Fields:** `split`; `influence`: largest scaled |H| at the last evaluation; `fresh`: the same when the chart was
+    made; `counters`: see the properties.
     """
 
     split: Split

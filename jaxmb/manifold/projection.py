@@ -25,8 +25,8 @@ _ITERATIONS = 8
 class Projection(AbstractManifold):
     """Integrate all coordinates with any diffrax Runge–Kutta solver, and project every step on the constraints.
 
-    The projection is the smallest change in the coordinates' scales, first of the configuration, then of the velocities. A
-    first-same-as-last derivative is kept across it: the difference is of the size of the local error.
+    The projection is the smallest change in the coordinates' scales, first of the configuration, then of the
+    velocities. A first-same-as-last derivative is kept across it: the difference is of the size of the local error.
     """
 
     def prepare(self, system, formulation, solver, rtol):

@@ -3,8 +3,7 @@
 from typing import Any
 
 from .._names import unknown
-from ._base import Mechanism as Mechanism
-from ._base import References as References
+from ._base import Mechanism as Mechanism, References as References
 from .andrews import andrews as andrews
 from .bricard import bricard as bricard
 from .car_axis import car_axis as car_axis

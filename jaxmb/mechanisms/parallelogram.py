@@ -16,7 +16,7 @@ def parallelogram(
     rocker: float = 1.0,
     spacing: float = 1.0,
     masses: tuple[float, float] = (1.0, 2.0),
-    angle: float = np.pi / 3,
+    angle: float = -np.pi / 3,
     speed: float = 1.0,
     gravity: float = 9.81,
 ) -> Mechanism:

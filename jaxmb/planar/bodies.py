@@ -13,8 +13,9 @@ from .._resolve import positive, vector
 class Body(AbstractPart):
     """A rigid body; its frame has its origin in the mass centre.
 
-    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the mass centre, and
-    `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and `angular_velocity` [rad/s] likewise.
+    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
+    mass centre, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and
+    `angular_velocity` [rad/s] likewise.
     """
 
     name: str = eqx.field(static=True)

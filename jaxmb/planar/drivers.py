@@ -22,8 +22,8 @@ class Driver(AbstractConstraint):
     **Arguments:**
 
     - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
-    - `quantity`: `"angle"` [rad], `angle_b − angle_a`; `"x"` or `"y"` [m], a coordinate of point B less that of point A along the axes
-        of `body_a`; `"distance"` [m], between the points.
+    - `quantity`: `"angle"` [rad], `angle_b − angle_a`; `"x"` or `"y"` [m], a coordinate of point B less that of point
+        A along the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
     - `point_a`, `point_b` [m], body-fixed, default the mass centres.

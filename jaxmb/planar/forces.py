@@ -39,8 +39,8 @@ class Torque(AbstractForce):
 class TorsionalSpringDamper(AbstractForce):
     """A linear spring and damper on the relative angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
 
-    **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `free_angle` [rad] of `angle_b − angle_a`, default that of
-    the given poses.
+    **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `free_angle` [rad] of `angle_b − angle_a`,
+    default that of the given poses.
     """
 
     name: str = eqx.field(static=True)
@@ -73,11 +73,11 @@ class TorsionalSpringDamper(AbstractForce):
 class Bushing(AbstractForce):
     """A compliant joint: springs and dampers on the three relative motions of a frame in B with respect to one in A.
 
-    The motions are the position of B's point in the axes of `body_a` relative to A's point (2) [m] and the relative angle less
-    that of the given poses [rad].
+    The motions are the position of B's point in the axes of `body_a` relative to A's point (2) [m] and the relative
+    angle less that of the given poses [rad].
 
-    **Arguments:** `stiffness`, shape (3,) [N/m, N/m, N m/rad]; `damping`, shape (3,) [N s/m, N s/m, N m s/rad]; points as in
-    `Revolute`; `free_angle` [rad], default that of the given poses.
+    **Arguments:** `stiffness`, shape (3,) [N/m, N/m, N m/rad]; `damping`, shape (3,) [N s/m, N s/m, N m s/rad];
+    points as in `Revolute`; `free_angle` [rad], default that of the given poses.
     """
 
     name: str = eqx.field(static=True)

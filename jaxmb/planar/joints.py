@@ -1,8 +1,9 @@
 """Joints of the plane.
 
-Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in the
-bodies' own frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the bodies' given poses
-(`point`, `axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
+Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
+the bodies' own frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the bodies' given
+poses (`point`, `axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of
+the axis.
 """
 
 from collections.abc import Callable
@@ -83,8 +84,8 @@ class Fixed(AbstractConstraint):
 class PointOnLine(AbstractConstraint):
     """A pin in a straight slot: point B stays on the line through A. Rows 1: `n·d = 0`.
 
-    **Arguments:** points as in `Revolute`; `axis_a`, unit, shape (2,), direction of the slot fixed in `body_a`, or `axis` in
-    the world at the given pose.
+    **Arguments:** points as in `Revolute`; `axis_a`, unit, shape (2,), direction of the slot fixed in `body_a`, or
+    `axis` in the world at the given pose.
     """
 
     name: str = eqx.field(static=True)
@@ -110,7 +111,8 @@ class PointOnLine(AbstractConstraint):
 
 
 class Prismatic(AbstractConstraint):
-    """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a = angle`.
+    """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a
+    = angle`.
 
     **Arguments:** as in `PointOnLine`; `angle` [rad], default that of the given poses.
     """
@@ -156,7 +158,8 @@ def _offset(space, part, poses):
 
 
 class Distance(AbstractConstraint):
-    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`; the multiplier is the rod force [N].
+    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`; the multiplier is
+    the rod force [N].
 
     **Arguments:** `point_a`, `point_b` [m], shape (2,), body-fixed; `length` [m] > 0, default that of the given poses.
     """
@@ -187,10 +190,11 @@ class Distance(AbstractConstraint):
 
 
 class PointOnCurve(AbstractConstraint):
-    """A pin in a curved slot: point B stays on a curve fixed in `body_a`. Rows 1: `curve(B in the frame of body_a, parameters) = 0`.
+    """A pin in a curved slot: point B stays on a curve fixed in `body_a`. Rows 1: `curve(B in the frame of body_a,
+    parameters) = 0`.
 
-    **Arguments:** `point_b` [m], shape (2,), body-fixed; `curve(point, parameters) -> scalar`, zero on the curve and with a
-    gradient there; `parameters`, numbers of the curve by name.
+    **Arguments:** `point_b` [m], shape (2,), body-fixed; `curve(point, parameters) -> scalar`, zero on the curve and
+    with a gradient there; `parameters`, numbers of the curve by name.
     """
 
     name: str = eqx.field(static=True)
@@ -220,8 +224,8 @@ class PointOnCurve(AbstractConstraint):
 class Gear(AbstractConstraint):
     """A pair of gears on a carrier. Rows 1: `(angle_b − angle_c) = ratio (angle_a − angle_c) + offset`.
 
-    **Arguments:** `ratio`, negative for gears that mesh outside (−radius_a / radius_b); `carrier`, the body that holds both
-    axles, default ground; `offset` [rad], default that of the given poses.
+    **Arguments:** `ratio`, negative for gears that mesh outside (−radius_a / radius_b); `carrier`, the body that
+    holds both axles, default ground; `offset` [rad], default that of the given poses.
     """
 
     name: str = eqx.field(static=True)
@@ -248,12 +252,14 @@ class Gear(AbstractConstraint):
 
 
 class RackAndPinion(AbstractConstraint):
-    """A pinion (`body_a`) that rolls along a rack (`body_b`). Rows 1: `axis·(A − B) = −radius (angle_a − angle_b) + offset`.
+    """A pinion (`body_a`) that rolls along a rack (`body_b`). Rows 1: `axis·(A − B) = −radius (angle_a − angle_b) +
+    offset`.
 
     A pinion on top of a rack along x, turning clockwise, moves towards +x of the rack.
 
-    **Arguments:** `radius` [m] > 0 of the pinion; `point_a` [m], its centre; `point_b` [m], a point of the rack; `axis_b`, unit,
-    shape (2,), direction of the rack fixed in `body_b`; `offset` [m], default that of the given poses.
+    **Arguments:** `radius` [m] > 0 of the pinion; `point_a` [m], its centre; `point_b` [m], a point of the rack;
+    `axis_b`, unit, shape (2,), direction of the rack fixed in `body_b`; `offset` [m], default that of the given
+    poses.
     """
 
     name: str = eqx.field(static=True)

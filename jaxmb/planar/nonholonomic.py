@@ -10,10 +10,11 @@ from .._resolve import unit, vector
 
 
 class KnifeEdge(AbstractVelocityConstraint):
-    """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n the normal of the blade.
+    """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n
+    the normal of the blade.
 
-    **Arguments:** `point` [m], shape (2,), contact point fixed in the body; `axis`, unit, shape (2,), direction of the blade fixed
-    in the body.
+    **Arguments:** `point` [m], shape (2,), contact point fixed in the body; `axis`, unit, shape (2,), direction of
+    the blade fixed in the body.
     """
 
     name: str = eqx.field(static=True)

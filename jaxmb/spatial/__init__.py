@@ -1,30 +1,28 @@
 """Parts of spatial scenes."""
 
-from .._forces import Damper as Damper
-from .._forces import PointForce as PointForce
-from .._forces import SpringDamper as SpringDamper
-from .bodies import Body as Body
-from .bodies import PointMass as PointMass
-from .bodies import box as box
-from .bodies import cylinder as cylinder
-from .bodies import disc as disc
-from .bodies import rod as rod
-from .bodies import sphere as sphere
+from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from .bodies import (
+    Body as Body,
+    PointMass as PointMass,
+    box as box,
+    cylinder as cylinder,
+    disc as disc,
+    rod as rod,
+    sphere as sphere,
+)
 from .drivers import Driver as Driver
-from .forces import Bushing as Bushing
-from .forces import Torque as Torque
-from .forces import TorsionalSpringDamper as TorsionalSpringDamper
-from .joints import Cylindrical as Cylindrical
-from .joints import Distance as Distance
-from .joints import Fixed as Fixed
-from .joints import Planar as Planar
-from .joints import PointOnLine as PointOnLine
-from .joints import PointOnPlane as PointOnPlane
-from .joints import Prismatic as Prismatic
-from .joints import Revolute as Revolute
-from .joints import Screw as Screw
-from .joints import Spherical as Spherical
-from .joints import Universal as Universal
-from .nonholonomic import KnifeEdge as KnifeEdge
-from .nonholonomic import RollingDisk as RollingDisk
-from .nonholonomic import RollingSphere as RollingSphere
+from .forces import Bushing as Bushing, Torque as Torque, TorsionalSpringDamper as TorsionalSpringDamper
+from .joints import (
+    Cylindrical as Cylindrical,
+    Distance as Distance,
+    Fixed as Fixed,
+    Planar as Planar,
+    PointOnLine as PointOnLine,
+    PointOnPlane as PointOnPlane,
+    Prismatic as Prismatic,
+    Revolute as Revolute,
+    Screw as Screw,
+    Spherical as Spherical,
+    Universal as Universal,
+)
+from .nonholonomic import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere

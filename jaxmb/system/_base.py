@@ -4,8 +4,8 @@
     inertia       M(t, q) u̇ = F(t, q, u) + Aᵀ λ
     constraints   Φ(t, q) = 0,   ψ(t, q, u) = 0   →   A u̇ = γ(t, q, u),   A = ∂ψ/∂u
 
-`Φ` holds the constraints between positions; `ψ` their time derivatives followed by the nonholonomic rows. Coordinates may have
-invariants of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those.
+`Φ` holds the constraints between positions; `ψ` their time derivatives followed by the nonholonomic rows. Coordinates
+may have invariants of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those.
 """
 
 import abc

@@ -12,7 +12,9 @@ from .rigid_bodies import RigidBodySystem
 
 
 def coordinate_names(system: RigidBodySystem) -> dict[str, list[int]]:
-    """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`, `position`, `orientation` of spatial ones."""
+    """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`,
+    `position`, `orientation` of spatial ones.
+    """
     if system.spatial:
         fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
         return _names(system, system.layout.pose_index, fields, {"position": slice(0, 3), "orientation": slice(3, 7)})
@@ -20,7 +22,9 @@ def coordinate_names(system: RigidBodySystem) -> dict[str, list[int]]:
 
 
 def rate_names(system: RigidBodySystem) -> dict[str, list[int]]:
-    """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`, `angular_velocity` in space."""
+    """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`,
+    `angular_velocity` in space.
+    """
     if system.spatial:
         fields = ["x", "y", "z", "wx", "wy", "wz"]
         groups = {"velocity": slice(0, 3), "angular_velocity": slice(3, 6)}

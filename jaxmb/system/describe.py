@@ -1,4 +1,6 @@
-"""What a compiled scene is made of, in words: bodies, joints, rows, degrees of freedom, redundancy, and what was left out."""
+"""What a compiled scene is made of, in words: bodies, joints, rows, degrees of freedom, redundancy, and what was left
+out.
+"""
 
 import dataclasses
 import html
@@ -11,8 +13,8 @@ from .rigid_bodies import RigidBodySystem
 class Description:
     """Tables of a scene; prints as text, shows as HTML in a notebook.
 
-    **Fields:** `facts`: (name, value) pairs; `bodies`, `joints`, `forces`: rows of (type, names or count, remark); `implied`: sentences
-    on redundant rows; `left_out`: sentences on what this scene does not trace.
+    **Fields:** `facts`: (name, value) pairs; `bodies`, `joints`, `forces`: rows of (type, names or count, remark);
+    `implied`: sentences on redundant rows; `left_out`: sentences on what this scene does not trace.
     """
 
     facts: tuple[tuple[str, str], ...]

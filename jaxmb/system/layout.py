@@ -29,7 +29,9 @@ class Layout:
 
     @functools.cached_property
     def pose_index(self) -> np.ndarray:
-        """Index of every pose entry, shape (bodies + 1, pose size), into the coordinates followed by the ground's pose."""
+        """Index of every pose entry, shape (bodies + 1, pose size), into the coordinates followed by the ground's
+        pose.
+        """
         return self._index(self.space.pose_size, [*range(self.nq, self.nq + self.space.pose_size)])
 
     @functools.cached_property
@@ -61,11 +63,11 @@ class Layout:
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
         """Where each entry of an assembled Jacobian comes from.
 
-        **Arguments:** `groups`: for each group of parts its bodies (parts, k) and its rows; `of_poses`: columns are coordinates
-        rather than velocities.
+        **Arguments:** `groups`: for each group of parts its bodies (parts, k) and its rows; `of_poses`: columns are
+        coordinates rather than velocities.
 
-        **Returns:** shape (all rows, columns), indices into the groups' blocks (parts, rows, k, size), raveled one after the
-        other and followed by a zero.
+        **Returns:** shape (all rows, columns), indices into the groups' blocks (parts, rows, k, size), raveled one
+        after the other and followed by a zero.
         """
         index = self.pose_index if of_poses else self.velocity_index
         columns = self.nq if of_poses else self.nu
@@ -82,9 +84,11 @@ class Layout:
         return source[:, :columns]
 
     def force_source(self, groups: list[np.ndarray]) -> np.ndarray:
-        """Which wrench entries add up to each generalized force: shape (nu, largest count), padded with the index of a zero.
+        """Which wrench entries add up to each generalized force: shape (nu, largest count), padded with the index of a
+        zero.
 
-        Indices are into the groups' wrenches (parts, k, velocity size), raveled one after the other and followed by a zero.
+        Indices are into the groups' wrenches (parts, k, velocity size), raveled one after the other and followed by a
+        zero.
         """
         flat = np.concatenate([self.velocity_index[bodies].ravel() for bodies in groups])
         contributions = [np.flatnonzero(flat == column) for column in range(self.nu)]

@@ -15,8 +15,8 @@ from .rigid_bodies import RigidBodySystem
 def parameters(system: RigidBodySystem) -> dict[str, Array]:
     """Every parameter of a compiled scene by name.
 
-    **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the shapes of the
-    parts' fields. Numbers of a user function keep their own key, `"drive.speed"`.
+    **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the
+    shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`.
     """
     leaves = {}
     for name, places in _places(system).items():

@@ -39,9 +39,9 @@ class Implied(NamedTuple):
 class RigidBodySystem(AbstractSystem):
     """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
 
-    **Fields:** `mass` [kg], shape (bodies,); `rotary` [kg m²], shape (bodies,) in the plane and (bodies, 3, 3) in space; `gravity`
-    [m/s²] or None; the groups of parts; `guess`, the state given with the bodies; `length` [m], the scene's size;
-    `body_names`.
+    **Fields:** `mass` [kg], shape (bodies,); `rotary` [kg m²], shape (bodies,) in the plane and (bodies, 3, 3) in
+    space; `gravity` [m/s²] or None; the groups of parts; `guess`, the state given with the bodies; `length` [m], the
+    scene's size; `body_names`.
     """
 
     mass: Float[Array, "b"]
@@ -65,7 +65,9 @@ class RigidBodySystem(AbstractSystem):
         return self.describe()._repr_html_()
 
     def describe(self) -> "Description":
-        """Bodies, joints, rows, degrees of freedom, redundant rows by name, and what was left out; as text and as HTML."""
+        """Bodies, joints, rows, degrees of freedom, redundant rows by name, and what was left out; as text and as
+        HTML.
+        """
         from .describe import describe
 
         return describe(self)
@@ -270,7 +272,9 @@ class RigidBodySystem(AbstractSystem):
         return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
 
     def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
-        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in space."""
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
+        space.
+        """
         poses, velocities = self.poses(q), self.velocities(u)
         if not self.spatial:
             x, v = poses[:, :2], velocities[:, :2]
