@@ -30,8 +30,9 @@ def unit(part: AbstractPart, field: str, value: Array, size: int) -> Float[Array
     value = vector(part, field, value, size)
     length = float(np.linalg.norm(value))
     if abs(length - 1.0) > 1e-6:
+        fix = "divide it by its length" if length > 0 else "give a direction"
         raise ValueError(
-            f"{label(part)}: {field} must be a unit vector, got {np.asarray(value)} of length {length:.6g}; divide it by its length."
+            f"{label(part)}: {field} must be a unit vector, got {np.asarray(value)} of length {length:.6g}; {fix}."
         )
     return value / length
 

@@ -7,12 +7,12 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """Outcomes; diffrax's, and those of mechanics. Each text says what to try next."""
 
     singular_configuration = (
-        "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints falls, "
-        "and the motion beyond is not determined by them. With `throw=False` the trajectory up to there is returned."
+        "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints "
+        "falls, and the motion beyond is not determined by them. With `throw=False` the motion up to there is kept."
     )
     newton_failed = (
-        "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives are not "
-        "smooth, or numbers that are not finite. With `throw=False` the trajectory up to there is returned."
+        "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives "
+        "are not smooth, or numbers that are not finite. With `throw=False` the motion up to there is kept."
     )
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."

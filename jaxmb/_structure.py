@@ -25,8 +25,8 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
         raise ValueError(
             "The mechanism cannot be assembled from the given poses: residuals remain in "
-            f"{open_joints(system, 0.0, found['q'])}. Check lengths, points and axes for joints that contradict each other, "
-            "or give better poses."
+            f"{open_joints(system, 0.0, found['q'])}. Check lengths, points and axes for joints that contradict each "
+            "other, or give better poses."
         )
     for what in ("velocities", "accelerations"):
         _check_left_over(system, what, *map(np.asarray, found[what]))
@@ -75,8 +75,8 @@ def _check_left_over(system, what, left, asked):
     if np.any(bad):
         names = sorted({name for (name, _), b in zip(system.rows, bad, strict=True) if b})
         raise ValueError(
-            f"The {what} asked for by {', '.join(names)} contradict each other (largest residual {np.abs(left).max():.3g}). "
-            "Remove one of them, or make their motions agree."
+            f"The {what} asked for by {', '.join(names)} contradict each other (largest residual "
+            f"{np.abs(left).max():.3g}). Remove one of them, or make their motions agree."
         )
 
 

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -78,9 +79,10 @@ class Scene(eqx.Module):
                 vector(part, "acceleration", part.acceleration, space.dimension)
                 continue
             own = tuple(index[name] for name in part.bodies)
-            _check_rotation(part, own, layout)
             _check_finite(part)
-            resolved = part.resolve(space, extended[layout.pose_index[np.array(own)]])
+            poses = extended[layout.pose_index[np.array(own)]]
+            resolved = part.resolve(space, poses)
+            _check_rotation(resolved, own, layout, poses)
             parts += [(component, own) for component in resolved.components()]
 
         kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
@@ -155,14 +157,34 @@ def _check_names(scene: Scene):
         for name in part.bodies:
             if name not in known:
                 raise ValueError(f"{label(part)}: {unknown('body', name, known)}")
-        if len(set(part.bodies)) < len(part.bodies) and len(set(part.bodies) - {GROUND}) < 2:
-            raise ValueError(f"{label(part)} connects {part.bodies[0]!r} with itself.")
+        twice = [name for name in part.bodies if part.bodies.count(name) > 1]
+        if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
+            raise ValueError(f"{label(part)} connects {twice[0]!r} with itself.")
 
 
-def _check_rotation(part, own, layout):
-    points = [k for k in own if k < layout.bodies and not layout.rotates[k]]
-    if points and isinstance(part, AbstractConstraint) and getattr(part, "rotational", False):
-        raise ValueError(f"{label(part)} acts on an angle, and a PointMass has none; use a Body.")
+def _check_rotation(part, own, layout, poses):
+    """A point mass does not turn: refuse parts that would turn it, or hold on to its angle."""
+    points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
+    if not points:
+        return
+    space = layout.space
+    velocities = jnp.ones((len(own), space.velocity_size))
+    for component in part.components():
+        if isinstance(component, AbstractForce):
+            felt = component.wrenches(space, poses, velocities, 0.0)
+        elif isinstance(component, AbstractConstraint):
+            rate = lambda v, c=component: jax.jvp(
+                lambda x: c.residual(space, x, 0.0), (poses,), (jax.vmap(space.rates)(poses, v),)
+            )[1]
+            felt = jnp.sum(jnp.abs(jax.jacfwd(rate)(velocities)), axis=0)
+        else:
+            residual = lambda v, c=component: c.residual(space, poses, v, 0.0)
+            felt = jnp.sum(jnp.abs(jax.jacfwd(residual)(velocities)), axis=0)
+        if np.any(np.abs(felt[np.array(points), space.dimension :]) > 0):
+            raise ValueError(
+                f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, or use "
+                "a Body."
+            )
 
 
 def _check_finite(part):

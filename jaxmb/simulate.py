@@ -86,9 +86,10 @@ def simulate(
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
     if state.q.shape != (system.nq,) or state.u.shape != (system.nu,):
         raise ValueError(
-            f"The state must have {system.nq} coordinates and {system.nu} velocities, got {state.q.shape} and {state.u.shape}."
+            f"The state must have {system.nq} coordinates and {system.nu} velocities, got {state.q.shape} and "
+            f"{state.u.shape}."
         )
-    _check_tolerances(rtol, atol, state.q.dtype)
+    rtol = _checked_tolerance(rtol, atol, state.q.dtype)
     atol = rtol / 100 if atol is None else atol
     solver = Adams() if solver is None else solver
     formulation = Partitioned() if formulation is None else formulation
@@ -162,24 +163,23 @@ def _integrate(
     )
 
 
-def _check_tolerances(rtol: Any, atol: Any, dtype) -> None:
+def _checked_tolerance(rtol: Any, atol: Any, dtype) -> Any:
     for name, value in (("rtol", rtol), ("atol", atol)):
         if value is None or isinstance(value, Tracer):
             continue
         if not np.all(np.isfinite(value)) or np.any(np.asarray(value) < 0) or np.any(np.asarray(value) >= 1):
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
-    if isinstance(rtol, Tracer):
-        return
-    smallest = 10 * float(jnp.finfo(dtype).eps)
-    if rtol < smallest:
-        if dtype == jnp.float32:
-            warnings.warn(
-                f"rtol={rtol:g} is below what single precision can do ({smallest:.1e}). Switch double precision on before "
-                'anything else: import jax; jax.config.update("jax_enable_x64", True).',
-                stacklevel=3,
-            )
-        elif rtol <= 0 or rtol < float(jnp.finfo(dtype).eps):
-            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {smallest:.1e}.")
+    least = 10 * float(jnp.finfo(dtype).eps)
+    if isinstance(rtol, Tracer) or rtol >= least:
+        return rtol
+    if dtype == jnp.float32:
+        warnings.warn(
+            f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double precision "
+            'on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
+            stacklevel=3,
+        )
+        return least
+    raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
 
 
 def _save_at(saveat) -> diffrax.SaveAt:

@@ -169,7 +169,7 @@ class Trajectory(eqx.Module):
         return jax.vmap(at)(self.ts, self.ys)
 
     def trimmed(self) -> "Trajectory":
-        """Without the padding of `SaveAt(steps=True)` and of runs that ended early; unchanged under `jit` and `vmap`."""
+        """Without the padding of `SaveAt(steps=True)` and of runs that ended early; the same under `jit` and `vmap`."""
         if isinstance(self.ts, Tracer) or self.ts is None or self.ts.ndim != 1:
             return self
         finite = np.isfinite(np.asarray(self.ts))

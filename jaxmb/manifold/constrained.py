@@ -110,7 +110,7 @@ def _restore_positions(system, t, q, split, tol):
 
     # A matrix of this very time is wrong by the first correction only; of an older one nothing is known.
     before = jnp.where(split.time == t, jnp.ones((), q.dtype), jnp.zeros((), q.dtype))
-    q, size, ahead, k = lax.while_loop(proceed, correct, correct((q, before, before, jnp.array(0))))
+    q, _, ahead, k = lax.while_loop(proceed, correct, correct((q, before, before, jnp.array(0))))
     return q, k, ~(ahead <= tol)
 
 

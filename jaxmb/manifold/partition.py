@@ -58,7 +58,8 @@ class Partition(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         if not isinstance(solver, Adams):
             raise ValueError(
-                f"Partition needs a solver that knows charts (Adams), got {type(solver).__name__}; use manifold=Projection() with it."
+                f"Partition needs a solver that knows charts (Adams), got {type(solver).__name__}; use "
+                "manifold=Projection() with it."
             )
         floor = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
         tol = min(max(1e-3 * rtol, floor), 1e-6) if self.newton_tol is None else self.newton_tol

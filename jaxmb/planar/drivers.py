@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._parts import AbstractConstraint, number
-from .._resolve import label, vector
+from .._parts import AbstractConstraint, optional_number
+from .._resolve import fill, label, vector
 from .._types import Scalar
 from .._user import numbers
 from ..rotations import norm
@@ -35,8 +35,8 @@ class Driver(AbstractConstraint):
     quantity: Quantity = eqx.field(static=True, kw_only=True)
     motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
     parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    point_a: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    point_b: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
+    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
 
@@ -49,9 +49,15 @@ class Driver(AbstractConstraint):
         return (self.body_a, self.body_b)
 
     def resolve(self, space, poses):
-        vector(self, "point_a", self.point_a, 2)
-        vector(self, "point_b", self.point_b, 2)
-        return self
+        if self.quantity == "angle":
+            if self.point_a is not None or self.point_b is not None:
+                raise ValueError(f"{label(self)}: quantity='angle' has no points; leave out point_a and point_b.")
+            return self
+        part = self
+        for field in ("point_a", "point_b"):
+            part = fill(part, field, jnp.zeros(2))
+            vector(part, field, getattr(part, field), 2)
+        return part
 
     def value(self, space, poses):
         """The driven quantity at given poses."""

@@ -242,7 +242,7 @@ class RigidBodySystem(AbstractSystem):
         return jnp.sum(_join([*wrenches, jnp.zeros(1, u.dtype)], u.dtype)[source], axis=1)
 
     def _own_wrenches(self, u):
-        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size), or None where there is neither."""
+        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if self.gravity is not None:

@@ -45,9 +45,8 @@ def four_bar(times, *, lengths=(1.0, 3.0, 2.5), base=2.5, masses=(1.0, 3.0, 2.5)
     def acceleration(theta, rate):
         p, r, p1, r1, p2, r2 = kinematics(theta)
         # The coupler's centre is at a e(θ) + b/2 e(p); |v|² = a² + b²/4 p′² + a b cos(θ − p) p′, times θ̇².
-        inertia = (
-            m1 * a**2 / 3 + m2 * (a**2 + b**2 * p1**2 / 3 + a * b * np.cos(theta - p) * p1) + m3 * c**2 * r1**2 / 3
-        )
+        cosine, sine = np.cos(theta - p), np.sin(theta - p)
+        inertia = m1 * a**2 / 3 + m2 * (a**2 + b**2 * p1**2 / 3 + a * b * cosine * p1) + m3 * c**2 * r1**2 / 3
         half_slope = (
             m2 * (b**2 * p1 * p2 / 3 + 0.5 * a * b * (cosine * p2 - sine * (1 - p1) * p1)) + m3 * c**2 * r1 * r2 / 3
         )

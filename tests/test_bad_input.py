@@ -1,0 +1,237 @@
+"""Bad input gets an error that names the part and the fix; a motion that cannot go on ends with its own result."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+
+
+def bar(name="bar", **changes):
+    return planar.Body(name, **({"mass": 1.0, "inertia": 0.1, "position": (0.5, 0.0)} | changes))
+
+
+def pin(name="pin", a="ground", b="bar", **changes):
+    return planar.Revolute(name, a, b, **({"point": (0.0, 0.0)} | changes))
+
+
+def rod(name, start, end):
+    start, end = np.array(start, float), np.array(end, float)
+    angle = np.arctan2(*(end - start)[::-1])
+    return planar.Body(name, mass=1.0, inertia=0.1, position=(start + end) / 2, angle=angle)
+
+
+SPATIAL = spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
+
+REFUSED = {
+    "repeated name": (lambda: mb.Scene([bar(), bar()]), "'bar' is used twice"),
+    "name of the ground": (lambda: mb.Scene([bar("ground")]), "'ground' is used twice.*fixed world"),
+    "empty name": (lambda: mb.Scene([bar("")]), "must not be empty"),
+    "dot in a name": (lambda: mb.Scene([bar("a.b")]), "dot"),
+    "unknown body": (lambda: mb.Scene([bar()], joints=[pin(b="baar")]), "pin.*Unknown body 'baar'; did you mean 'bar'"),
+    "joint with itself": (lambda: mb.Scene([bar()], joints=[pin(a="bar")]), "pin.*with itself"),
+    "no bodies": (lambda: mb.Scene([]), "at least one body"),
+    "force among joints": (lambda: mb.Scene([bar()], joints=[mb.Gravity((0, -1))]), "joints must hold constraints"),
+    "joint among forces": (lambda: mb.Scene([bar()], forces=[pin()]), "forces must hold force elements"),
+    "two gravities": (
+        lambda: mb.Scene([bar()], forces=[mb.Gravity((0, -1)), mb.Gravity((0, -1), name="more")]),
+        "one Gravity",
+    ),
+    "planar joint in space": (lambda: mb.Scene([SPATIAL], joints=[pin(b="body")]), "pin.*is planar.*scene is spatial"),
+    "spatial body in the plane": (lambda: mb.Scene([bar(), SPATIAL]), "body.*is spatial.*scene is planar"),
+    "mass": (lambda: mb.Scene([bar(mass=0.0)]).compile(), "bar.*mass must be positive"),
+    "inertia": (lambda: mb.Scene([bar(inertia=-1.0)]).compile(), "bar.*inertia must be positive"),
+    "not finite": (lambda: mb.Scene([bar(position=(np.nan, 0.0))]).compile(), "bar.*position must be finite"),
+    "triangle inequality": (
+        lambda: mb.Scene([spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 3.0))]).compile(),
+        "body.*triangle inequality",
+    ),
+    "shape": (lambda: mb.Scene([bar()], joints=[pin(point=(0, 0, 0))]).compile(), r"pin.*point must have shape \(2,\)"),
+    "gravity's shape": (lambda: mb.Scene([bar()], forces=[mb.Gravity((0, 0, -9.81))]).compile(), "gravity.*shape"),
+    "missing point": (lambda: mb.Scene([bar()], joints=[pin(point=None)]).compile(), "pin.*give point_a and point_b"),
+    "points twice": (lambda: mb.Scene([bar()], joints=[pin(point_a=(0, 0))]).compile(), "pin.*not both"),
+    "zero axis": (
+        lambda: mb.Scene(
+            [bar()], joints=[planar.PointOnLine("slot", "ground", "bar", point=(0, 0), axis=(0, 0))]
+        ).compile(),
+        "slot.*axis must be a unit vector.*give a direction",
+    ),
+    "axis of length two": (
+        lambda: mb.Scene(
+            [bar()], joints=[planar.PointOnLine("slot", "ground", "bar", point=(0, 0), axis=(2, 0))]
+        ).compile(),
+        "slot.*axis must be a unit vector.*divide",
+    ),
+    "infinite stiffness": (
+        lambda: mb.Scene([bar()], forces=[planar.SpringDamper("s", "ground", "bar", stiffness=np.inf)]).compile(),
+        "'s': stiffness must be finite",
+    ),
+    "negative stiffness": (
+        lambda: mb.Scene([bar()], forces=[planar.SpringDamper("s", "ground", "bar", stiffness=-1.0)]).compile(),
+        "'s': stiffness must be non-negative",
+    ),
+    "unknown quantity": (
+        lambda: planar.Driver("drive", "ground", "bar", quantity="angel", motion=lambda t, p: t),
+        "drive.*quantity must be one of",
+    ),
+    "points of an angle": (
+        lambda: mb.Scene(
+            [bar()],
+            joints=[planar.Driver("d", "ground", "bar", quantity="angle", motion=lambda t, p: t, point_b=(1, 0))],
+        ).compile(),
+        "'d'.*has no points",
+    ),
+    "turning a point mass": (
+        lambda: mb.Scene(
+            [planar.PointMass("m", mass=1.0)],
+            joints=[planar.Revolute("r", "ground", "m", point_a=(1, 0), point_b=(1, 0))],
+        ).compile(),
+        "'r' acts on the rotation of a PointMass",
+    ),
+    "open loop": (
+        lambda: mb.Scene(
+            [rod("a", (0, 0), (1, 0)), rod("b", (1, 0), (2, 0))],
+            joints=[
+                pin("O", b="a"),
+                planar.Revolute("A", "a", "b", point=(1, 0)),
+                planar.Revolute("B", "ground", "b", point_a=(5, 0), point_b=(0.5, 0)),
+            ],
+        ).compile(),
+        "cannot be assembled.*residuals remain in .*B",
+    ),
+    "inconsistent redundant joints": (
+        lambda: mb.Scene(
+            [bar()],
+            joints=[pin(), planar.Fixed("weld", "ground", "bar", point_a=(0, 0.1), point_b=(-0.5, 0), angle=0.0)],
+        ).compile(),
+        "cannot be assembled.*(pin|weld)",
+    ),
+    "drivers that fight": (
+        lambda: mb.Scene(
+            [bar()],
+            joints=[
+                pin(),
+                planar.Driver("one", "ground", "bar", quantity="angle", motion=lambda t, p: 1.0 * t),
+                planar.Driver("two", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t),
+            ],
+        ).compile(),
+        "velocities asked for by one, two contradict",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_the_name_and_the_fix(case):
+    build, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return mb.Scene([bar()], joints=[pin()], forces=[mb.Gravity((0, -9.81))]).compile()
+
+
+def test_unknown_names(pendulum):
+    with pytest.raises(ValueError, match=r"Unknown parameter 'bar.mas'; did you mean 'bar.mass'"):
+        mb.with_parameters(pendulum, {"bar.mas": 1.0})
+    with pytest.raises(ValueError, match=r"Parameter 'pin.point_b' has shape \(2,\), got \(\)"):
+        mb.with_parameters(pendulum, {"pin.point_b": 1.0})
+    with pytest.raises(ValueError, match=r"Unknown coordinate 'bar.angel'; did you mean 'bar.angle'"):
+        mb.assemble(pendulum, fix={"bar.angel": 0.1})
+    with pytest.raises(ValueError, match=r"Unknown rate 'baar.angle'"):
+        mb.assemble(pendulum, rates={"baar.angle": 0.1})
+    sol = mb.simulate(pendulum, mb.assemble(pendulum), t1=0.1)
+    with pytest.raises(ValueError, match="Unknown body 'baar'; did you mean 'bar'"):
+        sol["baar"]
+    with pytest.raises(ValueError, match="Unknown joint 'pim'; did you mean 'pin'"):
+        sol.reactions["pim"]
+    with pytest.raises(ValueError, match="dense=True"):
+        sol.at(0.05)
+
+
+def test_assembly_names_what_cannot_be_fixed(pendulum):
+    with pytest.raises(ValueError, match=r"cannot be assembled with bar.x, bar.y fixed.*pin"):
+        mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0})
+    with pytest.raises(ValueError, match=r"rates bar.x, bar.angle fixed"):
+        mb.assemble(pendulum, rates={"bar.x": 1.0, "bar.angle": 0.5})
+    with pytest.raises(ValueError, match="not finite"):
+        mb.assemble(pendulum, fix={"bar.angle": np.nan})
+    quiet = mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0}, throw=False)
+    assert np.all(np.isnan(quiet.q))
+
+
+@pytest.mark.parametrize("rtol", [0.0, -1e-3, 2.0, np.nan, 1e-17])
+def test_tolerances(pendulum, rtol):
+    with pytest.raises(ValueError, match="rtol"):
+        mb.simulate(pendulum, mb.assemble(pendulum), t1=0.1, rtol=rtol)
+
+
+def test_combinations(pendulum):
+    state = mb.assemble(pendulum)
+    with pytest.raises(ValueError, match="Partition needs a solver that knows charts"):
+        mb.simulate(pendulum, state, t1=0.1, solver=diffrax.Tsit5(), manifold=mb.manifold.Partition())
+    with pytest.raises(ValueError, match="Projection is for one-step solvers"):
+        mb.simulate(pendulum, state, t1=0.1, manifold=mb.manifold.Projection())
+    with pytest.raises(ValueError, match="coordinates and"):
+        mb.simulate(pendulum, mb.State(jnp.zeros(2), jnp.zeros(3)), t1=0.1)
+    with pytest.raises(ValueError, match="MultistepController"):
+        mb.simulate(pendulum, state, t1=0.1, stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
+
+
+def test_single_precision_warns(pendulum):
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, pendulum)
+    with jax.enable_x64(False), pytest.warns(UserWarning, match=r"single precision.*jax_enable_x64"):
+        state = mb.State(jnp.array([0.5, 0.0, 0.0]), jnp.zeros(3))
+        sol = mb.simulate(single, state, t1=0.1, rtol=1e-10)
+    assert sol.ys.q.dtype == jnp.float32 and np.all(np.isfinite(sol.ys.q))
+
+
+def lock_up(rod_length):
+    """A spatial slider-crank with its crank driven at 2π rad/s (Haug 1989, §10.2), from where the tip is nearest to the
+    slider's line; half a turn later it needs a rod of 0.2362 m.
+    """
+    r, height, depth = 0.08, 0.12, 0.1
+    centre = np.array([0.0, depth, height])
+    inward = -centre / np.linalg.norm(centre)
+    tip = centre + r * inward
+    slider = np.array([np.sqrt(rod_length**2 - tip @ tip), 0.0, 0.0])
+    crank = spatial.Body("crank", mass=0.12, inertia=(1e-4, 1e-4, 1e-4), position=centre)
+    block = spatial.Body("block", mass=2.0, inertia=(1e-2, 1e-2, 1e-2), position=slider)
+    turn = lambda t, p: p["speed"] * t
+    joints = [
+        spatial.Revolute("hub", "ground", "crank", point=centre, axis=(1.0, 0.0, 0.0)),
+        spatial.Prismatic("guide", "ground", "block", point=slider, axis=(1.0, 0.0, 0.0)),
+        spatial.Distance("rod", "crank", "block", point_a=r * inward, length=rod_length),
+        spatial.Driver(
+            "drive",
+            "ground",
+            "crank",
+            quantity="angle",
+            axis=(1.0, 0.0, 0.0),
+            motion=turn,
+            parameters={"speed": 2 * np.pi},
+        ),
+    ]
+    return mb.Scene([crank, block], joints=joints).compile()
+
+
+@pytest.mark.slow
+def test_lock_up_ends_with_its_own_result():
+    reached = {}
+    for length in (0.2363, 0.2361):
+        system = lock_up(length)
+        sol = mb.simulate(system, mb.assemble(system), t1=1.0, throw=False, saveat=diffrax.SaveAt(steps=True))
+        reached[length] = sol
+    assert reached[0.2363].result == mb.RESULTS.successful
+    short = reached[0.2361]
+    assert short.result == mb.RESULTS.singular_configuration
+    # The trajectory up to there is kept, on its constraints.
+    assert 0.3 < float(short.ts[-1]) < 0.6
+    assert float(jnp.max(short.constraint_violation.position)) < 1e-10
+    system = short.system
+    with pytest.raises(RuntimeError, match="singular configuration"):
+        mb.simulate(system, mb.assemble(system), t1=1.0)
