@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ._names import unknown
+from ._types import VectorLike
 from .system import RigidBodySystem, parameters
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class FreeParameters(eqx.Module):
 
 def free_parameters(
     system: RigidBodySystem,
-    free: Mapping[str, ArrayLike] | Sequence[str],
+    free: Mapping[str, VectorLike] | Sequence[str],
     bounds: Mapping[str, Bounds] | None,
 ) -> FreeParameters:
     """Free parameters with their starting values and ranges.

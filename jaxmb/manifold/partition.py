@@ -61,7 +61,8 @@ class Partition(AbstractManifold):
                 f"Partition needs a solver that knows charts (Adams), got {type(solver).__name__}; use "
                 "manifold=Projection() with it."
             )
-        floor = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
+        # Rounding leaves corrections of tens of units in the last place where many coordinates depend on each other.
+        floor = 512 * float(jnp.finfo(jnp.result_type(float)).eps)
         tol = min(max(1e-3 * rtol, floor), 1e-6) if self.newton_tol is None else self.newton_tol
         return PartitionTerm(system, formulation, self.max_influence, tol), solver
 
@@ -143,6 +144,9 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def free(self, chart):
         split, system = chart.split, self.system
+        if system.velocity_rank == system.nu:
+            # Driven in everything: nothing is integrated, but steps should still follow the motion.
+            return State(jnp.ones(system.nq, bool), jnp.ones(system.nu, bool))
         return State(
             split.coordinates.column_place >= system.coordinate_rank,
             split.velocity.column_place >= system.velocity_rank,
