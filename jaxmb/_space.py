@@ -59,6 +59,10 @@ class AbstractSpace(eqx.Module):
         """Body components of a world direction."""
 
     @abc.abstractmethod
+    def prepare(self, pose: Pose) -> Pose:
+        """The pose with what all parts on a body would work out again (cosines), for their common use."""
+
+    @abc.abstractmethod
     def rates(self, pose: Pose, velocity: Velocity) -> Pose:
         """Rate of the pose, `N(pose) velocity`."""
 

@@ -39,7 +39,7 @@ class Constraint(AbstractConstraint):
     rheonomic: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def residual(self, space, poses, t):
-        return jnp.reshape(self.function(poses, t, self.parameters), (self.rows,))
+        return jnp.reshape(self.function(poses[:, : space.pose_size], t, self.parameters), (self.rows,))
 
 
 class VelocityConstraint(AbstractVelocityConstraint):
@@ -59,7 +59,7 @@ class VelocityConstraint(AbstractVelocityConstraint):
     homogeneous: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def residual(self, space, poses, velocities, t):
-        return jnp.reshape(self.function(poses, velocities, t, self.parameters), (self.rows,))
+        return jnp.reshape(self.function(poses[:, : space.pose_size], velocities, t, self.parameters), (self.rows,))
 
 
 class Force(AbstractForce):
@@ -86,9 +86,9 @@ class Force(AbstractForce):
         return self.potential is not None
 
     def wrenches(self, space, poses, velocities, t):
-        value = self.function(poses, velocities, t, self.parameters)
+        value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
         return jnp.reshape(value, (len(self.bodies), space.velocity_size))
 
     def energy(self, space, poses, t):
         assert self.potential is not None
-        return jnp.reshape(self.potential(poses, t, self.parameters), ())
+        return jnp.reshape(self.potential(poses[:, : space.pose_size], t, self.parameters), ())

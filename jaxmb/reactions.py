@@ -31,24 +31,24 @@ def joint_names(system: RigidBodySystem) -> tuple[str, ...]:
 
 def reaction(system: RigidBodySystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]) -> Reaction:
     """Reaction of one joint at one state from the multipliers of all rows."""
-    extended_q, extended_u = system.extend_q(y.q), system.extend_u(y.u)
+    poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
     row, force, moment, own = 0, 0.0, 0.0, []
     for group in (*system.constraints, *system.velocity_constraints):
         if name in group.group.names:
             k = group.group.names.index(name)
             values = multipliers[row + k * group.rows : row + (k + 1) * group.rows]
-            wrenches = jnp.einsum("r,rkv->kv", values, group.jacobian(t, extended_q, extended_u)[k])
-            f, m = _on_last_body(system, group.group, k, extended_q, wrenches)
+            wrenches = jnp.einsum("r,rkv->kv", values, group.jacobian(t, poses, velocities)[k])
+            f, m = _on_last_body(system, group.group, k, poses, wrenches)
             force, moment = force + f, moment + m
             own.append(values)
         row += len(group.group.names) * group.rows
     return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(own))
 
 
-def _on_last_body(system, group, k, extended_q, wrenches):
+def _on_last_body(system, group, k, poses, wrenches):
     bodies = group.bodies[k]
     last = max(i for i, body in enumerate(bodies) if body < system.layout.bodies)
-    pose, wrench = group.poses(extended_q)[k, last], wrenches[last]
+    pose, wrench = group.own(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)
     point = getattr(part, "point_b" if last else "point_a", None)
     if not system.spatial:

@@ -70,7 +70,7 @@ class Scene(eqx.Module):
             jnp.concatenate([body.pose() for body in self.bodies]),
             jnp.concatenate([body.velocities() for body in self.bodies]),
         )
-        extended = jnp.concatenate([guess.q, jnp.asarray(space.ground, guess.q.dtype)])
+        given = jnp.concatenate([guess.q, jnp.asarray(space.ground, guess.q.dtype)])[layout.pose_index]
 
         gravity, parts = None, []
         for part in (*self.joints, *self.forces):
@@ -80,7 +80,7 @@ class Scene(eqx.Module):
                 continue
             own = tuple(index[name] for name in part.bodies)
             _check_finite(part)
-            poses = extended[layout.pose_index[np.array(own)]]
+            poses = given[np.array(own)]
             resolved = part.resolve(space, poses)
             _check_rotation(resolved, own, layout, poses)
             parts += [(component, own) for component in resolved.components()]
@@ -182,8 +182,8 @@ def _check_rotation(part, own, layout, poses):
             felt = jnp.sum(jnp.abs(jax.jacfwd(residual)(velocities)), axis=0)
         if np.any(np.abs(felt[np.array(points), space.dimension :]) > 0):
             raise ValueError(
-                f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, or use "
-                "a Body."
+                f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, "
+                "or use a Body."
             )
 
 

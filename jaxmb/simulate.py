@@ -89,8 +89,11 @@ def simulate(
             f"The state must have {system.nq} coordinates and {system.nu} velocities, got {state.q.shape} and "
             f"{state.u.shape}."
         )
-    rtol = _checked_tolerance(rtol, atol, state.q.dtype)
-    atol = rtol / 100 if atol is None else atol
+    # Numbers become arrays, so that other tolerances and times do not compile anew.
+    number = lambda x: jnp.asarray(x, dtype=state.q.dtype)
+    rtol = number(_checked_tolerance(rtol, atol, state.q.dtype))
+    atol = rtol / 100 if atol is None else number(atol)
+    times = number(t0), number(t1), None if dt0 is None else number(dt0)
     solver = Adams() if solver is None else solver
     formulation = Partitioned() if formulation is None else formulation
     if manifold is None:
@@ -110,7 +113,7 @@ def simulate(
         formulation,
         term,
         solver,
-        (t0, t1, dt0),
+        times,
         state,
         _save_at(saveat),
         stepsize_controller,
@@ -174,8 +177,8 @@ def _checked_tolerance(rtol: Any, atol: Any, dtype) -> Any:
         return rtol
     if dtype == jnp.float32:
         warnings.warn(
-            f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double precision "
-            'on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
+            f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
+            'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
             stacklevel=3,
         )
         return least

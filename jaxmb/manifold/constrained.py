@@ -101,8 +101,10 @@ def _restore_positions(system, t, q, split, tol):
         step = split.correction @ system.coordinate_residual(t, q)
         size = jnp.max(jnp.abs(step) / scale)
         # Corrections shrink by a constant factor, so the next one is known: no iteration is spent on verifying it.
+        # Those of the size of rounding errors stop shrinking; there is nothing left to correct.
         rate = jnp.where(size < before, size / before, 1.0)
-        return q - step, size, size * rate, k + 1
+        rounded = (size < 4096 * jnp.finfo(q.dtype).eps) & (rate > 0.5)
+        return q - step, size, jnp.where(rounded, 0.0, size * rate), k + 1
 
     def proceed(carry):
         _, size, ahead, k = carry

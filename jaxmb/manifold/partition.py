@@ -38,9 +38,10 @@ class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
     Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic
-    constraints these are two nested charts. Only independent components are integrated and error-controlled; the
-    others satisfy the constraints to Newton's tolerance at every evaluation. A chart is replaced when its influence
-    matrix H has grown by the factor `max_influence`; history is kept for all components, so that costs no restart.
+    constraints these are two nested charts. Only independent components are integrated; the others satisfy the
+    constraints to Newton's tolerance at every evaluation. The error of a step is measured on all of them. A chart is
+    replaced when its influence matrix H has grown by the factor `max_influence`; history is kept for all components,
+    so that costs no restart.
 
     **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
     made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its
@@ -61,9 +62,8 @@ class Partition(AbstractManifold):
                 f"Partition needs a solver that knows charts (Adams), got {type(solver).__name__}; use "
                 "manifold=Projection() with it."
             )
-        # Rounding leaves corrections of tens of units in the last place where many coordinates depend on each other.
-        floor = 512 * float(jnp.finfo(jnp.result_type(float)).eps)
-        tol = min(max(1e-3 * rtol, floor), 1e-6) if self.newton_tol is None else self.newton_tol
+        least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
+        tol = jnp.clip(1e-3 * rtol, least, 1e-6) if self.newton_tol is None else jnp.asarray(self.newton_tol)
         return PartitionTerm(system, formulation, self.max_influence, tol), solver
 
 
@@ -111,7 +111,7 @@ class PartitionTerm(AbstractManifoldTerm):
     system: AbstractSystem
     formulation: AbstractFormulation
     max_influence: float = eqx.field(static=True)
-    newton_tol: float = eqx.field(static=True)
+    newton_tol: Float[Array, ""]
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
@@ -142,15 +142,12 @@ class PartitionTerm(AbstractManifoldTerm):
         f = State(self.system.rates(t, out.q, out.u), out.udot)
         return State(out.q, out.u), f, Chart(split, influence, chart.fresh, counters), out.failed | chart.singular
 
-    def free(self, chart):
-        split, system = chart.split, self.system
-        if system.velocity_rank == system.nu:
-            # Driven in everything: nothing is integrated, but steps should still follow the motion.
-            return State(jnp.ones(system.nq, bool), jnp.ones(system.nu, bool))
-        return State(
-            split.coordinates.column_place >= system.coordinate_rank,
-            split.velocity.column_place >= system.velocity_rank,
-        )
+    def controlled(self, chart):
+        # All components, the dependent ones as well: where these turn fast, the error of the independent ones alone
+        # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
+        # spatial slider-crank 3107 against 3867.)
+        del chart
+        return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
     def update_chart(self, t, y, chart, args):
         system, y, chart = lax.stop_gradient((self.system, y, chart))

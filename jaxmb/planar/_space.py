@@ -5,11 +5,13 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from .._space import AbstractSpace
-from ..rotations import rotate_2d
 
 
 class PlanarSpace(AbstractSpace):
-    """Poses (x, y, angle), velocities (ẋ, ẏ, angular rate); y is up, angles counter-clockwise."""
+    """Poses (x, y, angle), velocities (ẋ, ẏ, angular rate); y is up, angles counter-clockwise.
+
+    A prepared pose carries cosine and sine of its angle as well, (x, y, angle, cos, sin).
+    """
 
     dimension: ClassVar[int] = 2
     pose_size: ClassVar[int] = 3
@@ -17,35 +19,59 @@ class PlanarSpace(AbstractSpace):
     ground: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
 
     def point(self, pose, s):
-        return pose[:2] + rotate_2d(pose[2], s)
+        return pose[:2] + _turned(pose, s)
 
     def point_velocity(self, pose, velocity, s):
-        arm = rotate_2d(pose[2], s)
+        arm = _turned(pose, s)
         return velocity[:2] + velocity[2] * jnp.stack([-arm[1], arm[0]])
 
     def point_force(self, pose, s, force_W):
-        arm = rotate_2d(pose[2], s)
+        arm = _turned(pose, s)
         return jnp.concatenate([force_W, (arm[0] * force_W[1] - arm[1] * force_W[0])[None]])
 
     def direction(self, pose, v):
-        return rotate_2d(pose[2], v)
+        return _turned(pose, v)
 
     def body_point(self, pose, point_W):
-        return rotate_2d(-pose[2], point_W - pose[:2])
+        return _turned_back(pose, point_W - pose[:2])
 
     def body_direction(self, pose, v_W):
-        return rotate_2d(-pose[2], v_W)
+        return _turned_back(pose, v_W)
+
+    def prepare(self, pose):
+        return jnp.concatenate([pose, jnp.cos(pose[2:3]), jnp.sin(pose[2:3])])
 
     def rates(self, pose, velocity):
-        del pose
-        return velocity
+        if not _prepared(pose):
+            return velocity
+        return jnp.concatenate([velocity, velocity[2] * jnp.stack([-pose[4], pose[3]])])
 
     def pull_back(self, pose, gradient):
-        del pose
-        return gradient
+        if not _prepared(pose):
+            return gradient
+        turning = gradient[2] - gradient[3] * pose[4] + gradient[4] * pose[3]
+        return jnp.concatenate([gradient[:2], turning[None]])
 
     def normalize(self, pose):
         return pose
+
+
+def _prepared(pose):
+    return pose.shape[0] == 5
+
+
+def _cos_sin(pose):
+    return (pose[3], pose[4]) if _prepared(pose) else (jnp.cos(pose[2]), jnp.sin(pose[2]))
+
+
+def _turned(pose, v):
+    c, s = _cos_sin(pose)
+    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+def _turned_back(pose, v):
+    c, s = _cos_sin(pose)
+    return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
 
 
 PLANE = PlanarSpace()

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .._parts import AbstractConstraint, number, optional_number
 from .._resolve import fill, label, point_pair, positive, unit, vector
 from .._types import Scalar
-from ..rotations import norm, rotate_2d
+from ..rotations import norm
 
 
 def _separation(space, part, poses):
@@ -285,7 +285,7 @@ class RackAndPinion(AbstractConstraint):
         return fill(self, "offset", self._travel(space, poses))
 
     def _travel(self, space, poses):
-        along = rotate_2d(poses[1, 2], self.axis_b)
+        along = space.direction(poses[1], self.axis_b)
         return -jnp.dot(along, _separation(space, self, poses)) + self.radius * (poses[0, 2] - poses[1, 2])
 
     def residual(self, space, poses, t):

@@ -89,10 +89,10 @@ def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart |
     return Evaluation(ravel(y, flat.dtype), f, _freeze(chart), failed)
 
 
-def free_components(term: Any, chart: Chart | None) -> Array | None:
+def controlled_components(term: Any, chart: Chart | None) -> Array | None:
     """A mask of the components that are integrated, or `None` if all of them are."""
     manifold = _manifold(term)
-    return None if manifold is None else ravel(manifold.free(chart), bool)
+    return None if manifold is None else ravel(manifold.controlled(chart), bool)
 
 
 def _manifold(term: Any) -> AbstractManifoldTerm | None:

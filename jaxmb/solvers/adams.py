@@ -17,10 +17,10 @@ from ._base import Args, Chart, Y
 from ._evaluation import (
     check_real,
     check_term,
+    controlled_components,
     derivative,
     evaluate,
     first_chart,
-    free_components,
     next_chart,
     ravel,
     unravel_like,
@@ -207,13 +207,15 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
 
     def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
-        """Weighted norms of the errors in the free components."""
+        """Weighted norms of the errors in the controlled components."""
         errors = lax.stop_gradient(errors) / self.tolerances.scale(before, after)[None]
-        free = free_components(terms, chart)
-        if free is not None:
+        controlled = controlled_components(terms, chart)
+        if controlled is not None:
             # The norm is a mean over all components.
-            share = jnp.maximum(jnp.sum(free), 1) / free.size
-            errors = jnp.where(free[None], errors, jnp.zeros((), errors.dtype)) / jnp.sqrt(share).astype(errors.dtype)
+            share = jnp.maximum(jnp.sum(controlled), 1) / controlled.size
+            errors = jnp.where(controlled[None], errors, jnp.zeros((), errors.dtype)) / jnp.sqrt(share).astype(
+                errors.dtype
+            )
         return jnp.stack([norm_of(self.tolerances.norm, error, y0) for error in errors])
 
 

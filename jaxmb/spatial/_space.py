@@ -34,6 +34,9 @@ class SpatialSpace(AbstractSpace):
     def body_direction(self, pose, v_W):
         return rot.unrotate(pose[3:], v_W)
 
+    def prepare(self, pose):
+        return pose
+
     def rates(self, pose, velocity):
         return jnp.concatenate([velocity[:3], rot.rates(pose[3:], velocity[3:])])
 

@@ -32,13 +32,9 @@ class Group(eqx.Module):
     def rows(self) -> int:
         return self.part.rows
 
-    def poses(self, extended_q: Float[Array, "nq_ground"]) -> Float[Array, "parts k p"]:
-        """Poses of the parts' bodies, from the coordinates followed by the ground's pose."""
-        return extended_q[self.layout.pose_index[self.body_index]]
-
-    def velocities(self, extended_u: Float[Array, "nu_zero"]) -> Float[Array, "parts k v"]:
-        """Velocities of the parts' bodies, from the velocities followed by a zero."""
-        return extended_u[self.layout.velocity_index[self.body_index]]
+    def own(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
+        """What each part's bodies have, from poses or velocities of all bodies and the ground."""
+        return of_bodies[self.body_index]
 
     def rates(self, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]) -> Float[Array, "k p"]:
         return jax.vmap(self.layout.space.rates)(poses, velocities)
@@ -81,17 +77,17 @@ class ConstraintGroup(eqx.Module):
     def rows(self) -> int:
         return self.group.rows
 
-    def residual(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows"]:
-        return self._map(lambda part, poses: part.residual(self._space, poses, t), extended_q)
+    def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
+        return self._map(lambda part, poses: part.residual(self._space, poses, t), poses)
 
-    def coordinate_jacobian(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, "parts rows k p"]:
-        return self._map(lambda part, poses: jax.jacfwd(lambda x: part.residual(self._space, x, t))(poses), extended_q)
+    def coordinate_jacobian(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows k p"]:
+        return self._map(lambda part, poses: jax.jacfwd(lambda x: part.residual(self._space, x, t))(poses), poses)
 
     def jacobian(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts rows k v"]:
         """Derivative along unit velocities: `Φ_q N`, body by body."""
-        del extended_u
+        del velocities
 
         def single(part, poses):
             residual = lambda x: part.residual(self._space, x, t)
@@ -100,16 +96,20 @@ class ConstraintGroup(eqx.Module):
             unit = jnp.eye(k * size, dtype=poses.dtype).reshape(-1, k, size)
             return jax.vmap(along, out_axes=-1)(unit).reshape(-1, k, size)
 
-        return self._map(single, extended_q)
+        return self._map(single, poses)
 
     def velocity(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts rows"]:
         """`dΦ/dt`."""
-        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), extended_q, extended_u)
+        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), poses, velocities)
 
     def acceleration(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"], extended_a: Float[Array, " _"]
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        accelerations: Float[Array, "b_ground v"],
     ) -> Float[Array, "parts rows"]:
         """`d²Φ/dt²`."""
 
@@ -117,7 +117,7 @@ class ConstraintGroup(eqx.Module):
             rate = lambda t, poses, v: self._rate(part, t, poses, v)
             return jax.jvp(rate, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
 
-        return self._map(single, extended_q, extended_u, extended_a)
+        return self._map(single, poses, velocities, accelerations)
 
     @property
     def _space(self):
@@ -129,9 +129,8 @@ class ConstraintGroup(eqx.Module):
             return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
         return jax.jvp(lambda x: part.residual(self._space, x, t), (poses,), (rates,))[1]
 
-    def _map(self, single, extended_q, *extended_velocities):
-        velocities = [self.group.velocities(v) for v in extended_velocities]
-        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), *velocities)
+    def _map(self, single, poses, *velocities):
+        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
 
 
 class VelocityConstraintGroup(eqx.Module):
@@ -144,32 +143,35 @@ class VelocityConstraintGroup(eqx.Module):
         return self.group.rows
 
     def velocity(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts rows"]:
-        return self._map(lambda part, poses, v: part.residual(self._space, poses, v, t), extended_q, extended_u)
+        return self._map(lambda part, poses, v: part.residual(self._space, poses, v, t), poses, velocities)
 
     def jacobian(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts rows k v"]:
         single = lambda part, poses, v: jax.jacfwd(lambda w: part.residual(self._space, poses, w, t))(v)
-        return self._map(single, extended_q, extended_u)
+        return self._map(single, poses, velocities)
 
     def acceleration(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"], extended_a: Float[Array, " _"]
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        accelerations: Float[Array, "b_ground v"],
     ) -> Float[Array, "parts rows"]:
         def single(part, poses, v, a):
             residual = lambda t, poses, v: part.residual(self._space, poses, v, t)
             return jax.jvp(residual, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
 
-        return self._map(single, extended_q, extended_u, extended_a)
+        return self._map(single, poses, velocities, accelerations)
 
     @property
     def _space(self):
         return self.group.layout.space
 
-    def _map(self, single, extended_q, *extended_velocities):
-        velocities = [self.group.velocities(v) for v in extended_velocities]
-        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), *velocities)
+    def _map(self, single, poses, *velocities):
+        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
 
 
 class ForceGroup(eqx.Module):
@@ -178,13 +180,13 @@ class ForceGroup(eqx.Module):
     group: Group
 
     def wrenches(
-        self, t: Scalar, extended_q: Float[Array, " _"], extended_u: Float[Array, " _"]
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts k v"]:
         single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
-        return jax.vmap(single)(self.group.part, self.group.poses(extended_q), self.group.velocities(extended_u))
+        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities))
 
-    def energy(self, t: Scalar, extended_q: Float[Array, " _"]) -> Float[Array, ""]:
+    def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
-            return jnp.zeros((), extended_q.dtype)
+            return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
-        return jnp.sum(jax.vmap(single)(self.group.part, self.group.poses(extended_q)))
+        return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))

@@ -136,29 +136,32 @@ class RigidBodySystem(AbstractSystem):
 
     # Kinematics
 
-    def extend_q(self, q: Float[Array, "nq"]) -> Float[Array, "nq_ground"]:
-        return jnp.concatenate([q, jnp.asarray(self.layout.space.ground, q.dtype)])
+    def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
+        """Poses of the bodies and of the ground, as parts take them."""
+        ground = jnp.asarray(self.layout.space.ground, q.dtype)[None]
+        return jax.vmap(self.layout.space.prepare)(jnp.concatenate([self.poses(q), ground]))
 
-    def extend_u(self, u: Float[Array, "nu"]) -> Float[Array, "nu_zero"]:
-        return jnp.concatenate([u, jnp.zeros(1, u.dtype)])
+    def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
+        """Velocities of the bodies and of the ground."""
+        return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
 
     def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
         """Poses of the bodies."""
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
-        return self.extend_q(q)[self.layout.pose_index[:-1]]
+        ground = jnp.asarray(self.layout.space.ground, q.dtype)
+        return jnp.concatenate([q, ground])[self.layout.pose_index[:-1]]
 
     def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
         """Velocities of the bodies."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
-        return self.extend_u(u)[self.layout.velocity_index[:-1]]
+        return jnp.concatenate([u, jnp.zeros(1, u.dtype)])[self.layout.velocity_index[:-1]]
 
     def rates(self, t, q, u):
         if self.rates_are_velocities:
             return u
-        rates = jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u))
-        return self._pack(rates)
+        return self._pack(jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u)))
 
     def normalize(self, q):
         if self.rates_are_velocities:
@@ -174,8 +177,8 @@ class RigidBodySystem(AbstractSystem):
     # Constraints
 
     def position_residual(self, t, q):
-        extended = self.extend_q(q)
-        return _join([g.residual(t, extended) for g in self.constraints], q.dtype)
+        poses = self.prepared_poses(q)
+        return _join([g.residual(t, poses) for g in self.constraints], q.dtype)
 
     def coordinate_residual(self, t, q):
         residual = self.position_residual(t, q)
@@ -185,32 +188,34 @@ class RigidBodySystem(AbstractSystem):
         return jnp.concatenate([residual, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
 
     def coordinate_jacobian(self, t, q):
-        extended = self.extend_q(q)
-        blocks = [g.coordinate_jacobian(t, extended) for g in self.constraints]
+        if self.rates_are_velocities:
+            return self._jacobian(t, q, jnp.zeros(self.nu, q.dtype), self.constraints)
+        poses = self.prepared_poses(q)
+        blocks = [g.coordinate_jacobian(t, poses) for g in self.constraints]
         jacobian = self._assemble(blocks, self.constraints, q.dtype, of_poses=True)
-        if not self.spatial:
-            return jacobian
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
         rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
         return jnp.concatenate([jacobian, rows])
 
     def velocity_residual(self, t, q, u):
-        extended, extended_u = self.extend_q(q), self.extend_u(u)
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         groups = (*self.constraints, *self.velocity_constraints)
-        return _join([g.velocity(t, extended, extended_u) for g in groups], q.dtype)
+        return _join([g.velocity(t, poses, velocities) for g in groups], q.dtype)
 
     def jacobian(self, t, q, u):
-        extended, extended_u = self.extend_q(q), self.extend_u(u)
-        groups = (*self.constraints, *self.velocity_constraints)
-        blocks = [g.jacobian(t, extended, extended_u) for g in groups]
+        return self._jacobian(t, q, u, (*self.constraints, *self.velocity_constraints))
+
+    def _jacobian(self, t, q, u, groups):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        blocks = [g.jacobian(t, poses, velocities) for g in groups]
         return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
-        extended, extended_u, extended_a = self.extend_q(q), self.extend_u(u), self.extend_u(udot)
+        poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
         groups = (*self.constraints, *self.velocity_constraints)
-        return _join([g.acceleration(t, extended, extended_u, extended_a) for g in groups], q.dtype)
+        return _join([g.acceleration(t, poses, velocities, accelerations) for g in groups], q.dtype)
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
@@ -229,8 +234,8 @@ class RigidBodySystem(AbstractSystem):
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
 
     def force(self, t, q, u):
-        extended, extended_u = self.extend_q(q), self.extend_u(u)
-        wrenches = [g.wrenches(t, extended, extended_u).reshape(-1) for g in self.forces]
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        wrenches = [g.wrenches(t, poses, velocities).reshape(-1) for g in self.forces]
         groups = [g.group.body_index for g in self.forces]
         own = self._own_wrenches(u)
         if own is not None:
@@ -259,8 +264,8 @@ class RigidBodySystem(AbstractSystem):
         return 0.5 * jnp.dot(u, self.inertia(t, q).product(u))
 
     def potential_energy(self, t, q):
-        extended = self.extend_q(q)
-        energy = sum((g.energy(t, extended) for g in self.forces), start=jnp.zeros((), q.dtype))
+        poses = self.prepared_poses(q)
+        energy = sum((g.energy(t, poses) for g in self.forces), start=jnp.zeros((), q.dtype))
         if self.gravity is not None:
             position = self.poses(q)[:, : self.layout.space.dimension]
             energy = energy - jnp.sum(self.mass * (position @ self.gravity))

@@ -47,7 +47,7 @@ class Circle(AbstractManifoldTerm):
             failed = failed | ((t > 1.0) & (t - chart["at"] > self.fail))
         return y, self.vf(t, y, args), chart, failed
 
-    def free(self, chart):
+    def controlled(self, chart):
         return self._is_free(chart)
 
     def update_chart(self, t, y, chart, args):
