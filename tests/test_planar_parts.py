@@ -256,8 +256,9 @@ def driver(quantity, **kwargs):
 def test_driver(quantity):
     rng = np.random.default_rng(2)
     poses = random_poses(rng)
-    part = driver(quantity, point_a=POINT_A, point_b=POINT_B).resolve(PLANE, poses)
-    d = PLANE.point(poses[1], part.point_b) - PLANE.point(poses[0], part.point_a)
+    points = {} if quantity == "angle" else {"point_a": POINT_A, "point_b": POINT_B}
+    part = driver(quantity, **points).resolve(PLANE, poses)
+    d = PLANE.point(poses[1], jnp.asarray(POINT_B)) - PLANE.point(poses[0], jnp.asarray(POINT_A))
     expected = {
         "angle": poses[1, 2] - poses[0, 2],
         "x": rotate_2d(poses[0, 2], jnp.array([1.0, 0.0])) @ d,

@@ -1,0 +1,124 @@
+"""A scene traces nothing that it does not need, and its program does not grow with the number of its bodies."""
+
+from collections import Counter
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.extend import core
+
+import jaxmb as mb
+from jaxmb import elimination, planar, rotations, spatial
+from jaxmb.manifold import constrained, projection
+
+
+def primitives(jaxpr) -> Counter:
+    """How often each primitive occurs, in inner programs as well."""
+    counts = Counter()
+    for equation in jaxpr.eqns:
+        counts[equation.primitive.name] += 1
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            if isinstance(value, core.ClosedJaxpr):
+                counts += primitives(value.jaxpr)
+            elif isinstance(value, core.Jaxpr):
+                counts += primitives(value)
+    return counts
+
+
+def program(system, **options) -> Counter:
+    run = lambda system, state: mb.simulate(system, state, t1=1.0, throw=False, **options).ys
+    return primitives(jax.make_jaxpr(run)(system, system.guess).jaxpr)
+
+
+def planar_body(**changes):
+    return planar.Body("body", mass=1.0, inertia=0.1, **changes)
+
+
+def refuse(monkeypatch, module, *names):
+    for name in names:
+
+        def refused(*args, name=name, **kwargs):
+            raise AssertionError(f"{name} is traced")
+
+        monkeypatch.setattr(module, name, refused)
+
+
+def test_unconstrained_body_has_nothing_of_constraints(monkeypatch):
+    system = mb.Scene([planar_body()], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    for module, names in {
+        elimination: ["full_pivot", "factor", "gauss_jordan"],
+        constrained: ["evaluate", "factor"],
+        projection: ["_root", "full_pivot"],
+    }.items():
+        refuse(monkeypatch, module, *names)
+    own = program(system)
+
+    def plain(system, state):
+        field = lambda t, y, args: mb.State(y.u, jnp.array([0.0, -9.81, 0.0]) + 0 * y.u)
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            mb.solvers.Adams(),
+            0.0,
+            1.0,
+            None,
+            state,
+            # The user's series and the end state.
+            saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t1=True))),
+            stepsize_controller=mb.solvers.MultistepController(rtol=1e-8, atol=1e-10),
+            throw=False,
+        ).ys[0]
+
+    bare = primitives(jax.make_jaxpr(plain)(system, system.guess).jaxpr)
+    # No loop, no branch, no search, no rule of differentiation besides those of the solver itself.
+    for name in ("while", "cond", "argmax", "sort", "custom_jvp_call", "gather", "cos", "sin"):
+        assert own[name] <= bare[name], name
+
+
+def test_constrained_body_has_them():
+    pin = planar.Revolute("pin", "ground", "body", point=(0.0, 0.0))
+    pendulum = program(mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin]).compile())
+    assert pendulum["custom_jvp_call"] > 0 and pendulum["argmax"] > 0
+
+
+def test_free_body_in_space_has_no_charts(monkeypatch):
+    body = spatial.Body("body", mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0.1, 2.0, 0.1))
+    system = mb.Scene([body]).compile()
+    refuse(monkeypatch, elimination, "full_pivot", "factor", "gauss_jordan")
+    refuse(monkeypatch, constrained, "evaluate", "factor")
+    assert program(system)["argmax"] == 0
+
+
+def test_planar_scene_has_no_euler_parameters(monkeypatch):
+    names = [n for n in dir(rotations) if callable(getattr(rotations, n)) and not n.startswith("_") and n != "norm"]
+    refuse(monkeypatch, rotations, *[n for n in names if getattr(rotations, n).__module__ == rotations.__name__])
+    four_bar = mb.mechanisms.get("four_bar").system
+    counts = program(four_bar)
+    assert counts["while"] > 0
+    shapes = jax.make_jaxpr(lambda s, y: mb.simulate(s, y, t1=1.0, throw=False).ys)(four_bar, four_bar.guess)
+    assert "f64[7]" not in str(shapes) and "f64[4,4]" not in str(shapes)
+
+
+def test_scleronomic_scene_has_no_time_derivative():
+    pin = planar.Revolute("pin", "ground", "body", point=(0.0, 0.0))
+    turn = lambda t, p: jnp.exp(p["rate"] * t) - 1.0
+    drive = planar.Driver("drive", "ground", "body", quantity="angle", motion=turn, parameters={"rate": 1.0})
+    still = mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin]).compile()
+    driven = mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin, drive]).compile()
+    assert still.homogeneous and not driven.homogeneous
+    assert program(still)["exp"] < program(driven)["exp"]
+    assert "scleronomic: no derivative with respect to time" in str(still)
+    assert "scleronomic" not in str(driven)
+
+
+@pytest.mark.parametrize("what", ["forward", "reverse"])
+def test_program_does_not_grow_with_the_number_of_bodies(what):
+    def lines(n):
+        mechanism = mb.mechanisms.get("rod_chain", n=n)
+        end = lambda system, state: mb.simulate(system, state, t1=1.0, throw=False, max_steps=1000).ys.q[-1, 0]
+        gradient = lambda system, state: jax.grad(lambda state: end(system, state))(state)
+        function = end if what == "forward" else gradient
+        return jax.jit(function).lower(mechanism.system, mechanism.state).as_text().count("\n")
+
+    few, many = lines(5), lines(50)
+    assert abs(many - few) <= 0.1 * few, (few, many)
