@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State
 from .elimination import full_pivot
-from .formulations import AbstractFormulation, Partitioned
+from .formulations import AbstractFormulation, Multipliers, Partitioned
 from .formulations._base import stages
 from .manifold import AbstractManifold, Free, Partition, Projection, project
 from .manifold.partition import Chart
@@ -42,8 +42,8 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     formulation: AbstractFormulation | None = None,
     manifold: AbstractManifold | None = None,
-    rtol: float = 1e-8,
-    atol: float | None = None,
+    rtol: Scalar = 1e-8,
+    atol: Scalar | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     event: diffrax.Event | None = None,
@@ -64,7 +64,8 @@ def simulate(
     **Other arguments, rarely needed:**
 
     - `solver`: default `Adams()`; any diffrax Runge–Kutta solver.
-    - `formulation`: how accelerations are solved for, default `Partitioned()`.
+    - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
+        `Multipliers()`, which needs no search for pivots.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams`, `Projection()` for
         others, and nothing of either for a system without constraints.
     - `dt0`: first step [s], default chosen from the motion.
@@ -95,9 +96,10 @@ def simulate(
     atol = rtol / 100 if atol is None else number(atol)
     times = number(t0), number(t1), None if dt0 is None else number(dt0)
     solver = Adams() if solver is None else solver
-    formulation = Partitioned() if formulation is None else formulation
     if manifold is None:
         manifold = Free() if system.velocity_rows == 0 else Partition() if isinstance(solver, Adams) else Projection()
+    if formulation is None:
+        formulation = Partitioned() if isinstance(manifold, Partition) else Multipliers()
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, Adams) else diffrax.PIDController
         stepsize_controller = controller(rtol=rtol, atol=atol)

@@ -6,6 +6,7 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,9 +16,20 @@ from .._types import Scalar
 from ..elimination import Factor, factor, full_pivot
 from ..system import AbstractInertia, AbstractSystem
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 
 class AbstractFormulation(eqx.Module):
-    """A road from the matrices of the equation to accelerations and multipliers."""
+    """A road from the matrices of the equation to accelerations and multipliers.
+
+    `partitions` says whether it needs the split in dependent and independent columns; without it only the independent
+    rows are needed, and no search for pivots where there is no redundancy.
+    """
+
+    partitions: AbstractVar[bool]
 
     @abc.abstractmethod
     def solve(
@@ -41,6 +53,11 @@ def linearize(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float
     return jacobian, factor(jacobian, pivots.order, system.velocity_rank)
 
 
+def every_row(m: int, n: int, dtype) -> Factor:
+    """A factor that keeps all rows and splits no columns, for formulations that do not partition."""
+    return Factor(jnp.zeros((n, m), dtype), jnp.zeros((n, 0), dtype), jnp.arange(m))
+
+
 def stages(system: AbstractSystem) -> Array:
     """Holonomic rows before nonholonomic ones, so that the dependent velocities nest."""
     return (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
@@ -57,6 +74,9 @@ def accelerations(
     inertia, force = system.inertia(t, q), system.force(t, q, u)
     if system.velocity_rows == 0:
         return inertia.solve(force), jnp.zeros(0, u.dtype)
-    jacobian, split = linearize(system, t, q, u)
+    if formulation.partitions or system.velocity_rank < system.velocity_rows:
+        jacobian, split = linearize(system, t, q, u)
+    else:
+        jacobian, split = system.jacobian(t, q, u), every_row(system.velocity_rows, system.nu, u.dtype)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     return formulation.solve(inertia, force, jacobian, gamma, split)

@@ -1,5 +1,7 @@
 """Lagrange multipliers first: the equations of all accelerations with the constraint forces."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 
 from ..elimination import solve_positive
@@ -11,6 +13,8 @@ class Multipliers(AbstractFormulation):
 
     Needs a mass matrix that is cheap to solve with; cheapest where constraints are few and degrees of freedom many.
     """
+
+    partitions: ClassVar[bool] = False
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         A = jacobian[factor.rows]

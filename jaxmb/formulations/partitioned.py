@@ -1,5 +1,7 @@
 """Elimination of the dependent accelerations: the reduced equations of coordinate partitioning."""
 
+from typing import ClassVar
+
 from ..elimination import solve_positive
 from ._base import AbstractFormulation
 
@@ -19,6 +21,8 @@ class Partitioned(AbstractFormulation):
         }
         ```
     """
+
+    partitions: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         particular = factor.correction @ gamma

@@ -5,6 +5,7 @@ import abc
 import diffrax
 import equinox as eqx
 
+from .._types import Scalar
 from ..formulations import AbstractFormulation
 from ..system import AbstractSystem
 
@@ -14,7 +15,7 @@ class AbstractManifold(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, system: AbstractSystem, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: float
+        self, system: AbstractSystem, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: Scalar
     ) -> tuple[diffrax.AbstractTerm, diffrax.AbstractSolver]:
         """The term to integrate and the solver to do it with.
 
