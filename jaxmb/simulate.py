@@ -82,7 +82,8 @@ def simulate(
     there is kept.
 
     Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
-    ones.
+    ones. A mesh is made for the motion it follows: from a state of rest in equilibrium it is coarse, and derivatives
+    there need a bound on the step, `stepsize_controller=MultistepController(rtol, atol, dtmax=...)`.
     """
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
     if state.q.shape != (system.nq,) or state.u.shape != (system.nu,):

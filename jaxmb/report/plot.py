@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 def plot_work_precision(report: "WorkPrecision") -> "Figure":
     """Error against run time and against evaluations, both axes logarithmic; failed runs are left out."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2, sharey=True)
     quantities = (("run time, warm [ms]", lambda run: 1e3 * run.shortest), ("evaluations", lambda run: run.evaluations))
@@ -24,6 +26,9 @@ def plot_work_precision(report: "WorkPrecision") -> "Figure":
         if report.disagreement > 0:
             axes.axhline(report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
         axes.set_xlabel(label)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize="small")
     panels[0].set_ylabel("relative error at the end")

@@ -1,0 +1,230 @@
+"""From a state to a motion: every way to ask for it and to look at it, and every road to the same accelerations."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.formulations import Multipliers, Partitioned, accelerations
+
+G = 9.81
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A rod of 2 m on a pin at the origin, held level."""
+    body = planar.Body("rod", mass=3.0, inertia=planar.rod(3.0, 2.0), position=(1.0, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    return mb.Scene([body], joints=[pin], forces=[mb.Gravity((0.0, -G))]).compile()
+
+
+@pytest.fixture(scope="module")
+def dense(rod):
+    return mb.simulate(
+        rod, mb.assemble(rod), t1=2.0, rtol=1e-10, saveat=diffrax.SaveAt(dense=True, steps=True, t0=True)
+    )
+
+
+def test_dense_output_is_on_the_constraints_and_accurate(rod, dense):
+    ts = jnp.linspace(0.0, 2.0, 17)
+    states = dense.at(ts)
+    saved = mb.simulate(rod, mb.assemble(rod), t1=2.0, rtol=1e-12, saveat=ts)
+    np.testing.assert_allclose(states.q, saved.ys.q, atol=1e-7)
+    np.testing.assert_allclose(dense.at(0.7).q, dense.at(jnp.array([0.7])).q[0], atol=1e-14)
+    violation = jax.vmap(lambda q: rod.position_residual(0.0, q))(states.q)
+    assert float(jnp.max(jnp.abs(violation))) < 1e-13
+
+
+def test_steps_are_trimmed(dense):
+    steps = int(dense.stats["num_accepted_steps"])
+    assert dense.ts.shape == (steps + 1,) and float(dense.ts[0]) == 0.0 and float(dense.ts[-1]) == 2.0
+    assert np.all(np.diff(dense.ts) > 0)
+    assert int(np.sum(dense.stats["orders"])) == steps
+
+
+def test_energy_momenta_and_save(dense, tmp_path):
+    np.testing.assert_allclose(dense.energy, dense.energy[0], atol=1e-7)
+    motion = dense["rod"]
+    spin = 3.0 * (motion.position[:, 0] * motion.velocity[:, 1] - motion.position[:, 1] * motion.velocity[:, 0])
+    np.testing.assert_allclose(dense.angular_momentum, spin + 1.0 * motion.angular_velocity, atol=1e-12)
+    np.testing.assert_allclose(dense.linear_momentum, 3.0 * motion.velocity, atol=1e-14)
+    dense.save(tmp_path / "motion.npz")
+    back = mb.load(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(back["rod.angle"], motion.angle)
+    assert int(back["stats.num_steps"]) == int(dense.stats["num_steps"])
+
+
+def test_reactions_balance_the_motion(dense):
+    reaction = dense.reactions["pin"]
+    acceleration = dense.accelerations[:, :2]
+    np.testing.assert_allclose(reaction.force, 3.0 * (np.asarray(acceleration) - np.array([0.0, -G])), atol=1e-9)
+    np.testing.assert_allclose(reaction.moment, 0.0, atol=1e-12)
+    # Released level: a quarter of the weight (R. C. Hibbeler, the falling rod).
+    np.testing.assert_allclose(reaction.force[0], [0.0, 3.0 * G / 4], atol=1e-12)
+    assert list(dense.reactions) == ["pin"]
+
+
+def test_backward_in_time_returns(rod):
+    there = mb.simulate(rod, mb.assemble(rod), t1=1.5, rtol=1e-11)
+    end = jax.tree.map(lambda y: y[-1], there.ys)
+    back = mb.simulate(rod, end, t0=1.5, t1=0.0, rtol=1e-11, saveat=jnp.array([1.0, 0.5, 0.0]))
+    np.testing.assert_allclose(back.ys.q[-1], mb.assemble(rod).q, atol=1e-8)
+    np.testing.assert_allclose(back.ts, [1.0, 0.5, 0.0])
+
+
+def test_event_stops_the_motion(rod):
+    hanging = lambda t, y, args, **kwargs: y.q[2] + np.pi / 2
+    event = diffrax.Event(hanging, optx.Newton(rtol=1e-10, atol=1e-10))
+    sol = mb.simulate(rod, mb.assemble(rod), t1=5.0, rtol=1e-10, event=event)
+    assert sol.result == mb.RESULTS.event_occurred
+    np.testing.assert_allclose(sol["rod"].angle[-1], -np.pi / 2, atol=1e-8)
+    # ω² = 3 g / l at the bottom of a rod released level.
+    np.testing.assert_allclose(sol["rod"].angular_velocity[-1], -np.sqrt(3 * G / 2.0), rtol=1e-8)
+
+
+def test_any_solver_gives_the_same_motion(rod):
+    state = mb.assemble(rod)
+    adams = mb.simulate(rod, state, t1=1.0, rtol=1e-10)
+    for options in (
+        {"solver": diffrax.Dopri8()},
+        {"solver": diffrax.Tsit5(), "formulation": Partitioned()},
+        {"formulation": Multipliers()},
+    ):
+        other = mb.simulate(rod, state, t1=1.0, rtol=1e-10, **options)
+        np.testing.assert_allclose(other.ys.q, adams.ys.q, atol=1e-8)
+        assert float(other.constraint_violation.position[-1]) < 1e-13
+
+
+def test_other_numbers_do_not_compile_anew(rod):
+    traces = []
+
+    @jax.jit
+    def run(mass, t1, rtol):
+        traces.append(1)
+        system = mb.with_parameters(rod, {"rod.mass": mass})
+        return mb.simulate(system, mb.assemble(system, throw=False), t1=t1, rtol=rtol, throw=False)["rod"].angle[-1]
+
+    values = [run(m, t, r) for m, t, r in [(1.0, 0.2, 1e-6), (2.0, 0.3, 1e-8), (3.0, 0.1, 1e-10)]]
+    assert len(traces) == 1 and np.all(np.isfinite(values))
+
+
+def test_trajectory_outside_its_use_is_an_error(rod):
+    with pytest.raises(ValueError, match="saveat must be a vector"):
+        mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=jnp.zeros((2, 2)))
+    with pytest.raises(RuntimeError, match="max_steps"):
+        mb.simulate(rod, mb.assemble(rod), t1=1.0, max_steps=5)
+
+
+NAMES = [n for n in mb.mechanisms.names() if n not in ("rod_chain", "free_body", "spatial_loop")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_formulations_agree(name):
+    """Accelerations and constraint forces from every road, at random velocities on the constraints."""
+    mechanism = mb.mechanisms.get(name)
+    system, state = mechanism.system, mechanism.state
+
+    @jax.jit
+    def both(u):
+        y = mb.manifold.project(system, 0.0, mb.State(state.q, u))
+        jacobian = system.jacobian(0.0, y.q, y.u)
+        roads = [accelerations(system, road, 0.0, y.q, y.u) for road in (Partitioned(), Multipliers())]
+        forces = [jacobian.T @ multipliers for _, multipliers in roads]
+        left = system.acceleration_residual(0.0, y.q, y.u, roads[0][0])
+        return [a for a, _ in roads], forces, left, jacobian @ roads[0][0], forces[0] @ y.u
+
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        (a, b), (f, g), left, size, power = both(state.u + jnp.asarray(rng.normal(size=system.nu)))
+        np.testing.assert_allclose(b, a, atol=1e-10 * (1.0 + np.max(np.abs(a))))
+        np.testing.assert_allclose(g, f, atol=1e-9 * (1.0 + np.max(np.abs(f))))
+        np.testing.assert_allclose(left, 0.0, atol=1e-9 * (1.0 + np.max(np.abs(size))))
+        # Ideal constraints do no work on motions they allow.
+        if system.homogeneous:
+            np.testing.assert_allclose(power, 0.0, atol=1e-9 * (1.0 + np.linalg.norm(f)))
+
+
+def test_own_constraints_and_forces():
+    """User functions against the library's parts: a rod as a distance, a blade, a spring."""
+    masses = [
+        planar.PointMass("a", mass=1.0, position=(1.0, 0.0)),
+        planar.PointMass("b", mass=2.0, position=(2.0, 0.5)),
+    ]
+    gravity = mb.Gravity((0.0, -G))
+    length = float(np.hypot(1.0, 0.5))
+    rods = [planar.Distance("r1", "ground", "a"), planar.Distance("r2", "a", "b")]
+    spring = planar.SpringDamper("s", "ground", "b", stiffness=5.0, damping=0.3, free_length=1.0)
+    library = mb.Scene(masses, joints=rods, forces=[gravity, spring]).compile()
+
+    gap = lambda poses, t, p: jnp.sum((poses[1, :2] - poses[0, :2]) ** 2) - p["length"] ** 2
+
+    def law(poses, velocities, t, p):
+        l = jnp.sqrt(jnp.sum(poses[0, :2] ** 2))
+        rate = jnp.dot(poses[0, :2], velocities[0, :2]) / l
+        pull = -(p["k"] * (l - 1.0) + p["c"] * rate) * poses[0, :2] / l
+        return jnp.concatenate([pull, jnp.zeros(1)])[None]
+
+    own = mb.Scene(
+        masses,
+        joints=[
+            mb.Constraint("r1", ["ground", "a"], gap, parameters={"length": 1.0}, rheonomic=False),
+            mb.Constraint("r2", ["a", "b"], gap, parameters={"length": length}),
+        ],
+        forces=[gravity, mb.Force("s", "b", law, parameters={"k": 5.0, "c": 0.3})],
+    ).compile()
+    assert {"r1.length", "s.k"} <= set(mb.parameters(own))
+    ends = [mb.simulate(s, mb.assemble(s), t1=1.0, rtol=1e-10)["b"].position for s in (library, own)]
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-8)
+
+
+def test_constraint_nonlinear_in_velocity():
+    """A particle held at constant speed under gravity, closed form: tan(φ/2) grows exponentially (Appell's type)."""
+    speed = 2.0
+    hold = lambda poses, velocities, t, p: jnp.sum(velocities[0, :2] ** 2) - p["speed"] ** 2
+    particle = planar.PointMass("p", mass=1.0, velocity=(speed, 0.0))
+    constant = mb.VelocityConstraint("speed", "p", hold, parameters={"speed": speed})
+    system = mb.Scene([particle], joints=[constant], forces=[mb.Gravity((0.0, -G))]).compile()
+    assert not system.linear
+    sol = mb.simulate(system, mb.assemble(system), t1=0.3, rtol=1e-10, saveat=jnp.linspace(0.0, 0.3, 4))
+    velocity = sol["p"].velocity
+    np.testing.assert_allclose(jnp.sum(velocity**2, axis=1), speed**2, rtol=1e-12)
+    # The constraint force is along the velocity, so the direction turns with φ' = −g cos(φ) / v.
+    angle = jnp.arctan2(velocity[:, 1], velocity[:, 0])
+    np.testing.assert_allclose(angle, -2 * jnp.arctan(jnp.tanh(G * sol.ts / (2 * speed))), atol=1e-8)
+
+
+def test_driven_in_everything():
+    """No degree of freedom: the motion is the driver's, and the torque it needs is its reaction."""
+    body = planar.Body("rod", mass=3.0, inertia=1.0, position=(1.0, 0.0))
+    turn = lambda t, p: p["a"] * jnp.sin(p["w"] * t)
+    joints = [
+        planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)),
+        planar.Driver("drive", "ground", "rod", quantity="angle", motion=turn, parameters={"a": 0.5, "w": 3.0}),
+    ]
+    system = mb.Scene([body], joints=joints).compile()
+    sol = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=jnp.linspace(0.0, 2.0, 9))
+    np.testing.assert_allclose(sol["rod"].angle, 0.5 * jnp.sin(3.0 * sol.ts), atol=1e-10)
+    about_pin = (1.0 + 3.0 * 1.0**2) * -4.5 * jnp.sin(3.0 * sol.ts)
+    np.testing.assert_allclose(sol.reactions["drive"].moment, about_pin, atol=1e-6)
+
+
+def test_spring_of_zero_length_is_linear():
+    """A motion that starts where a spring of no free length has zero length: derivatives are right there."""
+    body = planar.PointMass("p", mass=2.0)
+    system = mb.Scene(
+        [body], forces=[planar.SpringDamper("s", "ground", "p", stiffness=8.0, free_length=0.0)]
+    ).compile()
+
+    def end(x0, k):
+        changed = mb.with_parameters(system, {"s.stiffness": k})
+        state = mb.State(jnp.stack([x0, 0.0 * x0]), jnp.array([1.0, 0.0]))
+        return mb.simulate(changed, state, t1=1.0, rtol=1e-11).ys.q[-1, 0]
+
+    slope, stiffness = jax.grad(end, argnums=(0, 1))(jnp.array(0.0), jnp.array(8.0))
+    np.testing.assert_allclose(slope, np.cos(2.0), atol=1e-8)
+    # x = sin(ω t) / ω with ω² = k / m.
+    np.testing.assert_allclose(stiffness, (2.0 * np.cos(2.0) - np.sin(2.0)) / 4.0 / (2 * 2.0 * 2.0), atol=1e-8)
