@@ -52,12 +52,6 @@ def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def rotation_2d(angle: Float[ArrayLike, ""]) -> Float[Array, "2 2"]:
-    """Matrix from body to world components of a planar frame turned by `angle` [rad]."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-
-
 def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
     """World components of the body vector `v` in a planar frame turned by `angle` [rad]."""
     c, s = jnp.cos(angle), jnp.sin(angle)
