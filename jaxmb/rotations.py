@@ -42,7 +42,11 @@ def _constant(table: np.ndarray, like: Array) -> Array:
 
 
 def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
-    return jnp.sum(_constant(table, a) * (a[:, None] * b[None, :])[None], axis=(1, 2))
+    """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
+    # Pairs as one axis: under a few `vmap`s arrays of higher rank are what some versions of XLA hang on (jax issue
+    # 39257).
+    pairs = (a[:, None] * b[None, :]).reshape(-1)
+    return jnp.sum(_constant(table.reshape(-1, pairs.size), a) * pairs[None, :], axis=1)
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
@@ -60,7 +64,7 @@ def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array,
 
 def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Matrix from body to world components, `(e0² − e·e) I + 2 e eᵀ + 2 e0 ẽ`."""
-    return jnp.sum(_constant(_ROTATION, p) * (p[:, None] * p[None, :])[None, None], axis=(2, 3))
+    return _bilinear(_ROTATION, p, p).reshape(3, 3)
 
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:

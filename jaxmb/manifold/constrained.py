@@ -1,16 +1,16 @@
-"""One evaluation on the constraint manifold, with exact derivatives.
+"""Accelerations near the constraint manifold and the way back to it, with exact derivatives.
 
-Given a guess of the state and a chart, `evaluate` keeps the independent coordinates and velocities, solves `Φ = 0`
-and `ψ = 0` for the dependent ones, and the equations of motion for the accelerations. Jacobian, factor and influence
-matrix are computed once and shared.
+A step asks twice. `evaluate` takes predicted coordinates close to the manifold and factors the Jacobian there: the one
+elimination of the step. `restore` takes the corrected state, keeps its independent coordinates and velocities, solves
+`Φ = 0` and `ψ = 0` for the dependent ones, and finds the accelerations there by one Newton correction of those that
+were evaluated: no Jacobian and no elimination, a fifth of the cost.
 
-Its derivative does not follow the algorithm but the equations (implicit function theorem), with the factors that are
-there anyway: it is cheap, independent of the formulation, and cannot pick up a frozen iterate. The factors' own
-derivatives are part of the rule, so higher derivatives are right as well.
+Their derivatives do not follow the algorithm but the equations (implicit function theorem): they are cheap, independent
+of the formulation, and cannot pick up a frozen iterate. The factors' own derivatives are part of the rule, so higher
+derivatives are right as well.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -24,34 +24,35 @@ _MAX_ITERATIONS = 12
 
 
 class Split(eqx.Module):
-    """A chart's index sets and the carried matrix of its position Newton.
+    """A chart's index sets, and the matrix that restores positions.
 
     **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `coordinate`: that of the coordinates'
-    Jacobian, None where one split serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq =
-    −Φ` along dependent columns, made at `time`.
+    Jacobian, None where one order serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq =
+    −Φ` along dependent columns, from a state of this step or of one before.
     """
 
     velocity: Order
     coordinate: Order | None
     correction: Float[Array, "nq mq"]
-    time: Float[Array, ""]
-
-    @property
-    def coordinates(self) -> Order:
-        return self.velocity if self.coordinate is None else self.coordinate
 
 
 class Evaluation(eqx.Module):
-    """A state on the manifold and what was computed there.
+    """Velocities on the manifold of their coordinates, accelerations and the velocity factor."""
 
-    **Fields:** `q`, `u`, `udot`; the velocity `factor`; `iterations` of the position Newton and
-    `failed`, which tangents have not.
+    u: Float[Array, "nu"]
+    udot: Float[Array, "nu"]
+    factor: Factor
+
+
+class Restored(eqx.Module):
+    """A state on the manifold and its accelerations.
+
+    **Fields:** `q`, `u`, `udot`; `iterations` of the position Newton and `failed`, which tangents have not.
     """
 
     q: Float[Array, "nq"]
     u: Float[Array, "nu"]
     udot: Float[Array, "nu"]
-    factor: Factor
     iterations: Int[Array, ""] | None
     failed: Bool[Array, ""] | None
 
@@ -63,8 +64,15 @@ def shared(system: AbstractSystem) -> bool:
 
 def coordinate_factor(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: Split) -> Factor:
     """Factor of the coordinates' Jacobian in a chart."""
-    jacobian = system.coordinate_jacobian(t, q)
-    return factor(jacobian, split.coordinates, system.coordinate_rank)
+    order = split.velocity if split.coordinate is None else split.coordinate
+    return factor(system.coordinate_jacobian(t, q), order, system.coordinate_rank)
+
+
+def correct_positions(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: Split) -> Float[Array, "nq"]:
+    """Coordinates nearer to the manifold, by one correction with the matrix that is there."""
+    if system.coordinate_rank == 0:
+        return q
+    return q - split.correction @ system.coordinate_residual(t, q)
 
 
 @eqx.filter_custom_jvp
@@ -74,24 +82,69 @@ def evaluate(
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
+    order: Order,
+) -> Evaluation:
+    """Accelerations of a constrained system at coordinates on the manifold or near it.
+
+    **Arguments:** `u`: independent velocities exact, dependent ones a guess; `order` of elimination.
+    """
+    jacobian = system.jacobian(t, q, u)
+    solved = factor(jacobian, order, system.velocity_rank)
+    residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
+    u = u - solved.correction @ residual
+    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+    udot, _ = formulation.solve(system.inertia(t, q), system.force(t, q, u), jacobian, gamma, solved)
+    return Evaluation(u, udot, solved)
+
+
+@eqx.filter_custom_jvp
+def restore(
+    system: AbstractSystem,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    u: Float[Array, "nu"],
+    near: Evaluation,
     split: Split,
     tol: float,
-) -> Evaluation:
-    """Restore a state to the manifold and evaluate the accelerations there.
+) -> Restored:
+    """Restore a state to the manifold and find the accelerations of a constrained system there.
 
-    **Arguments:** `q`, `u`: the state, independent entries exact, dependent ones a guess; `tol`: size of the last
-    Newton correction, relative to the system's size.
+    They are wrong by the square of the distance to the state of `near`.
+
+    **Arguments:** `q`, `u`: the state, independent entries exact, dependent ones a guess; `near`: the evaluation of a
+    state close by at the same time; `tol`: size of the last Newton correction, relative to the system's size.
     """
-    q, iterations, failed = _restore_positions(system, t, q, split, tol)
-    u, jacobian, solved, slow = _restore_velocities(system, t, q, u, split, tol)
-    force = system.force(t, q, u)
-    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    udot, _ = formulation.solve(system.inertia(t, q), force, jacobian, gamma, solved)
-    failed = failed | slow | ~jnp.all(jnp.isfinite(udot))
-    return Evaluation(q, u, udot, solved, iterations, failed)
+    solved, udot = near.factor, near.udot
+    q, iterations, failed = restore_positions(system, t, q, split, tol)
+    # Wrong by the distance of the two states, the factor leaves the square and the cube of what there was.
+    for _ in range(1 if system.linear else 2):
+        u = u - solved.correction @ system.velocity_residual(t, q, u)
+    inertia = system.inertia(t, q)
+    multipliers = solved.correction.T @ (inertia.product(udot) - system.force(t, q, u))
+    unlevel, unbalance = _equations(system, t, q, u, udot, multipliers)
+    udot = udot + _solve_linear(inertia, solved, unlevel, unbalance)
+    return Restored(q, u, udot, iterations, failed)
 
 
-def _restore_positions(system, t, q, split, tol):
+def _equations(system, t, q, u, udot, multipliers):
+    """Residuals of the equations of motion: `A u̇ − γ` and `M u̇ − F − Aᵀ λ`."""
+    applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
+    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q).product(udot) - applied
+
+
+def _solve_linear(inertia, solved, unlevel, unbalance):
+    """The change of accelerations that makes these residuals vanish; that of the multipliers is eliminated."""
+    particular = -(solved.correction @ unlevel)
+    reduced = solved.basis.T @ inertia.product(solved.basis)
+    load = solved.basis.T @ (unbalance + inertia.product(particular))
+    return particular - solved.basis @ solve_positive(reduced, load)
+
+
+@eqx.filter_custom_jvp
+def restore_positions(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: Split, tol: float
+) -> tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]:
+    """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`."""
     if system.coordinate_rank == 0:
         return q, jnp.array(0), jnp.array(False)
     scale = system.coordinate_scale()
@@ -110,80 +163,79 @@ def _restore_positions(system, t, q, split, tol):
         _, size, ahead, k = carry
         return (ahead > tol) & (size < 1.0) & (k < _MAX_ITERATIONS)
 
-    # A matrix of this very time is wrong by the first correction only; of an older one nothing is known.
-    before = jnp.where(split.time == t, jnp.ones((), q.dtype), jnp.zeros((), q.dtype))
+    # Where velocities and coordinates share their factor it is of this very time, and wrong by the first correction
+    # only; of an older one nothing is known.
+    before = jnp.full((), 1.0 if split.coordinate is None else 0.0, q.dtype)
     q, _, ahead, k = lax.while_loop(proceed, correct, correct((q, before, before, jnp.array(0))))
     return q, k, ~(ahead <= tol)
 
 
-def _restore_velocities(system, t, q, u, split, tol):
-    def solve(u):
-        jacobian = system.jacobian(t, q, u)
-        solved = factor(jacobian, split.velocity, system.velocity_rank)
-        residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
-        return u - solved.correction @ residual, jacobian, solved
-
-    if system.linear:
-        return *solve(u), jnp.array(False)
-
-    def correct(carry):
-        u, _, k = carry
-        new, _, _ = solve(u)
-        return new, jnp.max(jnp.abs(new - u)), k + 1
-
-    def proceed(carry):
-        u, size, k = carry
-        return (size > tol * (1 + jnp.max(jnp.abs(u)))) & (k < _MAX_ITERATIONS)
-
-    u, _, k = lax.while_loop(proceed, correct, correct((u, None, jnp.array(0))))
-    _, jacobian, solved = solve(u)
-    return u, jacobian, solved, k >= _MAX_ITERATIONS
+# Derivatives
 
 
 @evaluate.def_jvp
 def _evaluate_jvp(primals, tangents):
-    system, formulation, t, q, u, split, tol = primals
-    dsystem, _, dt, dq, du, _, _ = tangents
-    out = evaluate(system, formulation, t, q, u, split, tol)
-    dq = jnp.zeros_like(q) if dq is None else dq
-    du = jnp.zeros_like(u) if du is None else du
-    q, u, udot, solved = out.q, out.u, out.udot, out.factor
+    system, formulation, t, q, u, order = primals
+    dsystem, _, dt, dq, du, _ = tangents
+    out = evaluate(system, formulation, t, q, u, order)
+    solved = out.factor
+    at, along = _push_velocities((system, t, q, out.u), (dsystem, dt, _dense(dq, q), _dense(du, u)), solved)
+    djacobian = _push(lambda s, t, q, u: s.jacobian(t, q, u), at, along)
+    pushed = solved.correction @ djacobian
+    dfactor = Factor(-(pushed @ solved.correction), -(pushed @ solved.basis), None)
+    return out, Evaluation(along[3], _push_accelerations(at, along, out.udot, solved), dfactor)
 
+
+@restore.def_jvp
+def _restore_jvp(primals, tangents):
+    system, t, q, u, near, split, tol = primals
+    dsystem, dt, dq, du, _, _, _ = tangents
+    out = restore(system, t, q, u, near, split, tol)
+    # The factor of the other state solved the equations, but only the one of this state differentiates them.
+    solved = factor(system.jacobian(t, out.q, out.u), split.velocity, system.velocity_rank)
+    own = solved if split.coordinate is None else coordinate_factor(system, t, out.q, split)
+    dq = _push_positions(system, t, out.q, own, (dsystem, dt, _dense(dq, q)))
+    at, along = _push_velocities((system, t, out.q, out.u), (dsystem, dt, dq, _dense(du, u)), solved)
+    dudot = _push_accelerations(at, along, out.udot, solved)
+    return out, Restored(dq, along[3], dudot, None, None)
+
+
+@restore_positions.def_jvp
+def _restore_positions_jvp(primals, tangents):
+    system, t, q, split, tol = primals
+    dsystem, dt, dq, _, _ = tangents
+    out = restore_positions(system, t, q, split, tol)
+    dq = _dense(dq, q)
     if system.coordinate_rank > 0:
-        exact = solved if shared(system) else coordinate_factor(system, t, q, split)
-        residual = _push(lambda s, t, q: s.coordinate_residual(t, q), (system, t, q), (dsystem, dt, dq))
-        dq = dq - exact.correction @ residual
-    at, along = (system, t, q, u), (dsystem, dt, dq, du)
-    if system.velocity_rows == 0:
-        acceleration = lambda s, t, q, u: s.inertia(t, q).solve(s.force(t, q, u))
-        return out, Evaluation(dq, du, _push(acceleration, at, along), _zero(out.factor), None, None)
+        own = coordinate_factor(system, t, out[0], split)
+        dq = _push_positions(system, t, out[0], own, (dsystem, dt, dq))
+    return out, (dq, None, None)
 
-    du = du - solved.correction @ _push(lambda s, t, q, u: s.velocity_residual(t, q, u), at, along)
-    along = (dsystem, dt, dq, du)
+
+def _push_positions(system, t, q, own, along):
+    """Tangent of the coordinates on the manifold, from their factor there."""
+    residual = _push(lambda s, t, q: s.coordinate_residual(t, q), (system, t, q), along)
+    return along[2] - own.correction @ residual
+
+
+def _push_velocities(at, along, solved):
+    """Point and tangent with that of the velocities on the manifold."""
+    dsystem, dt, dq, du = along
+    residual = _push(lambda s, t, q, u: s.velocity_residual(t, q, u), at, along)
+    return at, (dsystem, dt, dq, du - solved.correction @ residual)
+
+
+def _push_accelerations(at, along, udot, solved):
+    system, t, q, u = at
     inertia = system.inertia(t, q)
     multipliers = solved.correction.T @ (inertia.product(udot) - system.force(t, q, u))
-
-    def equations(s, t, q, u):
-        _, pull = jax.vjp(lambda u: s.velocity_residual(t, q, u), u)
-        balance = s.inertia(t, q).product(udot) - s.force(t, q, u) - pull(multipliers)[0]
-        return s.acceleration_residual(t, q, u, udot), balance
-
-    unlevel, unbalance = _push(equations, at, along)
-    particular = -solved.correction @ unlevel
-    reduced = solved.basis.T @ inertia.product(solved.basis)
-    load = solved.basis.T @ (unbalance + inertia.product(particular))
-    dudot = particular - solved.basis @ solve_positive(reduced, load)
-
-    djacobian = _push(lambda s, t, q, u: s.jacobian(t, q, u), at, along)
-    dfactor = Factor(
-        -solved.correction @ djacobian @ solved.correction, -solved.correction @ (djacobian @ solved.basis), None
-    )
-    return out, Evaluation(dq, du, dudot, dfactor, None, None)
+    unlevel, unbalance = _push(lambda s, t, q, u: _equations(s, t, q, u, udot, multipliers), at, along)
+    return _solve_linear(inertia, solved, unlevel, unbalance)
 
 
 def _push(fn, primals, tangents):
     return eqx.filter_jvp(fn, primals, tangents)[1]
 
 
-def _zero(solved):
-    return Factor(jnp.zeros_like(solved.correction), jnp.zeros_like(solved.basis), None)
+def _dense(tangent, primal):
+    return jnp.zeros_like(primal) if tangent is None else tangent

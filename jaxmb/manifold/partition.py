@@ -8,6 +8,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -15,10 +16,10 @@ from .._types import State
 from ..elimination import factor, full_pivot
 from ..formulations import AbstractFormulation
 from ..formulations._base import stages
-from ..solvers import AbstractManifoldTerm, Adams
+from ..solvers import AbstractManifoldTerm, Adams, ManifoldEvaluation
 from ..system import AbstractSystem
 from ._base import AbstractManifold
-from .constrained import Split, coordinate_factor, evaluate, shared
+from .constrained import Evaluation, Split, correct_positions, evaluate, restore, restore_positions, shared
 from .free import VectorField
 
 # A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
@@ -28,6 +29,9 @@ _SLOW = 3
 # seconds: 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts
 # in 1200 steps.)
 _GROWTH = 1.1
+# The same for the solution of the rows that were kept. Where others are redundant, the kept ones can lose rank at a
+# position where all of them do not, and H shows nothing of it.
+_ROW_GROWTH = 4.0
 
 
 # Traced once for all the places of a step.
@@ -70,13 +74,13 @@ class Partition(AbstractManifold):
 class Chart(eqx.Module):
     """A split with its quality and counters.
 
-    **Fields:** `split`; `influence`: largest scaled |H| at the last evaluation; `fresh`: the same when the chart was
-    made; `counters`: see the properties.
+    **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H| and, with
+    redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties.
     """
 
     split: Split
-    influence: Float[Array, ""]
-    fresh: Float[Array, ""]
+    quality: Float[Array, "k"]
+    fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
 
     @property
@@ -129,18 +133,35 @@ class PartitionTerm(AbstractManifoldTerm):
         return Chart(split, fresh, fresh, jnp.stack([0, 0, 0, 1, singular.astype(int)]))
 
     def evaluate(self, t, y, chart, args):
-        chart = lax.stop_gradient(chart)
-        split, influence = chart.split, chart.influence
-        out = _evaluate(self.system, self.formulation, t, y.q, y.u, split, self.newton_tol)
-        if split.coordinate is None:
-            split = Split(split.velocity, None, lax.stop_gradient(out.factor.correction), _time(t, y))
-        if self.system.velocity_rows:
-            basis = lax.stop_gradient(out.factor.basis)
-            influence = _scaled(basis, self.system.velocity_scale(), split.velocity, self.system.velocity_rank)
+        system, split, quality = self.system, chart.split, chart.quality
+        q = correct_positions(system, t, y.q, lax.stop_gradient(split))
+        if system.velocity_rows == 0:
+            u, udot, factors = y.u, system.inertia(t, q).solve(system.force(t, q, y.u)), None
+        else:
+            out = _evaluate(system, self.formulation, t, q, y.u, split.velocity)
+            u, udot, factors = out.u, out.udot, out.factor
+            quality = _velocity_quality(system, factors, split.velocity)
+            if split.coordinate is None:
+                split = Split(split.velocity, None, factors.correction)
+        f = State(system.rates(t, q, u), udot)
+        chart = Chart(split, quality, chart.fresh, chart.counters)
+        return ManifoldEvaluation(State(q, u), f, chart, chart.singular, factors)
+
+    def restore(self, t, y, near, args):
+        system, chart = self.system, near.chart
+        if system.velocity_rows == 0:
+            q, iterations, failed = restore_positions(system, t, y.q, chart.split, self.newton_tol)
+            u, udot = y.u, system.inertia(t, q).solve(system.force(t, q, y.u))
+        else:
+            before = lax.stop_gradient((near.y.u, near.f.u))
+            before = Evaluation(*before, near.factors)
+            out = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+            q, u, udot, iterations, failed = out.q, out.u, out.udot, out.iterations, out.failed
         age, _, newton, charts, singular = chart.counters
-        counters = jnp.stack([age, out.iterations, newton + out.iterations, charts, singular])
-        f = State(self.system.rates(t, out.q, out.u), out.udot)
-        return State(out.q, out.u), f, Chart(split, influence, chart.fresh, counters), out.failed | chart.singular
+        counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
+        chart = Chart(chart.split, chart.quality, chart.fresh, counters)
+        f = State(system.rates(t, q, u), udot)
+        return ManifoldEvaluation(State(q, u), f, chart, failed | chart.singular, None)
 
     def controlled(self, chart):
         # All components, the dependent ones as well: where these turn fast, the error of the independent ones alone
@@ -151,17 +172,15 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def update_chart(self, t, y, chart, args):
         system, y, chart = lax.stop_gradient((self.system, y, chart))
-        bound = self.max_influence * chart.fresh
         if chart.split.coordinate is not None and system.coordinate_rank > 0:
-            stale = (chart.influence > bound) | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
+            stale = self._worse(chart) | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
 
             def refresh(chart):
-                solved = coordinate_factor(system, t, y.q, chart.split)
-                own = _scaled(solved.basis, system.coordinate_scale(), chart.split.coordinates, system.coordinate_rank)
-                split = Split(chart.split.velocity, chart.split.coordinate, solved.correction, _time(t, y))
-                return Chart(split, jnp.maximum(own, chart.influence), chart.fresh, chart.counters.at[0].set(0))
+                split, own = _refreshed(system, t, y, chart.split.velocity, chart.split.coordinate)
+                quality = jnp.maximum(chart.quality, own)
+                return Chart(split, quality, chart.fresh, chart.counters.at[0].set(0))
 
-            keep = lambda chart: Chart(chart.split, chart.influence, chart.fresh, chart.counters.at[0].add(1))
+            keep = lambda chart: Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1))
             chart = _any_lane(stale, refresh, keep, chart)
 
         def renew(chart):
@@ -169,39 +188,46 @@ class PartitionTerm(AbstractManifoldTerm):
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
             return Chart(split, fresh, fresh, counters)
 
-        return _any_lane(chart.influence > bound, renew, lambda chart: chart, chart)
+        return _any_lane(self._worse(chart), renew, lambda chart: chart, chart)
+
+    def _worse(self, chart):
+        bounds = np.array([self.max_influence, _ROW_GROWTH])[: chart.fresh.size]
+        return jnp.any(chart.quality > bounds * chart.fresh)
 
 
 def _choose(system, t, y):
-    """A chart by full pivoting, its influence, and whether the rank is less than it was when the scene was compiled."""
+    """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled."""
     jacobian = system.jacobian(t, y.q, y.u)
     velocity = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
     singular = velocity.rank != system.velocity_rank
     solved = factor(jacobian, velocity.order, system.velocity_rank)
-    influence = _scaled(solved.basis, system.velocity_scale(), velocity.order, system.velocity_rank)
+    quality = _velocity_quality(system, solved, velocity.order)
     if shared(system):
-        return Split(velocity.order, None, solved.correction, _time(t, y)), influence, singular
+        return Split(velocity.order, None, solved.correction), quality, singular
     pivots = full_pivot(system.coordinate_jacobian(t, y.q), scale=system.coordinate_scale())
-    singular = singular | (pivots.rank != system.coordinate_rank)
-    empty = jnp.zeros((system.nq, system.coordinate_rows), y.q.dtype)
-    split = Split(velocity.order, pivots.order, empty, _time(t, y))
-    if system.coordinate_rank > 0:
-        solved = coordinate_factor(system, t, y.q, split)
-        own = _scaled(solved.basis, system.coordinate_scale(), pivots.order, system.coordinate_rank)
-        split, influence = (
-            Split(velocity.order, pivots.order, solved.correction, split.time),
-            jnp.maximum(influence, own),
-        )
-    return split, influence, singular
+    split, own = _refreshed(system, t, y, velocity.order, pivots.order)
+    return split, jnp.maximum(quality, own), singular | (pivots.rank != system.coordinate_rank)
 
 
-def _time(t, y):
-    return lax.stop_gradient(jnp.asarray(t, y.q.dtype))
+def _refreshed(system, t, y, velocity, coordinate):
+    """The split with the position factor of this state, and the coordinates' quality."""
+    solved = factor(system.coordinate_jacobian(t, y.q), coordinate, system.coordinate_rank)
+    own = _quality(system, solved, system.coordinate_scale(), coordinate, system.coordinate_rank)
+    return Split(velocity, coordinate, solved.correction), own
 
 
-def _scaled(basis, scale, order, rank):
-    """Largest entry of the influence matrix in units of the coordinates' scales."""
-    return jnp.max(jnp.abs(basis) * scale[order.columns[rank:]][None, :] / scale[:, None], initial=1.0)
+def _velocity_quality(system, solved, order):
+    solved = lax.stop_gradient(solved)
+    return _quality(system, solved, system.velocity_scale(), order, system.velocity_rank)
+
+
+def _quality(system, solved, scale, order, rank):
+    """What a chart is judged by, in units of the coordinates' scales."""
+    influence = jnp.abs(solved.basis) * scale[order.columns[rank:]][None, :] / scale[:, None]
+    largest = [jnp.max(influence, initial=1.0)]
+    if system.velocity_rank < system.velocity_rows:
+        largest.append(jnp.max(jnp.abs(solved.correction) / scale[:, None], initial=0.0))
+    return jnp.stack(largest)
 
 
 def _any_lane(pred, true_fn, false_fn, operand):

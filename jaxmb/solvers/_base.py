@@ -3,11 +3,11 @@
 A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` is the same equation together with
 invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart).
 The solver keeps its history for *all* components of `y`; the chart only says which of them are integrated and
-which are solved for (`evaluate`), so a change of chart costs neither history nor order.
+which are solved for (`restore`), so a change of chart costs neither history nor order.
 """
 
 import abc
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 from jaxtyping import Array, Bool, PyTree
@@ -15,6 +15,25 @@ from jaxtyping import Array, Bool, PyTree
 Chart: TypeAlias = PyTree[Array]
 Y: TypeAlias = PyTree[Array]
 Args: TypeAlias = Any
+
+
+class ManifoldEvaluation(NamedTuple):
+    """What an `AbstractManifoldTerm` returns.
+
+    **Fields:**
+
+    - `y`: the state, on the manifold if that was asked for.
+    - `f`: the vector field there.
+    - `chart`: the chart with the same index sets; it may carry what makes the next evaluation cheaper, and counters.
+    - `failed`: true where the state could not be evaluated or restored; the step is then retried with a smaller one.
+    - `factors`: what makes restoring a state nearby at the same time cheaper; any pytree of arrays, or None.
+    """
+
+    y: Y
+    f: Y
+    chart: Chart
+    failed: Bool[Array, ""]
+    factors: PyTree = None
 
 
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
@@ -29,14 +48,15 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """Choose a chart at a state; any pytree of arrays, of a structure and shape that never change."""
 
     @abc.abstractmethod
-    def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> tuple[Y, Y, Chart, Bool[Array, ""]]:
-        """Restore `y` to the manifold, then evaluate the vector field there.
+    def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
+        """Evaluate the vector field at a state on the manifold or near it, a prediction; it need not be restored."""
 
-        The independent components of `y` are kept; the others are a first guess and are solved for.
+    @abc.abstractmethod
+    def restore(self, t: Any, y: Y, near: ManifoldEvaluation, args: Args) -> ManifoldEvaluation:
+        """Restore a state to the manifold, and evaluate the vector field there.
 
-        **Returns:** `(y on the manifold, f, chart, failed)`. The returned chart has the same index sets and may carry
-        what makes the next evaluation cheaper (a matrix factor) and counters. `failed` is true where the state could
-        not be restored; the step is then retried with a smaller one.
+        The independent components of `y` are kept; the others are a first guess and are solved for. `near` is the
+        evaluation of the prediction that `y` corrects, at the same time; its `factors` may make this one cheap.
         """
 
     @abc.abstractmethod

@@ -13,16 +13,17 @@ from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around ter
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._base import AbstractManifoldTerm, Args, Chart
+from ._base import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation
 
 
 class Evaluation(NamedTuple):
-    """The state restored to the manifold, the derivative there, the chart, and whether restoring it failed."""
+    """A state, the derivative there, the chart, and whether that failed; `near` is the same as the manifold gave it."""
 
     y: Array
     f: Array
     chart: Chart | None
     failed: Any
+    near: ManifoldEvaluation | None
 
 
 def check_term(term: Any) -> None:
@@ -76,17 +77,35 @@ def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: A
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
-    """Restore a state to the manifold, if there is one, and evaluate the vector field.
-
-    `like` has the structure of the state before raveling.
-    """
-    y = unravel_like(like, flat)
+    """Evaluate the vector field; `like` has the structure of the state before raveling."""
     manifold = _manifold(term)
     if manifold is None:
-        return Evaluation(flat, ravel(derivative(term, t, y, args), flat.dtype), None, False)
-    y, f, chart, failed = manifold.evaluate(t * term.direction, y, chart, args)
-    f = ravel(f, flat.dtype) * jnp.asarray(term.direction).astype(flat.dtype)
-    return Evaluation(ravel(y, flat.dtype), f, _freeze(chart), failed)
+        return _evaluate_plain(term, t, flat, like, args)
+    out = manifold.evaluate(t * term.direction, unravel_like(like, flat), chart, args)
+    return _raveled(term, out, flat.dtype)
+
+
+def restore(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluation, args: Args) -> Evaluation:
+    """Restore a corrected state to the manifold, if there is one, and evaluate the vector field there.
+
+    `before` is the evaluation of the prediction, at the same time.
+    """
+    manifold = _manifold(term)
+    if manifold is None:
+        return _evaluate_plain(term, t, flat, like, args)
+    out = manifold.restore(t * term.direction, unravel_like(like, flat), before.near, args)
+    return _raveled(term, out, flat.dtype)
+
+
+def _evaluate_plain(term, t, flat, like, args):
+    f = derivative(term, t, unravel_like(like, flat), args)
+    return Evaluation(flat, ravel(f, flat.dtype), None, False, None)
+
+
+def _raveled(term, out: ManifoldEvaluation, dtype):
+    chart, factors = _freeze((out.chart, out.factors))
+    f = ravel(out.f, dtype) * jnp.asarray(term.direction).astype(dtype)
+    return Evaluation(ravel(out.y, dtype), f, chart, out.failed, out._replace(chart=chart, factors=factors))
 
 
 def controlled_components(term: Any, chart: Chart | None) -> Array | None:
@@ -99,6 +118,6 @@ def _manifold(term: Any) -> AbstractManifoldTerm | None:
     return term.term if isinstance(term.term, AbstractManifoldTerm) else None
 
 
-def _freeze(chart: Chart) -> Chart:
+def _freeze(tree):
     # Index sets and factors steer how the constraints are solved; the solution does not depend on them.
-    return jax.tree.map(jax.lax.stop_gradient, chart)
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, tree)

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-HIGHEST_ORDER = 12
+HIGHEST_ORDER = 13
 LENGTH = HIGHEST_ORDER + 1
 
-# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, one more than the highest basis polynomial.
+# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, that of the highest basis polynomial.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 # Selects, for basis polynomial i, the factors j < i.

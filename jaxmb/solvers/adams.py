@@ -23,6 +23,7 @@ from ._evaluation import (
     first_chart,
     next_chart,
     ravel,
+    restore,
     unravel_like,
 )
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start, step_end
@@ -54,7 +55,7 @@ class AdamsState(eqx.Module):
 
 
 class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptiveSolver[AdamsState]):
-    r"""Adams' method of variable order (1 to 12) and variable step, for non-stiff problems.
+    r"""Adams' method of variable order (1 to 13) and variable step, for non-stiff problems.
 
     Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order $k$ predicts with the
     Adams-Bashforth formula of order $k$ and corrects with the Adams-Moulton formula of order $k + 1$. Two evaluations a
@@ -173,18 +174,20 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         ahead = extrapolate(history, end)
         weights = jnp.where(order > INDEX, ahead.means, jnp.zeros((), dtype))
         predicted = before + h * (weights @ history.differences)
-        _, f, tried_chart, predictor_failed = evaluate(terms, t1, predicted, y0, chart, args)
+        first = evaluate(terms, t1, predicted, y0, chart, args)
 
         # What the new derivative adds to the polynomials through the last k - 1, k and k + 1, and its integral.
-        defects = f[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
+        defects = first.f[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
         integrals = ahead.means / ahead.values
         last = integrals[order]
-        differences = jnp.diff(integrals, prepend=jnp.zeros(1, dtype), append=integrals[-1:])
-        errors = h * lax.dynamic_slice_in_dim(differences, order - 1, 3)[:, None] * defects
+        padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
+        differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
+        errors = h * differences[:, None] * defects
         corrected = predicted + h * last * defects[1]
-        after, f, tried_chart, corrector_failed = evaluate(terms, t1, corrected, y0, tried_chart, args)
+        second = restore(terms, t1, corrected, y0, first, args)
+        after, f = second.y, second.f
 
-        failed = predictor_failed | corrector_failed
+        failed = first.failed | second.failed
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), self._sizes(terms, y0, before, after, errors, chart))
         next_order, estimate = choose_order(sizes, order, history.points, self.min_order, self.max_order)
         y1 = unravel_like(y0, after)
@@ -192,7 +195,7 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
             history=advance(history, end, f, ahead.partial_sums),
             order=next_order,
             tally=solver_state.tally + (order == INDEX).astype(np.int32),
-            chart=next_chart(terms, t1, y1, tried_chart, args),
+            chart=next_chart(terms, t1, y1, second.chart, args),
         )
         used = (order >= INDEX)[:, None]
         dense_info = {
@@ -220,10 +223,11 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
 
 
 def _start(terms, t0, t1, y0, args, chart, tally) -> AdamsState:
-    _, f, chart, failed = evaluate(terms, t0, ravel(y0), y0, chart, args)
-    if failed is not False:
+    first = evaluate(terms, t0, ravel(y0), y0, chart, args)
+    f, chart = first.f, first.chart
+    if first.failed is not False:
         # It spreads to the error estimate, and fails the step.
-        f = jnp.where(failed, jnp.full_like(f, jnp.nan), f)
+        f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
     tally = tally + (INDEX == 0).astype(np.int32)
     return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart)
 

@@ -83,6 +83,12 @@ class AbstractSystem(eqx.Module):
         """`A = ∂ψ/∂u`."""
 
     @abc.abstractmethod
+    def constraint_force(
+        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "velocity_rows"]
+    ) -> Float[Array, "nu"]:
+        """`Aᵀ λ`, without the matrix."""
+
+    @abc.abstractmethod
     def acceleration_residual(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
     ) -> Float[Array, "velocity_rows"]:

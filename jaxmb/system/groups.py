@@ -104,6 +104,18 @@ class ConstraintGroup(eqx.Module):
         """`dΦ/dt`."""
         return self._map(lambda part, poses, v: self._rate(part, t, poses, v), poses, velocities)
 
+    def wrenches(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        multipliers: Float[Array, "parts rows"],
+    ) -> Float[Array, "parts k v"]:
+        """What the constraints do to their bodies, `Aᵀ λ` body by body."""
+        pull = lambda part, multipliers, poses, v: _pull(lambda w: self._rate(part, t, poses, w), v, multipliers)
+        own = map(self.group.own, (poses, velocities))
+        return jax.vmap(pull)(self.group.part, multipliers, *own)
+
     def acceleration(
         self,
         t: Scalar,
@@ -153,6 +165,18 @@ class VelocityConstraintGroup(eqx.Module):
         single = lambda part, poses, v: jax.jacfwd(lambda w: part.residual(self._space, poses, w, t))(v)
         return self._map(single, poses, velocities)
 
+    def wrenches(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        multipliers: Float[Array, "parts rows"],
+    ) -> Float[Array, "parts k v"]:
+        residual = lambda part, poses: lambda w: part.residual(self._space, poses, w, t)
+        pull = lambda part, multipliers, poses, v: _pull(residual(part, poses), v, multipliers)
+        own = map(self.group.own, (poses, velocities))
+        return jax.vmap(pull)(self.group.part, multipliers, *own)
+
     def acceleration(
         self,
         t: Scalar,
@@ -190,3 +214,7 @@ class ForceGroup(eqx.Module):
             return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
         return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))
+
+
+def _pull(residual, at, multipliers):
+    return jax.vjp(residual, at)[1](multipliers)[0]

@@ -211,6 +211,16 @@ class RigidBodySystem(AbstractSystem):
         blocks = [g.jacobian(t, poses, velocities) for g in groups]
         return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
+    def constraint_force(self, t, q, u, multipliers):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        wrenches, bodies, row = [], [], 0
+        for g in (*self.constraints, *self.velocity_constraints):
+            own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
+            wrenches.append(g.wrenches(t, poses, velocities, own))
+            bodies.append(g.group.body_index)
+            row += own.size
+        return self._add_up(wrenches, bodies, u.dtype)
+
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
         poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
@@ -235,16 +245,20 @@ class RigidBodySystem(AbstractSystem):
 
     def force(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        wrenches = [g.wrenches(t, poses, velocities).reshape(-1) for g in self.forces]
-        groups = [g.group.body_index for g in self.forces]
+        wrenches = [g.wrenches(t, poses, velocities) for g in self.forces]
+        bodies = [g.group.body_index for g in self.forces]
         own = self._own_wrenches(u)
         if own is not None:
-            wrenches.append(own.reshape(-1))
-            groups.append(_all_bodies(self.layout))
+            wrenches.append(own)
+            bodies.append(_all_bodies(self.layout))
+        return self._add_up(wrenches, bodies, u.dtype)
+
+    def _add_up(self, wrenches, bodies, dtype):
+        """The generalized force of wrenches (parts, k, velocity size) on these bodies (parts, k), group by group."""
         if not wrenches:
-            return jnp.zeros_like(u)
-        source = self.layout.force_source(groups)
-        return jnp.sum(_join([*wrenches, jnp.zeros(1, u.dtype)], u.dtype)[source], axis=1)
+            return jnp.zeros(self.nu, dtype)
+        source = self.layout.force_source(bodies)
+        return jnp.sum(_join([*wrenches, jnp.zeros(1, dtype)], dtype)[source], axis=1)
 
     def _own_wrenches(self, u):
         """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.solvers import AbstractManifoldTerm, Adams, MultistepController
+from jaxmb.solvers import AbstractManifoldTerm, Adams, ManifoldEvaluation, MultistepController
 
 _AXES = np.arange(2, dtype=np.int32)
 
@@ -37,6 +37,10 @@ class Circle(AbstractManifoldTerm):
         }
 
     def evaluate(self, t, y, chart, args):
+        return ManifoldEvaluation(y, self.vf(t, y, args), chart, jnp.array(False))
+
+    def restore(self, t, y, near, args):
+        chart = near.chart
         kept = y[chart["free"]]
         room = 1 - kept**2
         failed = room < 0.01
@@ -45,7 +49,7 @@ class Circle(AbstractManifoldTerm):
         y = jnp.where(self._is_free(chart), y, solved)
         if self.fail is not None:
             failed = failed | ((t > 1.0) & (t - chart["at"] > self.fail))
-        return y, self.vf(t, y, args), chart, failed
+        return ManifoldEvaluation(y, self.vf(t, y, args), chart, failed)
 
     def controlled(self, chart):
         return self._is_free(chart)
@@ -167,11 +171,12 @@ def test_jump_on_the_manifold():
 
 
 def test_gradients_through_charts():
-    loss = lambda rate, adjoint: jnp.sum(_solve(Circle(rate), 4.0, adjoint=adjoint).ys[-1] * jnp.array([1.0, 0.5]))
+    end = lambda rate, adjoint: _solve(Circle(rate), 4.0, 1e-10, adjoint=adjoint).ys[-1]
+    loss = lambda rate, adjoint: jnp.sum(end(rate, adjoint) * jnp.array([1.0, 0.5]))
     rate = jnp.array(1.0)
     forward = jax.jit(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
     reverse = jax.jit(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
     angle_rate = 4.0 + 0.5 * (1 - np.cos(4.0))
     x, y = _exact(4.0)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    np.testing.assert_allclose(forward, angle_rate * (-y + 0.5 * x), atol=1e-6)
+    np.testing.assert_allclose(forward, angle_rate * (-y + 0.5 * x), atol=1e-7)

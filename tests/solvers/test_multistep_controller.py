@@ -42,8 +42,8 @@ def test_bad_controllers(arguments, message):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"min_order": 0}, "orders 1 to 12"),
-        ({"max_order": 13}, "orders 1 to 12"),
+        ({"min_order": 0}, "orders 1 to 13"),
+        ({"max_order": 14}, "orders 1 to 13"),
         ({"min_order": 5, "max_order": 4}, "at most `max_order`"),
         ({"rtol": 1e-6}, "both"),
     ],
