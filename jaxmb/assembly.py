@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
@@ -23,6 +22,10 @@ from .system import AbstractSystem, RigidBodySystem
 from .system.coordinates import coordinate_names, prescribe, rate_names
 
 _ITERATIONS = 100
+
+# Newton on the optimality conditions, which start near their solution: size of its last step, and how many at most.
+_REFINED = 1e-10
+_REFINEMENTS = 16
 
 
 def assemble(
@@ -105,29 +108,38 @@ def positions(
     # Where there is none, the equations are replaced by ones with a solution, so that their derivatives stay finite.
     closed = ok
 
-    def optimality(z, inputs):
-        system, t, guess = inputs
-        q, multipliers = z
+    def optimality(z):
+        q, multipliers = z[: system.nq], z[system.nq :]
         residual, pull = jax.vjp(lambda q: system.coordinate_residual(t, q)[rows], q)
         (gradient,) = pull(multipliers)
         balance = (q - guess) / square + jnp.where(fixed, 0.0, gradient)
-        return jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)
+        return jnp.concatenate([jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)])
 
     selected = (jacobian * scale[None, :])[rows]
     multipliers = jnp.linalg.solve(
         selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
     )
-    solution = optx.root_find(
-        optimality,
-        optx.Newton(rtol=1e-10, atol=1e-10),
-        (jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)),
-        (system, t, guess),
-        max_steps=16,
-        throw=False,
-    )
-    refined = solution.value[0]
+    nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
+    refined = lax.custom_root(optimality, nearby, _newton, _tangent_solve)[: system.nq]
     ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined) <= tolerance(q.dtype))
     return jnp.where(ok, refined, q), ok
+
+
+def _newton(residual, x):
+    def correct(carry):
+        x, _, k = carry
+        step = _tangent_solve(lambda v: jax.jvp(residual, (x,), (v,))[1], residual(x))
+        return x - step, jnp.max(jnp.abs(step) / (1.0 + jnp.abs(x))), k + 1
+
+    def proceed(carry):
+        _, size, k = carry
+        return (size > _REFINED) & (k < _REFINEMENTS)
+
+    return lax.while_loop(proceed, correct, (x, jnp.array(jnp.inf, x.dtype), jnp.array(0)))[0]
+
+
+def _tangent_solve(linear, b):
+    return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
 
 
 @eqx.filter_jit

@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, ArrayLike, Float
 
 from ._free import Bounds, FreeParameters, free_parameters
-from ._least_squares import LeastSquares, levenberg_marquardt
+from ._minimise import Minimum, descend, levenberg_marquardt
 from ._names import unknown
 from ._results import RESULTS
 from ._types import Scalar, State, VectorLike
@@ -123,8 +123,8 @@ def identify(
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
         optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
-    - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: change of the residuals' root mean square,
-        absolute and relative, or size of an optax step, at which to stop.
+    - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: change of unknowns and residuals, absolute and
+        relative, or size of an optax step, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
 
     A trial at which the mechanism cannot be assembled or the simulation fails is rejected, and a smaller step is tried.
@@ -154,8 +154,11 @@ def identify(
     _check_start(problem, start)
     kind = "lm" if method == "lm" else "optax"
     limit = _ITERATIONS[kind] if max_iterations is None else max_iterations
-    solve = _levenberg_marquardt if isinstance(method, str) else lambda *args: _descend(method, *args)
-    return _summary(problem, solve(problem, start, tol, limit), known_noise=sigma is not None or residual is not None)
+    if isinstance(method, str):
+        solution = levenberg_marquardt(problem.residuals, start, tol, limit)
+    else:
+        solution = descend(method, problem.residuals, start, tol, limit)
+    return _summary(problem, solution, known_noise=sigma is not None or residual is not None)
 
 
 class _Measured(eqx.Module):
@@ -213,9 +216,13 @@ class _Problem(eqx.Module):
             system, state, t0=self.t0, t1=self.ts[-1], saveat=self.ts, adjoint=adjoint, throw=False, **self.options
         )
 
-    def residuals(
+    def residuals(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Float[Array, "residuals"]:
+        return self.judged(z, adjoint)[0]
+
+    def judged(
         self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None
     ) -> tuple[Float[Array, "residuals"], RESULTS]:
+        """Residuals, infinite if anything failed, and how the simulation ended."""
         trajectory = self.simulate(z, adjoint)
         residuals = self.fit(trajectory)
         ok = (trajectory.result == RESULTS.successful) & jnp.all(jnp.isfinite(residuals))
@@ -315,7 +322,7 @@ def _linearised(problem: _Problem, z: Float[Array, "n"]):
     """Residuals, their Jacobian, and how the simulation ended."""
 
     def fn(z):
-        residuals, result = problem.residuals(z, diffrax.ForwardMode())
+        residuals, result = problem.judged(z, diffrax.ForwardMode())
         return residuals, (residuals, result)
 
     jacobian, (residuals, result) = jax.jacfwd(fn, has_aux=True)(z)
@@ -337,49 +344,8 @@ def _check_start(problem: _Problem, z: Float[Array, "n"]) -> None:
         position += r.size
 
 
-def _levenberg_marquardt(problem: _Problem, z: Float[Array, "n"], tol: float, limit: int) -> LeastSquares:
-    def linearise(z):
-        residuals, jacobian, _ = _linearised(problem, jnp.asarray(z))
-        return np.asarray(residuals), np.asarray(jacobian)
-
-    return levenberg_marquardt(linearise, np.asarray(z), tol=tol, limit=limit, cut=_UNDETERMINED)
-
-
-@eqx.filter_jit
-def _descent_step(problem: _Problem, optimiser: optax.GradientTransformation, z: Float[Array, "n"], memory: Any):
-    def loss(z):
-        residuals, _ = problem.residuals(z, None)
-        return 0.5 * jnp.mean(residuals**2)
-
-    value, gradient = jax.value_and_grad(loss)(z)
-    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
-    with jax.numpy_dtype_promotion("standard"):
-        update = optax.with_extra_args_support(optimiser).update
-        step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=loss)
-    return value, finite, jnp.asarray(step, z.dtype), memory
-
-
-def _descend(
-    optimiser: optax.GradientTransformation, problem: _Problem, z: Float[Array, "n"], tol: float, limit: int
-) -> LeastSquares:
-    """Steps of an optimiser; where the simulation fails, half the step is tried instead."""
-    memory = optimiser.init(z)
-    best, best_value, good = z, np.inf, z
-    for iteration in range(limit):
-        value, finite, step, ahead = _descent_step(problem, optimiser, z, memory)
-        if not bool(finite):
-            z = 0.5 * (good + z)
-            continue
-        if float(value) < best_value:
-            best, best_value = z, float(value)
-        good, memory, z = z, ahead, z + step
-        if float(jnp.max(jnp.abs(step))) <= tol:
-            return LeastSquares(np.asarray(best), iteration + 1, True)
-    return LeastSquares(np.asarray(best), limit, False)
-
-
-def _summary(problem: _Problem, solution: LeastSquares, *, known_noise: bool) -> Identification:
-    z = jnp.asarray(solution.z)
+def _summary(problem: _Problem, solution: Minimum, *, known_noise: bool) -> Identification:
+    z = solution.z
     residuals, jacobian, _ = (np.asarray(x) if eqx.is_array(x) else x for x in _linearised(problem, z))
     free = problem.free
     values = {name: np.asarray(value) for name, value in free(z).items()}

@@ -11,7 +11,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb._free import free_parameters
-from jaxmb._least_squares import levenberg_marquardt
+from jaxmb._minimise import levenberg_marquardt
 from jaxmb.identify import _quantities, _quantity
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
@@ -195,18 +195,24 @@ def test_inertia_matrices_stay_positive_definite():
     assert np.linalg.matrix_rank(jax.jacfwd(free.flat)(jnp.zeros(6))) == 6
 
 
-def test_least_squares_rejects_failed_trials():
-    """Rosenbrock's function from its usual start, undefined beyond a line that full steps cross."""
-    failed = 0
+def test_failed_trials_are_rejected():
+    """A square root near its branch point, on whose far side the iteration tries to land."""
+    trials = []
 
-    def linearise(z):
-        nonlocal failed
-        failed += z[0] > 1.05
-        r = np.array([10 * (z[1] - z[0] ** 2), 1 - z[0]]) if z[0] <= 1.05 else np.full(2, np.inf)
-        return r, np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
+    def residuals(z, adjoint):
+        jax.debug.callback(lambda x: trials.append(float(x)), z[0])
+        there = z[0] > 0
+        root = jnp.sqrt(jnp.where(there, z[0], 1.0))
+        return jnp.where(there, jnp.stack([root - 0.1, 10 * (z[1] - z[0] ** 2)]), jnp.inf)
 
-    solution = levenberg_marquardt(linearise, np.array([-1.2, -3.0]), tol=1e-10, limit=100, cut=1e-12)
+    solution = levenberg_marquardt(residuals, jnp.array([3.0, 1.0]), tol=1e-10, limit=100)
+    jax.effects_barrier()
+    assert min(trials) < 0
     assert solution.success
-    np.testing.assert_allclose(solution.z, [1.0, 1.0], atol=1e-8)
-    stuck = levenberg_marquardt(lambda z: (np.array([z[0] + 2]), np.eye(1)), np.zeros(1), tol=1e-10, limit=1, cut=1e-12)
-    assert not stuck.success
+    np.testing.assert_allclose(solution.z, [1e-2, 1e-4], rtol=1e-8)
+
+
+def test_iterations_are_limited(system, motion):
+    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
+    fit = mb.identify(system, noisy(motion, 0), ts=TS, free=start, sigma=SIGMA, solver=TSIT5, max_iterations=2)
+    assert not fit.success and "did not converge" in str(fit)

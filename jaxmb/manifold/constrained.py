@@ -193,8 +193,10 @@ def _restore_jvp(primals, tangents):
     out = restore(system, t, q, u, near, split, tol)
     # The factor of the other state solved the equations, but only the one of this state differentiates them.
     solved = factor(system.jacobian(t, out.q, out.u), split.velocity, system.velocity_rank)
-    own = solved if split.coordinate is None else coordinate_factor(system, t, out.q, split)
-    dq = _push_positions(system, t, out.q, own, (dsystem, dt, _dense(dq, q)))
+    dq = _dense(dq, q)
+    if system.coordinate_rank > 0:
+        own = solved if split.coordinate is None else coordinate_factor(system, t, out.q, split)
+        dq = _push_positions(system, t, out.q, own, (dsystem, dt, dq))
     at, along = _push_velocities((system, t, out.q, out.u), (dsystem, dt, dq, _dense(du, u)), solved)
     dudot = _push_accelerations(at, along, out.udot, solved)
     return out, Restored(dq, along[3], dudot, None, None)

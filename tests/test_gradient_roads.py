@@ -1,0 +1,131 @@
+"""Gradients along every other road to a motion: solvers, formulations, saved times, events, kinds of constraints.
+
+On small planar scenes with a spring; as in `test_gradients`, forward mode = reverse mode, and both = central
+differences of a tighter solution.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+
+SPRING = planar.SpringDamper(
+    "spring",
+    "ground",
+    "rod",
+    stiffness=30.0,
+    damping=0.3,
+    free_length=0.5,
+    point_a=(0.4, 1.0),
+    point_b=(0.2, 0.1),
+)
+GRAVITY = mb.Gravity((0.0, -9.81))
+
+
+def rod(name="rod", position=(0.5, 0.0)):
+    return planar.Body(name, mass=1.5, inertia=0.2, position=position, velocity=(1.0, 0.0))
+
+
+def pendulum(*joints):
+    """A rod on a pin, with its rate at the start."""
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    system = mb.Scene([rod()], joints=[pin, *joints], forces=[SPRING, GRAVITY]).compile()
+    return system, ["rod.mass", "rod.inertia", "pin.point_b", "spring.stiffness"], {"rod.angle": 0.0}, "rod.angle"
+
+
+def double_pendulum():
+    joints = [
+        planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+        planar.Revolute("knee", "rod", "shank", point_a=(0.5, 0.0), point_b=(-0.5, 0.0)),
+    ]
+    bodies = [rod(), rod("shank", (1.5, 0.0))]
+    system = mb.Scene(bodies, joints=joints, forces=[SPRING, GRAVITY]).compile()
+    fix = {"rod.angle": 0.0, "shank.angle": 0.0}
+    return system, ["rod.mass", "shank.inertia", "knee.point_a", "spring.stiffness"], fix, "rod.angle"
+
+
+def driven_pendulum():
+    """Nothing is free: the driver says where the rod is."""
+    turn = lambda t, p: p["amplitude"] * jnp.sin(p["rate"] * t)
+    drive = planar.Driver(
+        "drive", "ground", "rod", quantity="angle", motion=turn, parameters={"amplitude": 0.7, "rate": 3.0}
+    )
+    system, _, _, _ = pendulum(drive)
+    return system, ["pin.point_b", "drive.amplitude", "drive.rate"], {}, None
+
+
+def steady_particle():
+    """The speed of the mass centre is kept by a constraint that is not linear in it."""
+    speed = lambda poses, velocities, t, p: velocities[0, 0] ** 2 + velocities[0, 1] ** 2 - p["speed"] ** 2
+    pace = mb.VelocityConstraint("pace", "rod", speed, parameters={"speed": 1.2})
+    system = mb.Scene([rod()], joints=[pace], forces=[SPRING, GRAVITY]).compile()
+    return system, ["rod.mass", "rod.inertia", "spring.stiffness", "pace.speed"], {}, "rod.y"
+
+
+def at_the_end(sol):
+    return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]])
+
+
+def at_all_times(sol):
+    return jnp.concatenate([sol.ys.q, sol.ys.u], axis=1).ravel()
+
+
+def when_it_happens(sol):
+    return jnp.concatenate([sol.ts[-1:], sol.ys.q[-1], sol.ys.u[-1]])
+
+
+TIMES = np.array([0.07, 0.2, 0.31, 0.5])
+HANGING = diffrax.Event(lambda t, y, args, **kwargs: y.q[2] + 0.3, optx.Newton(rtol=1e-13, atol=1e-13))
+
+ROADS = {
+    "projection": (double_pendulum, {"solver": diffrax.Dopri8()}, at_the_end),
+    "multipliers": (double_pendulum, {"formulation": mb.formulations.Multipliers()}, at_the_end),
+    "saved times": (double_pendulum, {"saveat": TIMES}, at_all_times),
+    "event": (pendulum, {"event": HANGING}, when_it_happens),
+    "nonlinear in velocity": (steady_particle, {}, at_the_end),
+    "fully driven": (driven_pendulum, {"saveat": TIMES}, at_all_times),
+}
+
+
+def build(road):
+    scene, options, observe = ROADS[road]
+    system, names, fix, rate = scene()
+    start = {name: mb.parameters(system)[name] for name in names}
+    if rate is not None:
+        start["initial rate"] = jnp.array(0.4)
+
+    def loss(values, rtol, adjoint):
+        values = dict(values)
+        rates = {} if rate is None else {rate: values.pop("initial rate")}
+        changed = mb.with_parameters(system, values)
+        state = mb.assemble(changed, fix=fix, rates=rates, throw=False)
+        sol = mb.simulate(changed, state, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False, **options)
+        seen = observe(sol)
+        return jnp.sum(jnp.cos(jnp.arange(seen.size, dtype=float)) * seen)
+
+    return loss, start
+
+
+@pytest.mark.parametrize("road", ROADS)
+def test_forward_reverse_and_central_differences(road):
+    loss, start = build(road)
+    flat, unravel = jax.flatten_util.ravel_pytree(start)
+    run = lambda x, rtol, adjoint: loss(unravel(x), rtol, adjoint)
+    forward = jax.jit(jax.jacfwd(lambda x: run(x, 1e-10, diffrax.ForwardMode())))(flat)
+    reverse = jax.jit(jax.grad(lambda x: run(x, 1e-10, None)))(flat)
+    scale = np.max(np.abs(forward))
+    assert np.all(np.abs(forward) > 1e-6 * scale)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
+
+    h = 1e-4 * np.maximum(np.abs(flat), 1e-2)
+    # Richardson's extrapolation of central differences, so that their own error is below the one tested.
+    steps = np.concatenate([np.diag(k * h) for k in (1.0, -1.0, 2.0, -2.0)])
+    n = len(h)
+    values = np.asarray(jax.jit(jax.vmap(lambda x: run(x, 1e-13, None)))(flat[None, :] + steps))
+    plain, double = (values[:n] - values[n : 2 * n]) / (2 * h), (values[2 * n : 3 * n] - values[3 * n :]) / (4 * h)
+    np.testing.assert_allclose(forward, (4 * plain - double) / 3, rtol=1e-5, atol=1e-7 * scale)
