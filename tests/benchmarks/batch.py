@@ -17,13 +17,15 @@ MEMBERS = 256
 REPEATS = 5
 
 
+MECHANISM = mb.mechanisms.get("four_bar")
+
+
 def crank_angle(length):
     """Angle of the crank after two seconds, and the number of steps."""
-    mechanism = mb.mechanisms.get("four_bar")
     half = jnp.stack([length / 2, jnp.zeros_like(length)])
     values = {"A.point_b": -half, "B.point_a": half, "crank.inertia": length**2 / 12}
-    system = mb.with_parameters(mechanism.system, values)
-    state = mb.assemble(system, mechanism.state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
+    system = mb.with_parameters(MECHANISM.system, values)
+    state = mb.assemble(system, MECHANISM.state, fix=MECHANISM.fix, rates=MECHANISM.rates, throw=False)
     sol = mb.simulate(system, state, t1=2.0, rtol=1e-8, throw=False)
     return sol["crank"].angle[-1], sol.stats["num_steps"]
 
