@@ -138,8 +138,9 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
         """Poses of the bodies and of the ground, as parts take them."""
-        ground = jnp.asarray(self.layout.space.ground, q.dtype)[None]
-        return jax.vmap(self.layout.space.prepare)(jnp.concatenate([self.poses(q), ground]))
+        space = self.layout.space
+        ground = space.prepare(jnp.asarray(space.ground, q.dtype))[None]
+        return jnp.concatenate([jax.vmap(space.prepare)(self.poses(q)), ground])
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
         """Velocities of the bodies and of the ground."""
