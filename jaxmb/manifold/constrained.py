@@ -117,8 +117,11 @@ def restore(
     solved, udot = near.factor, near.udot
     q, iterations, failed = restore_positions(system, t, q, split, tol)
     # Wrong by the distance of the two states, the factor leaves the square and the cube of what there was.
-    for _ in range(1 if system.linear else 2):
-        u = u - solved.correction @ system.velocity_residual(t, q, u)
+    u = u - solved.correction @ system.velocity_residual(t, q, u)
+    if not system.linear:
+        step = solved.correction @ system.velocity_residual(t, q, u)
+        u = u - step
+        failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(u))))
     inertia = system.inertia(t, q)
     multipliers = solved.correction.T @ (inertia.product(udot) - system.force(t, q, u))
     unlevel, unbalance = _equations(system, t, q, u, udot, multipliers)

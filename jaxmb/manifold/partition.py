@@ -43,9 +43,12 @@ class Partition(AbstractManifold):
 
     Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic
     constraints these are two nested charts. Only independent components are integrated; the others satisfy the
-    constraints to Newton's tolerance at every evaluation. The error of a step is measured on all of them. A chart is
-    replaced when its influence matrix H has grown by the factor `max_influence`; history is kept for all components,
-    so that costs no restart.
+    constraints to Newton's tolerance at the end of every step. The error of a step is measured on all of them. A chart
+    is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would serve
+    better than those it keeps; history is kept for all components, so that costs no restart.
+
+    The formulation finds the accelerations of predicted states; at corrected ones they are improved by Newton's method,
+    with the same factor.
 
     **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
     made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its

@@ -91,7 +91,7 @@ def restore(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluat
     `before` is the evaluation of the prediction, at the same time.
     """
     manifold = _manifold(term)
-    if manifold is None:
+    if manifold is None or before.near is None:
         return _evaluate_plain(term, t, flat, like, args)
     out = manifold.restore(t * term.direction, unravel_like(like, flat), before.near, args)
     return _raveled(term, out, flat.dtype)
