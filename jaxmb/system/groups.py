@@ -1,5 +1,6 @@
 """Parts of one type, stacked: one kernel and one `vmap` for all of them, whatever their number."""
 
+import abc
 from collections.abc import Sequence
 from typing import Any
 
@@ -68,14 +69,70 @@ def _anonymous(part: AbstractLink) -> AbstractLink:
     return out
 
 
-class ConstraintGroup(eqx.Module):
-    """Kernels of stacked constraints between positions."""
+class AbstractConstraintGroup(eqx.Module):
+    """Kernels of stacked constraints, from what each says about velocities."""
 
     group: Group
+
+    @abc.abstractmethod
+    def _rate(self, part, t, poses, v) -> Array:
+        """Residuals of one part between the velocities of its bodies, shape (rows,)."""
+
+    @abc.abstractmethod
+    def jacobian(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> Float[Array, "parts rows k v"]:
+        """Derivative with respect to velocities, body by body."""
 
     @property
     def rows(self) -> int:
         return self.group.rows
+
+    def velocity(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> Float[Array, "parts rows"]:
+        """Residuals between velocities."""
+        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), poses, velocities)
+
+    def wrenches(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        multipliers: Float[Array, "parts rows"],
+    ) -> Float[Array, "parts k v"]:
+        """What the constraints do to their bodies, `Aᵀ λ` body by body."""
+
+        def single(part, poses, v, multipliers):
+            return jax.vjp(lambda w: self._rate(part, t, poses, w), v)[1](multipliers)[0]
+
+        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities), multipliers)
+
+    def acceleration(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        accelerations: Float[Array, "b_ground v"],
+    ) -> Float[Array, "parts rows"]:
+        """The time derivative of the residuals between velocities."""
+
+        def single(part, poses, v, a):
+            rate = lambda t, poses, v: self._rate(part, t, poses, v)
+            return jax.jvp(rate, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
+
+        return self._map(single, poses, velocities, accelerations)
+
+    @property
+    def _space(self):
+        return self.group.layout.space
+
+    def _map(self, single, poses, *velocities):
+        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
+
+
+class ConstraintGroup(AbstractConstraintGroup):
+    """Kernels of stacked constraints between positions."""
 
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
         return self._map(lambda part, poses: part.residual(self._space, poses, t), poses)
@@ -98,66 +155,15 @@ class ConstraintGroup(eqx.Module):
 
         return self._map(single, poses)
 
-    def velocity(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts rows"]:
-        """`dΦ/dt`."""
-        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), poses, velocities)
-
-    def wrenches(
-        self,
-        t: Scalar,
-        poses: Float[Array, "b_ground p"],
-        velocities: Float[Array, "b_ground v"],
-        multipliers: Float[Array, "parts rows"],
-    ) -> Float[Array, "parts k v"]:
-        """What the constraints do to their bodies, `Aᵀ λ` body by body."""
-        pull = lambda part, multipliers, poses, v: _pull(lambda w: self._rate(part, t, poses, w), v, multipliers)
-        own = map(self.group.own, (poses, velocities))
-        return jax.vmap(pull)(self.group.part, multipliers, *own)
-
-    def acceleration(
-        self,
-        t: Scalar,
-        poses: Float[Array, "b_ground p"],
-        velocities: Float[Array, "b_ground v"],
-        accelerations: Float[Array, "b_ground v"],
-    ) -> Float[Array, "parts rows"]:
-        """`d²Φ/dt²`."""
-
-        def single(part, poses, v, a):
-            rate = lambda t, poses, v: self._rate(part, t, poses, v)
-            return jax.jvp(rate, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
-
-        return self._map(single, poses, velocities, accelerations)
-
-    @property
-    def _space(self):
-        return self.group.layout.space
-
     def _rate(self, part, t, poses, v):
         rates = self.group.rates(poses, v)
         if part.rheonomic:
             return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
         return jax.jvp(lambda x: part.residual(self._space, x, t), (poses,), (rates,))[1]
 
-    def _map(self, single, poses, *velocities):
-        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
 
-
-class VelocityConstraintGroup(eqx.Module):
+class VelocityConstraintGroup(AbstractConstraintGroup):
     """Kernels of stacked constraints between velocities."""
-
-    group: Group
-
-    @property
-    def rows(self) -> int:
-        return self.group.rows
-
-    def velocity(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts rows"]:
-        return self._map(lambda part, poses, v: part.residual(self._space, poses, v, t), poses, velocities)
 
     def jacobian(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
@@ -165,37 +171,8 @@ class VelocityConstraintGroup(eqx.Module):
         single = lambda part, poses, v: jax.jacfwd(lambda w: part.residual(self._space, poses, w, t))(v)
         return self._map(single, poses, velocities)
 
-    def wrenches(
-        self,
-        t: Scalar,
-        poses: Float[Array, "b_ground p"],
-        velocities: Float[Array, "b_ground v"],
-        multipliers: Float[Array, "parts rows"],
-    ) -> Float[Array, "parts k v"]:
-        residual = lambda part, poses: lambda w: part.residual(self._space, poses, w, t)
-        pull = lambda part, multipliers, poses, v: _pull(residual(part, poses), v, multipliers)
-        own = map(self.group.own, (poses, velocities))
-        return jax.vmap(pull)(self.group.part, multipliers, *own)
-
-    def acceleration(
-        self,
-        t: Scalar,
-        poses: Float[Array, "b_ground p"],
-        velocities: Float[Array, "b_ground v"],
-        accelerations: Float[Array, "b_ground v"],
-    ) -> Float[Array, "parts rows"]:
-        def single(part, poses, v, a):
-            residual = lambda t, poses, v: part.residual(self._space, poses, v, t)
-            return jax.jvp(residual, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
-
-        return self._map(single, poses, velocities, accelerations)
-
-    @property
-    def _space(self):
-        return self.group.layout.space
-
-    def _map(self, single, poses, *velocities):
-        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
+    def _rate(self, part, t, poses, v):
+        return part.residual(self._space, poses, v, t)
 
 
 class ForceGroup(eqx.Module):
@@ -214,7 +191,3 @@ class ForceGroup(eqx.Module):
             return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
         return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))
-
-
-def _pull(residual, at, multipliers):
-    return jax.vjp(residual, at)[1](multipliers)[0]
