@@ -19,7 +19,7 @@ from .formulations import AbstractFormulation, Multipliers, Partitioned
 from .formulations._base import stages
 from .manifold import AbstractManifold, Free, Partition, Projection, project
 from .manifold.partition import Chart
-from .solvers import Adams, MultistepController
+from .solvers import AbstractMultistep, Adams, AdamsState, HermiteState, MultistepController
 from .system import AbstractSystem
 from .trajectory import Trajectory
 
@@ -63,13 +63,13 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; any diffrax Runge–Kutta solver.
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
         `Multipliers()`, which needs no search for pivots.
-    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams`, `Projection()` for
-        others, and nothing of either for a system without constraints.
+    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
+        `Projection()` for others, and nothing of either for a system without constraints.
     - `dt0`: first step [s], default chosen from the motion.
-    - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams`.
+    - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
         them computed twice. For few parameters forward mode is faster and needs no memory: `jax.jacfwd` with
         `adjoint=diffrax.ForwardMode()`.
@@ -98,11 +98,12 @@ def simulate(
     times = number(t0), number(t1), None if dt0 is None else number(dt0)
     solver = Adams() if solver is None else solver
     if manifold is None:
-        manifold = Free() if system.velocity_rows == 0 else Partition() if isinstance(solver, Adams) else Projection()
+        constrained = Partition() if isinstance(solver, AbstractMultistep) else Projection()
+        manifold = Free() if system.velocity_rows == 0 else constrained
     if formulation is None:
         formulation = Partitioned() if isinstance(manifold, Partition) else Multipliers()
     if stepsize_controller is None:
-        controller = MultistepController if isinstance(solver, Adams) else diffrax.PIDController
+        controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=rtol, atol=atol)
     if adjoint is None:
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
@@ -254,10 +255,13 @@ def _chart(solution) -> Any:
 
 def _statistics(solution) -> dict[str, Array]:
     stats = dict(solution.stats)
-    tally = getattr(solution.solver_state, "tally", None)
-    if tally is not None:
-        stats["num_evaluations"] = tally[0] + 2 * stats["num_steps"]
-        stats["orders"] = tally[1:]
+    state = solution.solver_state
+    if isinstance(state, AdamsState):
+        stats["num_evaluations"] = state.tally[0] + 2 * stats["num_steps"]
+        stats["orders"] = state.tally[1:]
+    if isinstance(state, HermiteState):
+        stats["num_evaluations"], stats["num_matrices"] = state.work
+        stats["points"] = state.tally[1:]
     chart = _chart(solution)
     if isinstance(chart, Chart):
         stats["newton_iterations"] = chart.newton

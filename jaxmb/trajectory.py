@@ -53,9 +53,8 @@ class Reactions(Mapping[str, Reaction]):
         names = joint_names(self._trajectory.system)
         if name not in names:
             raise unknown("joint", name, names)
-        system = self._trajectory.system
-        solve = lambda t, y, multipliers: reaction(system, name, t, y, multipliers)
-        return jax.vmap(solve)(self._trajectory.ts, self._trajectory.ys, self._trajectory.multipliers)
+        trajectory = self._trajectory
+        return _reactions(trajectory.system, name, trajectory.ts, trajectory.ys, trajectory.multipliers)
 
     def __iter__(self) -> Iterator[str]:
         return iter(joint_names(self._trajectory.system))
@@ -101,23 +100,21 @@ class Trajectory(eqx.Module):
         if interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
         t = jnp.asarray(t, self.ys_dtype)
-        single = lambda t: self._restored(t, interpolation.evaluate(t))
-        out = jax.vmap(single)(t.reshape(-1))
+        out = _between(self.system, interpolation, t.reshape(-1))
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
-
-    def _restored(self, t, y):
-        return project(self.system, t, State(self.system.normalize(y.q), y.u))
 
     @property
     def ys_dtype(self):
         return self.system.guess.q.dtype
 
     @property
+    @eqx.filter_jit
     def kinetic_energy(self) -> Float[Array, "times"]:
         """Kinetic energy [J]."""
         return jax.vmap(lambda t, y: self.system.kinetic_energy(t, y.q, y.u))(self.ts, self.ys)
 
     @property
+    @eqx.filter_jit
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
         return jax.vmap(lambda t, y: self.system.potential_energy(t, y.q))(self.ts, self.ys)
@@ -128,11 +125,13 @@ class Trajectory(eqx.Module):
         return self.kinetic_energy + self.potential_energy
 
     @property
+    @eqx.filter_jit
     def linear_momentum(self) -> Float[Array, "times d"]:
         """`Σ m v` [kg m/s], world axes."""
         return jax.vmap(lambda y: self.system.linear_momentum(y.q, y.u))(self.ys)
 
     @property
+    @eqx.filter_jit
     def angular_momentum(self) -> Float[Array, "times *d"]:
         """Moment of momentum about the world origin [kg m²/s]."""
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
@@ -148,6 +147,7 @@ class Trajectory(eqx.Module):
         return self._solved[1]
 
     @property
+    @eqx.filter_jit
     def _solved(self):
         return jax.vmap(lambda t, y: accelerations(self.system, self.formulation, t, y.q, y.u))(self.ts, self.ys)
 
@@ -157,6 +157,7 @@ class Trajectory(eqx.Module):
         return Reactions(self)
 
     @property
+    @eqx.filter_jit
     def constraint_violation(self) -> ConstraintViolation:
         """Largest scaled residuals of position and velocity constraints at every saved time."""
 
@@ -194,6 +195,20 @@ class Trajectory(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`."""
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
+
+
+@eqx.filter_jit
+def _reactions(system, name, ts, ys, multipliers):
+    return jax.vmap(lambda t, y, own: reaction(system, name, t, y, own))(ts, ys, multipliers)
+
+
+@eqx.filter_jit
+def _between(system, interpolation, ts):
+    def single(t):
+        y = interpolation.evaluate(t)
+        return project(system, t, State(system.normalize(y.q), y.u))
+
+    return jax.vmap(single)(ts)
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:

@@ -84,11 +84,14 @@ HANGING = diffrax.Event(lambda t, y, args, **kwargs: y.q[2] + 0.3, optx.Newton(r
 
 ROADS = {
     "projection": (double_pendulum, {"solver": diffrax.Dopri8()}, at_the_end),
-    "multipliers": (double_pendulum, {"formulation": mb.formulations.Multipliers()}, at_the_end),
-    "saved times": (double_pendulum, {"saveat": TIMES}, at_all_times),
+    "multipliers, saved times": (
+        double_pendulum,
+        {"formulation": mb.formulations.Multipliers(), "saveat": TIMES},
+        at_all_times,
+    ),
     "event": (pendulum, {"event": HANGING}, when_it_happens),
     "nonlinear in velocity": (steady_particle, {}, at_the_end),
-    "fully driven": (driven_pendulum, {"saveat": TIMES}, at_all_times),
+    "fully driven": (driven_pendulum, {}, at_the_end),
 }
 
 

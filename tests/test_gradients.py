@@ -97,25 +97,32 @@ def test_forward_reverse_and_central_differences(name):
     observe, start = build(name)
     flat, unravel = jax.flatten_util.ravel_pytree(start)
     loss = lambda x, rtol, adjoint: observe(unravel(x), rtol, adjoint)
-    forward = jax.jit(jax.jacfwd(lambda x: loss(x, 1e-9, diffrax.ForwardMode())))(flat)
+    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    # One program for derivatives and, at a tighter tolerance, for differences.
+    derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
+    forward, _ = derivatives_and_value(flat, 1e-9)
     reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-9, None)))(flat)
     scale = np.max(np.abs(forward))
-    assert np.all(np.isfinite(forward))
+    # Not zeros, but for the few that symmetry makes so.
+    assert np.all(np.isfinite(forward)) and np.mean(np.abs(forward) > 1e-8 * scale) > 0.5
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
 
-    tight = jax.jit(jax.vmap(lambda x: loss(x, 1e-12, None)))
     h = 1e-4 * np.maximum(np.abs(flat), 1e-2)
+    value = lambda k: np.array([derivatives_and_value(flat + k * step, 1e-12)[1] for step in np.diag(h)])
+    plain, double = (value(1.0) - value(-1.0)) / (2 * h), (value(2.0) - value(-2.0)) / (4 * h)
     # Richardson's extrapolation of central differences, so that their own error is below the one tested.
-    steps = np.concatenate([np.diag(k * h) for k in (1.0, -1.0, 2.0, -2.0)])
-    n = len(h)
-    values = np.asarray(tight(flat[None, :] + steps))
-    plain, double = (values[:n] - values[n : 2 * n]) / (2 * h), (values[2 * n : 3 * n] - values[3 * n :]) / (4 * h)
-    central = (4 * plain - double) / 3
-    np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-7 * scale)
+    np.testing.assert_allclose(forward, (4 * plain - double) / 3, rtol=1e-5, atol=1e-7 * scale)
 
 
-def test_every_parameter_is_felt():
-    """The gradients compared above are not all zeros."""
+def test_gradients_in_a_batch():
     observe, start = build("four_bar")
-    gradient = jax.grad(lambda p: observe(p, 1e-6, None))(start)
-    assert all(np.all(np.abs(v) > 1e-8) for k, v in gradient.items() if k != "spring.point_b")
+    flat, unravel = jax.flatten_util.ravel_pytree(start)
+    loss = lambda x, rtol: observe(unravel(x), rtol, None)
+    values_and_gradients = jax.jit(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None)))
+    direction = np.cos(np.arange(flat.size)) * np.abs(flat)
+    steps = 1e-4 * np.array([0.0, 1.0, -1.0, 2.0, -2.0])
+    batch = flat[None, :] + steps[:, None] * direction[None, :]
+    slope = values_and_gradients(batch, 1e-9)[1] @ direction
+    values = values_and_gradients(batch, 1e-12)[0]
+    central = (8 * (values[1] - values[2]) - (values[3] - values[4])) / 12e-4
+    np.testing.assert_allclose(slope[0], central, rtol=1e-6)

@@ -5,7 +5,6 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 """
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,8 @@ from .._types import State
 from ..elimination import factor, full_pivot
 from ..formulations import AbstractFormulation
 from ..formulations._base import stages
-from ..solvers import AbstractManifoldTerm, Adams, ManifoldEvaluation
+from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
 from ._base import AbstractManifold
 from .constrained import Evaluation, Split, correct_positions, evaluate, restore, restore_positions, shared
@@ -64,9 +64,9 @@ class Partition(AbstractManifold):
             raise ValueError(f"Partition: max_influence must be above 1, got {self.max_influence}.")
 
     def prepare(self, system, formulation, solver, rtol):
-        if not isinstance(solver, Adams):
+        if not isinstance(solver, AbstractMultistep):
             raise ValueError(
-                f"Partition needs a solver that knows charts (Adams), got {type(solver).__name__}; use "
+                f"Partition needs a solver that knows charts (Adams or Hermite), got {type(solver).__name__}; use "
                 "manifold=Projection() with it."
             )
         least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
@@ -173,6 +173,12 @@ class PartitionTerm(AbstractManifoldTerm):
         del chart
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
+    def free(self, chart):
+        system, velocity = self.system, chart.split.velocity
+        coordinate = velocity if chart.split.coordinate is None else chart.split.coordinate
+        independent = coordinate.columns[system.coordinate_rank :]
+        return jnp.concatenate([independent, system.nq + velocity.columns[system.velocity_rank :]])
+
     def update_chart(self, t, y, chart, args):
         system, y, chart = lax.stop_gradient((self.system, y, chart))
         if chart.split.coordinate is not None and system.coordinate_rank > 0:
@@ -184,14 +190,14 @@ class PartitionTerm(AbstractManifoldTerm):
                 return Chart(split, quality, chart.fresh, chart.counters.at[0].set(0))
 
             keep = lambda chart: Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1))
-            chart = _any_lane(stale, refresh, keep, chart)
+            chart = cond_of_any_lane(stale, refresh, keep, chart)
 
         def renew(chart):
             split, fresh, singular = _choose(system, t, y)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
             return Chart(split, fresh, fresh, counters)
 
-        return _any_lane(self._worse(chart), renew, lambda chart: chart, chart)
+        return cond_of_any_lane(self._worse(chart), renew, lambda chart: chart, chart)
 
     def _worse(self, chart):
         bounds = np.array([self.max_influence, _ROW_GROWTH])[: chart.fresh.size]
@@ -231,9 +237,3 @@ def _quality(system, solved, scale, order, rank):
     if system.velocity_rank < system.velocity_rows:
         largest.append(jnp.max(jnp.abs(solved.correction) / scale[:, None], initial=0.0))
     return jnp.stack(largest)
-
-
-def _any_lane(pred, true_fn, false_fn, operand):
-    """`lax.cond` that stays a branch under `vmap`: taken if any lane wants it, kept only by those that do."""
-    new = lax.cond(eqxi.unvmap_any(pred), true_fn, false_fn, operand)
-    return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))

@@ -8,6 +8,7 @@ from .andrews import andrews as andrews
 from .bricard import bricard as bricard
 from .car_axis import car_axis as car_axis
 from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
+from .flyball import flyball as flyball
 from .four_bar import four_bar as four_bar
 from .free_body import free_body as free_body
 from .heavy_top import heavy_top as heavy_top
@@ -19,6 +20,7 @@ from .rolling_disk import rolling_disk as rolling_disk
 from .slider_crank import slider_crank as slider_crank
 from .spatial_loop import spatial_loop as spatial_loop
 from .spatial_slider_crank import spatial_slider_crank as spatial_slider_crank
+from .stiff_four_bar import stiff_four_bar as stiff_four_bar
 
 _LIBRARY = {
     function.__name__: function
@@ -26,6 +28,7 @@ _LIBRARY = {
         pendulum,
         rod_chain,
         four_bar,
+        stiff_four_bar,
         slider_crank,
         parallelogram,
         andrews,
@@ -37,6 +40,7 @@ _LIBRARY = {
         spatial_slider_crank,
         spatial_loop,
         bricard,
+        flyball,
         rolling_disk,
     )
 }

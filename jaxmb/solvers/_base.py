@@ -10,7 +10,7 @@ import abc
 from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 Chart: TypeAlias = PyTree[Array]
 Y: TypeAlias = PyTree[Array]
@@ -62,6 +62,10 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
         """A mask with the structure of `y`: true for the components that the local error is measured on."""
+
+    @abc.abstractmethod
+    def free(self, chart: Chart) -> Int[Array, " free"]:
+        """Indices of the independent components in the raveled state; their number never changes."""
 
     @abc.abstractmethod
     def update_chart(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:

@@ -7,6 +7,7 @@ respect to that time. States are raveled: one vector of all components.
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around terms, but does not export them
@@ -67,13 +68,13 @@ def derivative(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
 def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None:
     """A chart at `y`, or `None` for a plain vector field."""
     manifold = _manifold(term)
-    return None if manifold is None else _freeze(manifold.init_chart(t * term.direction, y, args))
+    return None if manifold is None else freeze(manifold.init_chart(t * term.direction, y, args))
 
 
 def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
     """The same chart, or a better one at `y`; `None` for a plain vector field."""
     manifold = _manifold(term)
-    return None if manifold is None else _freeze(manifold.update_chart(t * term.direction, y, chart, args))
+    return None if manifold is None else freeze(manifold.update_chart(t * term.direction, y, chart, args))
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
@@ -97,13 +98,40 @@ def restore(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluat
     return _raveled(term, out, flat.dtype)
 
 
+def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: Args) -> Any:
+    """`(t, y) -> ((y on the manifold, f), (chart, failed))` for raveled states, a pytree."""
+    manifold = _manifold(term)
+    flat = ravel(like)
+
+    def plain(t, flat):
+        f = derivative(term, t, unravel_like(like, flat), args)
+        return (flat, ravel(f, flat.dtype)), (None, jnp.array(False))
+
+    def constrained(t, flat):
+        assert manifold is not None
+        y = unravel_like(like, flat)
+        # Its derivative is that of the restored state; where that was found from does not matter.
+        frozen = jax.tree.map(_stop, (manifold, t * term.direction, y, args))
+        near = frozen[0].evaluate(frozen[1], frozen[2], chart, frozen[3])
+        out = _raveled(term, manifold.restore(t * term.direction, y, near, args), flat.dtype)
+        return (out.y, out.f), (out.chart, out.failed | near.failed)
+
+    return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)
+
+
+def free_components(term: Any, flat: Array, chart: Chart | None) -> Array:
+    """Indices of the components that are integrated."""
+    manifold = _manifold(term)
+    return jnp.arange(flat.size) if manifold is None else manifold.free(chart)
+
+
 def _evaluate_plain(term, t, flat, like, args):
     f = derivative(term, t, unravel_like(like, flat), args)
     return Evaluation(flat, ravel(f, flat.dtype), None, False, None)
 
 
 def _raveled(term, out: ManifoldEvaluation, dtype):
-    chart, factors = _freeze((out.chart, out.factors))
+    chart, factors = freeze((out.chart, out.factors))
     f = ravel(out.f, dtype) * jnp.asarray(term.direction).astype(dtype)
     return Evaluation(ravel(out.y, dtype), f, chart, out.failed, out._replace(chart=chart, factors=factors))
 
@@ -118,6 +146,11 @@ def _manifold(term: Any) -> AbstractManifoldTerm | None:
     return term.term if isinstance(term.term, AbstractManifoldTerm) else None
 
 
-def _freeze(tree):
+def freeze(tree: Any) -> Any:
+    """The same numbers, without derivatives."""
     # Index sets and factors steer how the constraints are solved; the solution does not depend on them.
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, tree)
+    return jax.tree.map(_stop, tree)
+
+
+def _stop(x):
+    return jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x

@@ -21,10 +21,8 @@ HIGHEST_ORDER = 13
 LENGTH = HIGHEST_ORDER + 1
 
 # Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, that of the highest basis polynomial.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
-# Selects, for basis polynomial i, the factors j < i.
-_FACTORS_OF = np.tril(np.ones((LENGTH, HIGHEST_ORDER), dtype=bool), -1)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(7)
+NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 INDEX = np.arange(LENGTH, dtype=np.int32)
 _SUM_BEFORE = np.tril(np.ones((LENGTH + 1, LENGTH)), -1)
 
@@ -67,11 +65,19 @@ def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
     return History(differences, mesh, jnp.asarray(1, jnp.int32))
 
 
+def spans(mesh: Float[Array, " length"]) -> Float[Array, " length-1"]:
+    """What the factors of the basis are divided by. Where the latest point is double, its own span is the next one."""
+    out = mesh[0] - mesh[1:]
+    return jnp.where(out > 0, out, jnp.append(out[1:], out[-1:]))
+
+
 def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Array, "length points"]:
     """The Newton basis of a mesh at some times."""
-    factors = (t[None, :] - mesh[:-1, None]) / (mesh[0] - mesh[1:])[:, None]
+    length = mesh.shape[0]
+    factors = (t[None, :] - mesh[:-1, None]) / spans(mesh)[:, None]
     # A product over a mask: XLA makes one kernel of it, where a cumulative product becomes a dozen.
-    return jnp.prod(jnp.where(_FACTORS_OF[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
+    factors_of = np.tril(np.ones((length, length - 1), dtype=bool), -1)
+    return jnp.prod(jnp.where(factors_of[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
 
 
 def basis_means(
@@ -79,10 +85,15 @@ def basis_means(
 ) -> tuple[Float[Array, " length"], Float[Array, " length"]]:
     """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
     dtype = mesh.dtype
-    table = basis(mesh, a + (b - a) * jnp.asarray(np.append(_NODES, 1.0), dtype))
+    table = basis(mesh, a + (b - a) * jnp.asarray(np.append(NODES, 1.0), dtype))
     # Written out: in a batch XLA's sum over so short an axis is ten times as dear.
-    means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(_WEIGHTS))
+    means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(WEIGHTS))
     return jnp.asarray(means), table[:, -1]
+
+
+def before_each(length: int) -> np.ndarray:
+    """Square matrix that sums, for each index, over those before it."""
+    return np.tril(np.ones((length, length)), -1)
 
 
 def step_end(history: History, t: Any) -> Any:
@@ -91,8 +102,8 @@ def step_end(history: History, t: Any) -> Any:
     Such steps are made, and thrown away, by members of a batch that are done before the others. Without a length they
     would divide by zero, and spoil reverse-mode derivatives.
     """
-    latest, previous = history.mesh[0], history.mesh[1]
-    return jnp.where(t > latest, t, latest + (latest - previous))
+    latest = history.mesh[0]
+    return jnp.where(t > latest, t, latest + spans(history.mesh)[0])
 
 
 def extrapolate(history: History, t: Any) -> Extrapolation:
@@ -104,13 +115,14 @@ def extrapolate(history: History, t: Any) -> Extrapolation:
     return Extrapolation(values, means, partial_sums)
 
 
-def advance(history: History, t: Any, f: Float[Array, " n"], partial_sums: Float[Array, "length+1 n"]) -> History:
-    """The history with one mesh point more."""
+def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float[Array, "length n"]) -> History:
+    """The history with one mesh point more; `partial_sums` are the polynomials of all orders, evaluated there."""
     # Rows that would mix in the placeholders are kept at zero: they are never used, but would grow without bound.
-    known = history.points >= INDEX
-    zero = jnp.zeros((), f.dtype)
+    length = history.mesh.shape[0]
+    known = history.points >= np.arange(length, dtype=np.int32)
+    zero = jnp.zeros((), z.dtype)
     return History(
-        differences=jnp.where(known[:, None], f[None] - partial_sums[:-1], zero),
+        differences=jnp.where(known[:, None], z[None] - partial_sums, zero),
         mesh=jnp.concatenate([t[None], history.mesh[:-1]]),
-        points=jnp.minimum(history.points + 1, LENGTH),
+        points=jnp.minimum(history.points + 1, length).astype(np.int32),
     )

@@ -1,5 +1,6 @@
 """Dense output of a multistep method."""
 
+import abc
 from typing import Any
 
 import diffrax
@@ -7,16 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ._evaluation import ravel, unravel_like
-from ._history import basis_means
+from ._history import basis, basis_means, spans
 
 
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
-    """The integral of the polynomial through the derivative at the end of a step and at `order` mesh points before it.
-
-    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the
-    step began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
-    differentiable from step to step, and its derivative at mesh points is the vector field.
-    """
+    """A polynomial through what a method remembers, in Newton's form on its mesh, of the `order` used in a step."""
 
     t0: Any
     t1: Any
@@ -32,12 +28,33 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
             return unravel_like(self.y1, ravel(self.y1) + self._since_end(t0))
         return unravel_like(self.y1, self._since_end(t1) - self._since_end(t0))
 
+    @abc.abstractmethod
+    def _since_end(self, t: Any) -> Float[Array, " n"]:
+        """The solution at `t` minus that at the end of the step."""
+
+
+class RateInterpolation(MultistepInterpolation):
+    """The integral of a polynomial through the derivatives at the end of a step and before.
+
+    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the
+    step began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
+    differentiable from step to step, and its derivative at mesh points is the vector field.
+    """
+
     def _since_end(self, t: Any) -> Float[Array, " n"]:
         dtype = self.mismatch.dtype
         end = self.mesh[0]
         elapsed = jnp.asarray(t, end.dtype) - end
         means, _ = basis_means(self.mesh, end, end + elapsed)
-        back = (elapsed / (self.mesh[1] - end)).astype(dtype)
+        back = -(elapsed / spans(self.mesh)[0]).astype(dtype)
         return (
             elapsed.astype(dtype) * (means.astype(dtype) @ self.differences) + back**2 * (3 - 2 * back) * self.mismatch
         )
+
+
+class StateInterpolation(MultistepInterpolation):
+    """A polynomial through the states at the end of a step and before, with its slope at the end."""
+
+    def _since_end(self, t: Any) -> Float[Array, " n"]:
+        values = basis(self.mesh, jnp.asarray(t, self.mesh.dtype)[None])[:, 0]
+        return values[1:].astype(self.mismatch.dtype) @ self.differences[1:]

@@ -1,12 +1,12 @@
 """The choice of order and step size from the error estimates of neighbouring orders."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
-
-from ._history import LENGTH
+from jaxtyping import Array, Bool, Float, Int
 
 # The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
 # orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
@@ -16,14 +16,7 @@ _TARGET = 0.2
 # How the step of the order below, and of the order above, counts against that of the present order.
 _LOWER, _UPPER = 0.98, 0.95
 # How much of the deviation from the target the next step is to make up for.
-_GAIN = 0.85
-
-
-def _responses() -> np.ndarray:
-    # The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
-    # 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
-    orders = np.arange(1, LENGTH)
-    return np.append(1.0, _GAIN * (orders + 1) / (1 + np.cumsum(1 / orders)))
+GAIN = 0.85
 
 
 class StepEstimate(eqx.Module):
@@ -35,46 +28,54 @@ class StepEstimate(eqx.Module):
     - `growth`: the factor by which steps may grow, all of them, with the order that the solver has chosen for the next.
     - `retry`: the same for the order just used; zero if there is no usable estimate.
     - `response`: the power of these factors by which to change the next step, when those before are what they are.
+    - `limit`: the largest factor by which the next step may grow.
     """
 
     error: Float[Array, ""]
     growth: Float[Array, ""]
     retry: Float[Array, ""]
     response: Float[Array, ""]
+    limit: Float[Array, ""]
 
 
 def choose_order(
-    errors: Float[Array, "3"], order: Int[Array, ""], points: Int[Array, ""], min_order: int, max_order: int
+    errors: Float[Array, "3"],
+    powers: Float[Array, "3"],
+    response: Float[Array, ""],
+    *,
+    may_fall: Bool[Array, ""],
+    may_rise: Bool[Array, ""],
+    known: Bool[Array, ""],
+    limit: Any = np.inf,
 ) -> tuple[Int[Array, ""], StepEstimate]:
-    """Choose among the orders `k - 1`, `k`, `k + 1` the one that allows the longest next step.
+    """Choose, among the present formula and its neighbours in order, the one that allows the longest next step.
 
     **Arguments:**
 
-    - `errors`: weighted norms of the local errors that the three orders would have made in the step. Infinite or not a
-        number if the step went wrong. Those of orders out of bounds are ignored.
-    - `order`: the order `k` of the step.
-    - `points`: the number of mesh points the step was built on, at least `k`. An estimate for order `k + 1` needs one
-        more than `k`.
-    - `min_order`, `max_order`: bounds of the order. Starting from order one, `min_order` is approached step by step.
+    - `errors`: weighted norms of the local errors that the lower, the present and the higher formula would have made in
+        the step. Infinite or not a number if the step went wrong. Those of formulas that are not allowed are ignored.
+    - `powers`: of the steps that these errors fall with.
+    - `response`: as in `StepEstimate`.
+    - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
+    - `known`: whether there are points enough for the error of the higher formula.
+    - `limit`: as in `StepEstimate`.
 
-    **Returns:** `(order of the next step, StepEstimate)`.
+    **Returns:** `(-1, 0 or 1, StepEstimate)`.
     """
     errors = lax.stop_gradient(errors)
     dtype = errors.dtype
     errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, dtype))
-    # A method of order k has a local error of h^(k+1).
-    exponents = 1 / (order[None] + np.arange(3, dtype=np.int32)).astype(dtype)
-    factors = (_TARGET / jnp.maximum(errors, jnp.finfo(dtype).tiny)) ** exponents
+    factors = (_TARGET / jnp.maximum(errors, jnp.finfo(dtype).tiny)) ** (1 / powers.astype(dtype))
     zero = jnp.zeros((), dtype)
-    raisable = order < max_order
-    lower = jnp.where(order > min_order, _LOWER * factors[0], zero)
+    lower = jnp.where(may_fall, _LOWER * factors[0], zero)
     same = factors[1]
-    higher = jnp.where(raisable & (order < points), _UPPER * factors[2], zero)
+    higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
     # With every point since the start in use there is no estimate for the next order, but it is better as a rule.
-    opening = raisable & (order == points) & (lower <= same)
+    opening = may_rise & ~known & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))
     fall = ~rise & (lower > same)
-    next_order = order + rise.astype(order.dtype) - fall.astype(order.dtype)
     growth = jnp.maximum(jnp.maximum(lower, higher), same)
-    response = jnp.asarray(_responses(), dtype)[order]
-    return next_order, StepEstimate(error=errors[1], growth=growth, retry=same, response=response)
+    change = rise.astype(jnp.int32) - fall.astype(jnp.int32)
+    return change, StepEstimate(
+        error=errors[1], growth=growth, retry=same, response=response.astype(dtype), limit=jnp.asarray(limit, dtype)
+    )

@@ -5,8 +5,6 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -15,10 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Args, Chart, Y
 from ._evaluation import (
-    check_real,
-    check_term,
     controlled_components,
-    derivative,
     evaluate,
     first_chart,
     next_chart,
@@ -27,12 +22,15 @@ from ._evaluation import (
     unravel_like,
 )
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start, step_end
-from ._interpolation import MultistepInterpolation
-from ._order import StepEstimate, choose_order
+from ._interpolation import RateInterpolation
+from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
+from ._order import GAIN, StepEstimate, choose_order
 from ._tolerances import Tolerances, norm_of
 
-# A step whose constraints were not solved; it only counts if the steps are fixed, otherwise its error is infinite.
-_FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+# The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
+# 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
+_ORDERS = np.arange(1, LENGTH)
+_RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
 
 class AdamsState(eqx.Module):
@@ -54,7 +52,7 @@ class AdamsState(eqx.Module):
     chart: Chart | None
 
 
-class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptiveSolver[AdamsState]):
+class Adams(AbstractMultistep):
     r"""Adams' method of variable order (1 to 13) and variable step, for non-stiff problems.
 
     Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order $k$ predicts with the
@@ -94,7 +92,7 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
     max_order: int = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., MultistepInterpolation]] = MultistepInterpolation
+    interpolation_cls: ClassVar[Callable[..., RateInterpolation]] = RateInterpolation
 
     def __init__(
         self,
@@ -119,37 +117,16 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
                 f"`Adams` has the orders 1 to {HIGHEST_ORDER}, and `min_order` is at most `max_order`; got "
                 f"`min_order={min_order}` and `max_order={max_order}`."
             )
-        if (rtol is None) != (atol is None):
-            raise ValueError(
-                f"`Adams` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
-            )
-        if rtol is None:
-            self.tolerances = diffrax.with_stepsize_controller_tols(Tolerances)()  # pyright: ignore[reportArgumentType]
-        else:
-            self.tolerances = Tolerances(rtol, atol, norm, fixed=True)
+        self.tolerances = tolerances_of("Adams", rtol, atol, norm)
         self.min_order = min_order
         self.max_order = max_order
-
-    # The place from which diffrax fills in the tolerances of a step size controller. There is no root to find.
-    @property
-    def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.tolerances
-
-    @property
-    def root_find_max_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return 0
 
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
         del terms
         return self.max_order + 1
 
-    def func(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, y0: Y, args: Args) -> Y:
-        return derivative(terms, t0, y0, args)
-
     def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> AdamsState:
-        self.tolerances.check("Adams")
-        check_term(terms)
-        check_real(y0)
+        self._check(terms, y0)
         chart = first_chart(terms, t0, y0, args)
         return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32))
 
@@ -163,9 +140,12 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
         solver_state: AdamsState,
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], AdamsState, diffrax.RESULTS]:
-        if made_jump is not False:
-            solver_state = _restart(terms, t0, t1, y0, args, solver_state, made_jump)
-        history, order, chart = solver_state.history, solver_state.order, solver_state.chart
+        def restart():
+            chart = next_chart(terms, t0, y0, solver_state.chart, args)
+            return _start(terms, t0, t1, y0, args, chart, solver_state.tally)
+
+        state = restart_after(made_jump, restart, solver_state)
+        history, order, chart = state.history, state.order, state.chart
         before = ravel(y0)
         dtype = before.dtype
         h = (t1 - t0).astype(dtype)
@@ -189,25 +169,32 @@ class Adams(diffrax.AbstractImplicitSolver[AdamsState], diffrax.AbstractAdaptive
 
         failed = first.failed | second.failed
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), self._sizes(terms, y0, before, after, errors, chart))
-        next_order, estimate = choose_order(sizes, order, history.points, self.min_order, self.max_order)
+        change, estimate = choose_order(
+            sizes,
+            order + np.arange(3, dtype=np.int32),
+            jnp.asarray(_RESPONSES, dtype)[order],
+            may_fall=order > self.min_order,
+            may_rise=order < self.max_order,
+            known=order < history.points,
+        )
         y1 = unravel_like(y0, after)
-        state = AdamsState(
-            history=advance(history, end, f, ahead.partial_sums),
-            order=next_order,
-            tally=solver_state.tally + (order == INDEX).astype(np.int32),
+        new_state = AdamsState(
+            history=advance(history, end, f, ahead.partial_sums[:-1]),
+            order=order + change,
+            tally=state.tally + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, second.chart, args),
         )
         used = (order >= INDEX)[:, None]
         dense_info = {
             "y1": y1,
-            "differences": jnp.where(used, state.history.differences, jnp.zeros((), dtype)),
-            "mesh": state.history.mesh,
+            "differences": jnp.where(used, new_state.history.differences, jnp.zeros((), dtype)),
+            "mesh": new_state.history.mesh,
             "mismatch": predicted + h * last * (f - ahead.partial_sums[order]) - after,
         }
         result = diffrax.RESULTS.successful
         if failed is not False:
-            result = diffrax.RESULTS.where(failed, _FAILED, result)
-        return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
+            result = diffrax.RESULTS.where(failed, FAILED, result)
+        return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
 
     def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
         """Weighted norms of the errors in the controlled components."""
@@ -230,13 +217,3 @@ def _start(terms, t0, t1, y0, args, chart, tally) -> AdamsState:
         f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
     tally = tally + (INDEX == 0).astype(np.int32)
     return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart)
-
-
-def _restart(terms, t0, t1, y0, args, state: AdamsState, made_jump) -> AdamsState:
-    def restart():
-        chart = next_chart(terms, t0, y0, state.chart, args)
-        restarted = _start(terms, t0, t1, y0, args, chart, state.tally)
-        return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restarted, state)
-
-    # In a batch the evaluation is spent if any of its members has made a jump.
-    return lax.cond(eqxi.unvmap_any(made_jump), restart, lambda: state)

@@ -144,8 +144,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         del y0, y1_candidate, args, error_order
         if not isinstance(y_error, StepEstimate):
             raise ValueError(
-                "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams`, "
-                "without `rtol` and `atol` in the solver: it takes those of the controller."
+                "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams` or "
+                "`Hermite`, without `rtol` and `atol` in the solver: it takes those of the controller."
             )
         dt = t1 - t0
         dtype = dt.dtype
@@ -156,7 +156,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
 
         scalar = lambda x: jnp.asarray(x, y_error.error.dtype)
         allowed = (scalar(self.safety) * y_error.growth) ** y_error.response
-        growth = jnp.clip(allowed, scalar(0.5), scalar(self.factormax))
+        growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
         # The last step of a stretch may be short only because the stretch ended there.
         recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))

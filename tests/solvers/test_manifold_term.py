@@ -54,6 +54,9 @@ class Circle(AbstractManifoldTerm):
     def controlled(self, chart):
         return self._is_free(chart)
 
+    def free(self, chart):
+        return chart["free"][None]
+
     def update_chart(self, t, y, chart, args):
         worse = jnp.abs(y[chart["free"]]) > 0.8
         free = jnp.where(worse, 1 - chart["free"], chart["free"])

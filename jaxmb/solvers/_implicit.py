@@ -1,0 +1,192 @@
+"""Implicit steps that use the second derivative: Newton's method, and the exact derivative of its solution.
+
+A step solves `y = past + a f(t, y) + b g(t, y)`, where `g` is the time derivative of `f` along the solution: one
+directional derivative of `f`, exact. On a manifold the unknowns are the free components only; the others, and with
+them f and g, follow from the constraints.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+# `(t, y) -> ((y on the manifold, f), anything else)`, for raveled y: a pytree, so that it can carry parameters.
+Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
+
+_MAX_ITERATIONS = 10
+# A matrix is made anew after a step whose corrections shrank by less than this factor from one to the next.
+_SLOW = 0.2
+
+
+class Derivatives(NamedTuple):
+    """A state with its first and second derivative in time; `rest` is what else the field returned."""
+
+    y: Float[Array, " n"]
+    f: Float[Array, " n"]
+    g: Float[Array, " n"]
+    rest: PyTree
+
+
+def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
+    """The state, on the manifold, and its derivatives in time."""
+    (y, f), push, rest = jax.linearize(field, t, y, has_aux=True)
+    return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
+
+
+class Linearization(eqx.Module):
+    """How a state and its derivatives in time change with the free components.
+
+    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g, None where `J²` takes its
+    place, with J the free rows of `rate`; `renewals`: how many steps are still to make a matrix of their own.
+    """
+
+    state: Float[Array, "n free"]
+    rate: Float[Array, "n free"]
+    acceleration: Float[Array, "n free"] | None
+    renewals: Int[Array, ""]
+
+
+def linearize(field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool) -> Linearization:
+    """The derivatives of a field with respect to the free components."""
+    unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
+    zero = jnp.zeros_like(t)
+    fields = lambda t, y: derivatives(field, t, y)[:3] if exact else field(t, y)[0]
+    _, push = jax.linearize(fields, t, y)
+    state, *others = jax.vmap(lambda along: push(zero, along), out_axes=-1)(unit)
+    return Linearization(state, others[0], others[1] if exact else None, jnp.array(0, jnp.int32))
+
+
+class Inverses(NamedTuple):
+    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`, in stiff directions `-1/J`; and
+    `relaxation`, which is the same there and a multiple of `a` in slow ones.
+    """
+
+    newton: Float[Array, "free free"]
+    rate: Float[Array, "free free"]
+    relaxation: Float[Array, "free free"]
+
+
+def inverses_of(matrix: Linearization, free: Int[Array, " free"], a: Any, b: Any) -> Inverses:
+    """The inverses that Newton's method needs, in the free components."""
+    jacobian = matrix.rate[free]
+    identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
+    # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
+    # complex for all formulas with equal steps; should they become real, those of the nearest complex ones do.
+    imaginary = jnp.sqrt(jnp.maximum(-b - a**2 / 4, a**2 / 1000))
+    root = lax.complex(a / 2, imaginary)
+    once = root * inverse(identity - root * jacobian)
+    return Inverses(jnp.imag(once) / imaginary, jnp.imag(root * once) / imaginary, jnp.real(once))
+
+
+# One member of a batch after the other; see `jaxmb.elimination`.
+@jax.custom_batching.sequential_vmap
+def _lapack_inverse(matrix):
+    return jnp.linalg.inv(matrix)
+
+
+@jax.custom_jvp
+def inverse(matrix: Array) -> Array:
+    """The inverse of a matrix."""
+    return _lapack_inverse(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    out = inverse(*primals)
+    return out, -out @ tangents[0] @ out
+
+
+class Solved(NamedTuple):
+    """The end of a step, without derivatives; whether Newton's method `converged`, how many `evaluations` of f and g it
+    took, and whether it was `slow`.
+    """
+
+    end: Derivatives
+    converged: Bool[Array, ""]
+    evaluations: Int[Array, ""]
+    slow: Bool[Array, ""]
+
+
+def solve(
+    field: Field,
+    t: Any,
+    past: Float[Array, " n"],
+    a: Any,
+    b: Any,
+    guess: Float[Array, " n"],
+    free: Int[Array, " free"],
+    matrix: Linearization,
+    inverses: Inverses,
+    size: Callable[[Array], Any],
+    tol: float,
+) -> Solved:
+    """Solve `y = past + a f + b g` for the free components by Newton's method with a fixed matrix.
+
+    **Arguments:** `guess` of y; `matrix`, and its `inverses`; `size`: the norm of a correction in units
+    of the tolerance, and `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is
+    there: what is left of it would be multiplied by the stiffness in them, and spoil predictions.
+    """
+
+    def correct(carry):
+        change, y, _, before, k, _ = carry
+        new = derivatives(field, t, y - matrix.state @ change)
+        # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
+        mismatch = new.g[free] - matrix.rate[free] @ new.f[free]
+        change = inverses.newton @ ((new.y - past)[free] - b * mismatch) - inverses.rate @ new.f[free]
+        now = size(matrix.state @ change)
+        return change, new.y, new, now, k + 1, now / before
+
+    def proceed(carry):
+        *_, now, k, rate = carry
+        return (now > tol) & (k < _MAX_ITERATIONS) & ((k < 3) | (rate < 2.0))
+
+    one = jnp.ones((), past.dtype)
+    nothing = jnp.zeros(free.shape[0], past.dtype)
+    carry = correct((nothing, guess, None, one * jnp.inf, jnp.array(0, jnp.int32), one))
+    change, _, end, now, k, rate = lax.while_loop(proceed, correct, carry)
+    moved = matrix.rate @ change
+    twice = matrix.rate @ moved[free] if matrix.acceleration is None else matrix.acceleration @ change
+    end = end._replace(f=end.f - moved, g=end.g - twice)
+    return Solved(end, now <= tol, k, (k > 2) & (rate > _SLOW))
+
+
+@eqx.filter_custom_jvp
+def differentiable(
+    end: tuple[Array, Array, Array],
+    field: Field,
+    t: Any,
+    past: Float[Array, " n"],
+    a: Any,
+    b: Any,
+    free: Int[Array, " free"],
+) -> tuple[Array, Array, Array]:
+    """`(y, f, g)` at the `end` of a step, a solution of `y = past + a f + b g`, with its derivatives."""
+    del field, t, past, a, b, free
+    return end
+
+
+@differentiable.def_jvp
+def _differentiable_jvp(primals, tangents):
+    _, field, t, past, a, b, free = primals
+    _, dfield, dt, dpast, da, db, _ = tangents
+    y, f, g = differentiable(*primals)
+    values, structure = eqx.partition(field, eqx.is_inexact_array)
+
+    def at(values, t, change):
+        return derivatives(eqx.combine(values, structure), t, y.at[free].add(change))[:3]
+
+    still = jnp.zeros(free.shape[0], y.dtype)
+    _, push = jax.linearize(at, values, t, still)
+    dense = lambda tangent, primal: jnp.zeros_like(primal) if tangent is None else tangent
+    dvalues = jax.tree.map(lambda v, d: None if v is None else dense(d, v), values, dfield, is_leaf=lambda x: x is None)
+    moved = push(dvalues, dense(dt, t), still)
+    zeros = jax.tree.map(jnp.zeros_like, (values, t))
+    columns = jax.vmap(lambda change: push(*zeros, change), out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
+    load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + a * moved[1] + b * moved[2])[free]
+    equation = jnp.eye(still.size, dtype=still.dtype) - (a * columns[1] + b * columns[2])[free]
+    change = inverse(equation) @ load
+    return (y, f, g), tuple(along + column @ change for along, column in zip(moved, columns, strict=True))

@@ -1,0 +1,74 @@
+"""What the multistep solvers have in common: tolerances, restarts, and how errors are measured."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import diffrax
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from ._base import Args, Y
+from ._evaluation import check_real, check_term, derivative
+from ._tolerances import Tolerances, norm_of
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+# A step whose constraints or implicit equation were not solved; it only counts if the steps are fixed, otherwise its
+# error is infinite.
+FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+
+
+class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
+    """A multistep method under a `MultistepController`."""
+
+    tolerances: AbstractVar[Tolerances]
+
+    # The place from which diffrax fills in the tolerances of a step size controller. There is no root to find.
+    @property
+    def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.tolerances
+
+    @property
+    def root_find_max_steps(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0
+
+    def func(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, y0: Y, args: Args) -> Y:
+        return derivative(terms, t0, y0, args)
+
+    def _check(self, terms: PyTree[diffrax.AbstractTerm], y0: Y) -> None:
+        self.tolerances.check(type(self).__name__)
+        check_term(terms)
+        check_real(y0)
+
+    def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
+        """The weighted norm of an error."""
+        return norm_of(self.tolerances.norm, error / scale, like)
+
+
+def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], Any]) -> Tolerances:
+    """Tolerances of a solver's own, or those of the step size controller if there are none."""
+    if (rtol is None) != (atol is None):
+        raise ValueError(
+            f"`{solver}` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
+        )
+    if rtol is None:
+        return diffrax.with_stepsize_controller_tols(Tolerances)()  # pyright: ignore[reportArgumentType]
+    return Tolerances(rtol, atol, norm, fixed=True)
+
+
+def restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
+    """The state of a solver after a jump, made anew, or else the same."""
+    if made_jump is False:
+        return state
+
+    def restarted():
+        return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart(), state)
+
+    # In a batch the evaluation is spent if any of its members has made a jump.
+    return lax.cond(eqxi.unvmap_any(made_jump), restarted, lambda: state)

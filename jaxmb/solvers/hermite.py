@@ -1,0 +1,314 @@
+"""Implicit multistep methods with second derivatives, of variable order and variable step."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._base import Args, Chart, Y
+from ._evaluation import field_of, first_chart, free_components, freeze, next_chart, ravel, unravel_like
+from ._formulas import FAMILIES, Family, double, formulas, start
+from ._history import History, advance, basis, before_each, step_end
+from ._implicit import Inverses, Linearization, Solved, derivatives, differentiable, inverses_of, linearize, solve
+from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
+from ._lanes import cond_of_any_lane
+from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
+from ._order import GAIN, StepEstimate, choose_order
+from ._tolerances import Tolerances
+
+# Newton's method ends when its correction would be smaller than this, in units of the tolerance.
+_NEWTON = 0.01
+# After a matrix has failed that was made for another step, so many steps make their own.
+_DISTRUST = 10
+
+
+class HermiteState(eqx.Module):
+    """What `Hermite` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+
+    **Fields:**
+
+    - `history`: the mesh, and scaled divided differences: of f and y in the families that integrate, otherwise of y.
+    - `slope`: the time derivatives of the same at the latest point.
+    - `points`: the number of points of the past in the formula of the next step.
+    - `matrix`: what Newton's method works with.
+    - `tally`: `tally[0]` counts the starts (the first, and the restarts after jumps), `tally[k]` the accepted steps
+        with k points.
+    - `work`: evaluations of f with g, and matrices made, in accepted steps.
+    - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
+    """
+
+    history: History
+    slope: Float[Array, " m"]
+    points: Int[Array, ""]
+    matrix: Linearization
+    tally: Int[Array, " length"]
+    work: Int[Array, "2"]
+    chart: Chart | None
+
+
+class Hermite(AbstractMultistep):
+    r"""Implicit multistep methods that use $y'' = f_t + f_y f$, of variable order and step, for stiff problems.
+
+    A step interpolates, in the sense of Hermite, at the new point and at $k$ points of the past. The second derivative
+    is exact, by one directional derivative of the vector field, which must be differentiable. Families:
+
+    - `"E"` (Enright), order $k + 2$, $k \le 7$: integrates the polynomial through values of $f$. A-stable for
+        $k \le 2$, stiffly stable for all, and zero-stable for any sequence of steps. The default.
+    - `"B"`, order $k + 1$, $k \le 8$: backward differentiation of $y$ with the second derivative at the new point.
+        A-stable for $k \le 3$; steps may only grow slowly at high orders.
+    - `"H"`, order $2k + 2$, $k \le 3$: as E, with $f'$ at every point. A-stable, without damping at infinity, for
+        $k = 1$; of no use for stiff problems beyond.
+    - `"Y"`, order $2k + 1$, $k \le 3$: as B, with $y'$ at every point. A-stable for $k = 1$.
+
+    Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
+    events, jumps, backward time, adjoints and derivatives are as there. Derivatives go through the implicit equation
+    by the implicit function theorem, with its exact Jacobian. Problems that are not stiff are solved as accurately,
+    but slower than by `Adams`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{enright1974second,
+            author={Enright, W. H.},
+            title={Second Derivative Multistep Methods for Stiff Ordinary Differential Equations},
+            journal={SIAM Journal on Numerical Analysis},
+            volume={11}, number={2}, pages={321--331}, year={1974},
+        }
+        ```
+    """
+
+    tolerances: Tolerances
+    family: str = eqx.field(static=True)
+    points: tuple[int, ...] = eqx.field(static=True)
+    matrix: str = eqx.field(static=True)
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    def __init__(
+        self,
+        family: Literal["E", "B", "H", "Y"] = "E",
+        points: Sequence[int] | None = None,
+        *,
+        matrix: Literal["square", "exact"] = "square",
+        rtol: Any = None,
+        atol: Any = None,
+        norm: Callable[[PyTree], Any] = optx.rms_norm,
+    ):
+        """**Arguments:**
+
+        - `family`: of formulas.
+        - `points`: the numbers $k$ of points of the past to choose from, increasing; default all that are of use. A
+            pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a single
+            one fixes the order. The first of them is approached from $k = 1$.
+        - `matrix`: what Newton's method takes for the derivative of $g$: the `"square"` of that of $f$, so that one
+            complex matrix is inverted (W. H. Enright), or the `"exact"` one, which needs third derivatives.
+        - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
+            `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
+            leave them out.
+
+        **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that do not
+        increase, and if only one tolerance is given.
+        """
+        if family not in FAMILIES:
+            raise ValueError(f"`Hermite` has the families {', '.join(FAMILIES)}; got `family={family!r}`.")
+        if matrix not in ("square", "exact"):
+            raise ValueError(f"`Hermite` takes `matrix='square'` or `'exact'`; got `matrix={matrix!r}`.")
+        highest = FAMILIES[family].highest
+        points = tuple(range(1, highest + 1) if points is None else points)
+        increasing = list(points) == sorted(set(points))
+        if not points or not increasing or any(k != int(k) or not 1 <= k <= highest for k in points):
+            raise ValueError(
+                f"The formulas of family {family} have 1 to {highest} points of the past; `points` lists some of these "
+                f"numbers, increasing. Got `points={points}`."
+            )
+        self.tolerances = tolerances_of("Hermite", rtol, atol, norm)
+        self.family = family
+        self.points = points
+        self.matrix = matrix
+
+    @property
+    def interpolation_cls(self) -> Callable[..., MultistepInterpolation]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return RateInterpolation if FAMILIES[self.family].integrated else StateInterpolation
+
+    def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
+        del terms
+        return FAMILIES[self.family].order(self.points[-1])
+
+    def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> HermiteState:
+        self._check(terms, y0)
+        chart = first_chart(terms, t0, y0, args)
+        tally = jnp.zeros(FAMILIES[self.family].highest + 1, np.int32)
+        return self._start(terms, t0, t1, y0, args, chart, tally, jnp.zeros(2, np.int32))
+
+    def step(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        args: Args,
+        solver_state: HermiteState,
+        made_jump: Any,
+    ) -> tuple[Y, StepEstimate | None, dict[str, Any], HermiteState, diffrax.RESULTS]:
+        def restart():
+            chart = next_chart(terms, t0, y0, solver_state.chart, args)
+            return self._start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.work)
+
+        state = restart_after(made_jump, restart, solver_state)
+        family, history, k = FAMILIES[self.family], state.history, state.points
+        before = ravel(y0)
+        n, dtype = before.size, before.dtype
+        h = (t1 - t0).astype(dtype)
+        nodes = family.multiplicity * k
+        index = np.arange(family.length, dtype=np.int32)
+
+        # The prediction extrapolates y, not f: what Newton's method leaves of stiff components is large in f.
+        end = step_end(history, t1)
+        values = basis(history.mesh, end[None])[:, 0].astype(dtype)
+        partial_sums = (jnp.asarray(before_each(family.length), dtype) * values) @ history.differences
+        recent = jnp.where(index <= nodes, values, jnp.zeros((), dtype))
+        predicted = recent @ history.differences[:, -n:]
+
+        # y = past + a f + b g, by the formula with k points.
+        coefficients = formulas(family, history, end)
+        base, unit = (before, h) if family.integrated else (jnp.zeros_like(before), jnp.ones_like(h))
+        past = base + unit * (coefficients.past[nodes] @ history.differences[:, :n])
+        a, b = h * coefficients.slope[nodes], h**2 * coefficients.curvature[nodes]
+        field = field_of(terms, t1, y0, state.chart, args)
+        free = free_components(terms, before, state.chart)
+        scale = self.tolerances.scale(before, before)
+        newton = self._newton(field, t1, past, a, b, predicted, before, free, state.matrix, scale, y0)
+        y, f, g = differentiable(newton.solved.end[:3], field, t1, past, a, b, free)
+        chart, broken = newton.solved.end.rest
+        failed = ~newton.solved.converged | broken
+
+        ends = coefficients.past @ history.differences[:, :n]
+        ends = unit * ends + h * coefficients.slope[:, None] * f + h**2 * coefficients.curvature[:, None] * g
+        ladder = _ladder(self.points)
+        around = jnp.asarray(ladder)[k]
+        sizes = self._sizes(ends, around, family, newton, free, scale, y0)
+        change, estimate = choose_order(
+            jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes),
+            family.order(around) + 1,
+            jnp.asarray(_responses(family), dtype)[k],
+            may_fall=k > self.points[0],
+            may_rise=(k < self.points[-1]) & (family.multiplicity * (around[2] - 1) <= history.points),
+            known=family.multiplicity * (around[2] + 1) <= history.points,
+            limit=jnp.asarray((1.0, *family.growth), dtype)[k],
+        )
+
+        z, slope = self._recorded(y, f, g)
+        advanced = advance(history, end, z, partial_sums)
+        doubled = double(advanced, slope)
+        y1 = unravel_like(y0, y)
+        renewed = next_chart(terms, t1, y1, chart, args)
+        matrix = newton.matrix
+        if chart is not None:
+            # Of other components it is another matrix.
+            changed = jnp.any(free_components(terms, before, renewed) != free)
+            matrix = eqx.tree_at(lambda m: m.renewals, matrix, jnp.maximum(matrix.renewals, changed.astype(jnp.int32)))
+        new_state = HermiteState(
+            history=doubled if family.multiplicity == 2 else advanced,
+            slope=slope,
+            points=around[1 + change],
+            matrix=matrix,
+            tally=state.tally + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
+            work=state.work + newton.work,
+            chart=renewed,
+        )
+        used = (index < nodes + 2)[:, None]
+        dense_info = {
+            "y1": y1,
+            "differences": jnp.where(used, doubled.differences[:, :n], jnp.zeros((), dtype)),
+            "mesh": doubled.mesh,
+            "mismatch": past + a * f + b * g - y,
+        }
+        result = diffrax.RESULTS.where(failed, FAILED, diffrax.RESULTS.successful)
+        return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
+
+    def _newton(self, field, t, past, a, b, predicted, before, free, matrix, scale, like) -> "_Newton":
+        """Newton's method with the matrix that is there; failing that, with a new one, and from the step's start."""
+        size = lambda correction: self._size(correction, scale, like)
+        field, t, past, a, b, predicted, before = freeze((field, t, past, a, b, predicted, before))
+
+        def attempt(carry):
+            k, _, matrix, _, work = carry
+            guess = jnp.where(k < 2, predicted, before)
+            anew = (matrix.renewals > 0) | (k > 0)
+
+            def renew(matrix):
+                new = linearize(field, t, guess, free, self.matrix == "exact")
+                return eqx.tree_at(lambda m: m.renewals, new, matrix.renewals)
+
+            matrix = cond_of_any_lane(anew, renew, lambda matrix: matrix, matrix)
+            inverses = inverses_of(matrix, free, a, b)
+            solved = solve(field, t, past, a, b, guess, free, matrix, inverses, size, _NEWTON)
+            again = jnp.maximum(matrix.renewals - 1, solved.slow.astype(jnp.int32))
+            renewals = jnp.where(solved.converged, again, _DISTRUST)
+            matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals.astype(jnp.int32))
+            # A matrix made for the prediction is not made for it again.
+            k = jnp.where(anew & (k == 0), 2, k + 1)
+            return k, solved, matrix, inverses, work + jnp.stack([solved.evaluations, anew.astype(jnp.int32)])
+
+        carry = attempt((jnp.array(0), None, matrix, None, jnp.zeros(2, jnp.int32)))
+        proceed = lambda carry: ~carry[1].converged & (carry[0] < 3)
+        return _Newton(*lax.while_loop(proceed, attempt, carry)[1:])
+
+    def _sizes(self, ends, around, family, newton, free, scale, like) -> Float[Array, "3"]:
+        """Weighted norms of the errors of the lower, the present and the higher formula.
+
+        A formula's error in the equation is what the next one would change; Newton's matrix makes it one of y.
+        """
+        ends = lax.stop_gradient(ends)
+        changes = ends[family.multiplicity * (around + 1)] - ends[family.multiplicity * around]
+        matrix, inverses = freeze((newton.matrix, newton.inverses))
+        errors = changes[:, free] @ (matrix.state @ inverses.newton).T
+        return jnp.stack([self._size(error, scale, like) for error in errors])
+
+    def _start(self, terms, t0, t1, y0, args, chart, tally, work) -> HermiteState:
+        family, flat = FAMILIES[self.family], ravel(y0)
+        first = derivatives(field_of(terms, t0, y0, chart, args), t0, flat)
+        chart, failed = first.rest
+        # It spreads to the error estimate, and fails the step.
+        f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
+        free = free_components(terms, flat, chart)
+        none = jnp.zeros((flat.size, free.size), flat.dtype)
+        matrix = Linearization(none, none, none if self.matrix == "exact" else None, jnp.asarray(1, jnp.int32))
+        z, slope = self._recorded(flat, f, first.g)
+        history = start(family, t0, z, slope, t1 - t0)
+        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, tally.at[0].add(1), work, chart)
+
+    def _recorded(self, y, f, g):
+        """What the history is of, and its slope."""
+        if not FAMILIES[self.family].integrated:
+            return y, f
+        return jnp.concatenate([f, y]), jnp.concatenate([g, f])
+
+
+class _Newton(NamedTuple):
+    solved: Solved
+    matrix: Linearization
+    inverses: Inverses
+    work: Int[Array, "2"]
+
+
+def _ladder(points: tuple[int, ...]) -> np.ndarray:
+    """For each number of points the one below in order, itself, and the one above."""
+    steps = [*range(1, points[0]), *points]
+    out = np.zeros((points[-1] + 1, 3), np.int32)
+    for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
+        out[own] = lower, own, upper
+    return out
+
+
+def _responses(family: Family) -> np.ndarray:
+    # As in Adams' method: the error is a product of a power of the step and of its distances from all nodes.
+    k = np.arange(1, family.highest + 1)
+    last = (3 if family.integrated else 2) + family.multiplicity * np.cumsum(1 / k)
+    return np.append(1.0, GAIN * (family.order(k) + 1) / last)

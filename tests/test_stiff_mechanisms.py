@@ -1,0 +1,199 @@
+"""Mechanisms with stiff springs and dampers against independent models in minimal coordinates."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import linkages, stiff
+
+import jaxmb as mb
+from jaxmb import mechanisms, rotations
+from jaxmb.formulations import Partitioned, accelerations
+
+extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="needs numbers longer than double")
+
+
+@functools.cache
+def library(name):
+    return mechanisms.get(name)
+
+
+def relative(values, expected):
+    """Errors relative to the largest value of each column, as those of a mechanism."""
+    expected = np.asarray(expected, float)
+    return np.max(np.abs(np.asarray(values, float) - expected) / np.max(np.abs(expected), axis=0))
+
+
+# Structure and start
+
+
+@pytest.mark.parametrize("name, counts", [("flyball", (28, 24, 20, 20)), ("stiff_four_bar", (9, 9, 6, 6))])
+def test_degrees_of_freedom(name, counts):
+    """Two arms, the shaft and the cube; three angles of an open chain."""
+    system = library(name).system
+    assert (system.nq, system.nu, system.velocity_rows, system.velocity_rank) == counts
+    assert system.nq - system.coordinate_rank == system.nu - system.velocity_rank == {9: 3, 24: 4}[system.nu]
+    assert not system.implied
+
+
+def test_flyball_starts_with_all_parts_turning_together():
+    mechanism, model = library("flyball"), stiff.flyball(number=float)
+    q, u = governor(mechanism.system, model.q, model.rates)
+    np.testing.assert_allclose(mechanism.state.q, q, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(mechanism.state.u, u, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e8, 1e14])
+def test_stiff_four_bar_starts_in_the_state_of_the_rigid_one(stiffness):
+    rigid = mechanisms.four_bar()
+    made = mechanisms.stiff_four_bar(stiffness=stiffness, damping=0.0)
+    np.testing.assert_allclose(made.state.q, rigid.state.q, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(made.state.u, rigid.state.u, rtol=0, atol=1e-13)
+    assert made.references is None
+    np.testing.assert_allclose(
+        made.system.potential_energy(0.0, made.state.q), rigid.system.potential_energy(0.0, rigid.state.q), rtol=1e-13
+    )
+
+
+# Carried values
+
+
+def test_carried_values_of_the_flyball_are_those_of_another_model():
+    references = library("flyball").references
+    values = stiff.implicit_motion(stiff.flyball(number=float), references.times, rtol=1e-11)
+    expected = np.column_stack([np.cos(values[:, 0]), np.sin(values[:, 0]), values[:, 1:]])
+    assert relative(references.values, expected) < 1e-11
+
+
+@extended
+def test_carried_values_of_the_flyball_in_extended_precision():
+    references = library("flyball").references
+    ((psi, *rest),) = stiff.motion(stiff.flyball(), references.times[:1], step=1e-4, columns=8)
+    expected = np.array([np.cos(psi), np.sin(psi), *rest], float)
+    np.testing.assert_allclose(references.values[0], expected, rtol=0, atol=1e-14)
+
+
+@extended
+def test_carried_values_of_the_stiff_four_bar_are_those_of_an_open_chain():
+    """At a coarser step to the end, at a finer one to 0.1 s, and by an implicit method to 0.01 s."""
+    references = library("stiff_four_bar").references
+    count = len(references.labels)
+    early = references.times[:2]
+    coarse = stiff.motion(stiff.four_bar(), references.times, step=2e-4, columns=7)
+    assert relative(coarse[:, :count], references.values) < 1e-10
+    fine = stiff.motion(stiff.four_bar(), early, step=1e-4, columns=7)
+    assert relative(fine[:, :count], references.values[:2]) < references.tolerance
+    implicit = stiff.implicit_motion(stiff.four_bar(number=float), early[:1], rtol=1e-11)
+    assert relative(implicit[:, :count], references.values[:1]) < 1e-9
+
+
+def test_stiff_four_bar_stays_near_the_rigid_one():
+    references = library("stiff_four_bar").references
+    rigid = linkages.four_bar(references.times)[:, :3]
+    distance = np.max(np.abs(references.values[:, :3] - rigid))
+    assert 1e-6 < distance < 1e-5
+
+
+# Right-hand sides
+
+
+def placed(system, motions):
+    """A state from position, orientation or angle, velocity and angular velocity of every body."""
+    q, u = np.zeros(system.nq), np.zeros(system.nu)
+    for body, (pose, velocity) in motions.items():
+        k = system.body_names.index(body)
+        q[system.layout.pose_index[k]] = pose
+        u[system.layout.velocity_index[k]] = velocity
+    assert np.max(np.abs(system.coordinate_residual(0.0, q))) < 1e-13
+    assert np.max(np.abs(system.velocity_residual(0.0, q, u))) < 1e-12
+    return jnp.asarray(q), jnp.asarray(u)
+
+
+def chain(system, phi, rate):
+    """Bars A→B→C and the rocker C→end, which points from its foot to C, at given angles."""
+    e, n = np.stack([np.cos(phi), np.sin(phi)], axis=1), np.stack([-np.sin(phi), np.cos(phi)], axis=1)
+    levers = np.array([[0.5, 0.0, 0.0], [1.0, 1.5, 0.0], [1.0, 3.0, -1.25]])
+    bars = zip(("crank", "coupler", "rocker"), levers, phi, rate, strict=True)
+    return placed(system, {name: ([*l @ e, p], [*(l * rate) @ n, r]) for name, l, p, r in bars})
+
+
+def governor(system, q, rate):
+    """Shaft, arms and cube at given ψ, α₁, α₂, s and their rates."""
+    (psi, *alphas, s), (omega, *turns, slide) = q, rate
+    shaft = rotations.from_axis_angle((0.0, 0.0, 1.0), psi)
+    x, y = np.array([np.cos(psi), np.sin(psi), 0.0]), np.array([-np.sin(psi), np.cos(psi), 0.0])
+    z = np.array([0.0, 0.0, 1.0])
+    motions = {
+        "shaft": ([0.0, 0.0, 0.5, *shaft], [0.0, 0.0, 0.0, 0.0, 0.0, omega]),
+        "slider": ([0.0, 0.0, s, *shaft], [0.0, 0.0, slide, 0.0, 0.0, omega]),
+    }
+    center = (0.3 * 0.5 + 5.0) / 5.3
+    for k, (alpha, turn, side) in enumerate(zip(alphas, turns, (1.0, -1.0), strict=True), start=1):
+        # An arm's own axes: along it, the shaft's y, and across.
+        angle = alpha if side > 0 else np.pi - alpha
+        about_y = side * turn
+        along = side * np.cos(alpha) * x - np.sin(alpha) * z
+        position = side * 0.05 * x + z + center * along
+        velocity = omega * np.cross(z, position) + about_y * center * np.cross(y, along)
+        p = rotations.multiply(shaft, rotations.from_axis_angle((0.0, 1.0, 0.0), angle))
+        spin = [-omega * np.sin(angle), about_y, omega * np.cos(angle)]
+        motions[f"arm{k}"] = ([*position, *p], [*velocity, *spin])
+    return placed(system, motions)
+
+
+def test_accelerations_of_the_stiff_four_bar():
+    system, model = library("stiff_four_bar").system, stiff.four_bar()
+    solve = jax.jit(lambda q, u: accelerations(system, Partitioned(), 0.0, q, u)[0])
+    rng = np.random.default_rng(1)
+    # Rounding of positions of about 1 m, times the stiffness: all there is without a displacement.
+    floor = 1e8 * 2.0**-52
+    for size in (0.0, 1e-5, 1e-3, 0.1, 1.0):
+        phi = model.q.astype(float) + size * rng.normal(size=3)
+        rate = model.rates.astype(float) + size * rng.normal(size=3)
+        expected = model.acceleration(phi.astype(np.longdouble), rate.astype(np.longdouble)).astype(float)
+        found = np.asarray(solve(*chain(system, phi, rate)))[2::3]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)) + floor)
+
+
+def test_accelerations_of_the_flyball():
+    """Also where the arms move differently."""
+    system, model = library("flyball").system, stiff.flyball()
+    solve = jax.jit(lambda q, u: accelerations(system, Partitioned(), 0.0, q, u)[0])
+    arms = [system.layout.velocity_index[system.body_names.index(f"arm{k}")][4] for k in (1, 2)]
+    shaft, slider = (system.layout.velocity_index[system.body_names.index(name)] for name in ("shaft", "slider"))
+    where, sign = np.array([shaft[5], *arms, slider[2]]), np.array([1.0, 1.0, -1.0, 1.0])
+    rng = np.random.default_rng(2)
+    for size in (0.0, 1e-5, 1e-2, 0.3):
+        q, rate = (value.astype(float) + size * rng.normal(size=4) for value in (model.q, model.rates))
+        expected = model.acceleration(q.astype(np.longdouble), rate.astype(np.longdouble)).astype(float)
+        found = sign * np.asarray(solve(*governor(system, q, rate)))[where]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+
+
+# Motions
+
+
+def test_the_flyball_moves_as_its_references_say():
+    mechanism = library("flyball")
+    trajectory = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-10, saveat=np.array([0.0, 0.1]))
+    assert max(float(error[0]) for error in mechanism.errors(trajectory).values()) < 1e-9
+    momentum = np.asarray(trajectory.angular_momentum)
+    np.testing.assert_allclose(momentum[1], momentum[0], rtol=0, atol=1e-10 * momentum[0, 2])
+    other = trajectory["arm2"].angular_velocity[:, 1]
+    np.testing.assert_allclose(other, -trajectory["arm1"].angular_velocity[:, 1], rtol=0, atol=1e-9)
+
+
+def test_the_stiff_four_bar_moves_as_the_open_chain_does():
+    """With the oscillation of the bushing, of some 10⁻⁷ m."""
+    mechanism, times = library("stiff_four_bar"), [0.001, 0.01, 0.1]
+    trajectory = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-12, saveat=np.array(times))
+    observed = mechanism.observe(trajectory)
+    expected = stiff.motion(stiff.four_bar(), times, step=1e-4, columns=7).astype(float)
+    labels = ("crank", "coupler", "rocker", "crank_rate", "coupler_rate", "rocker_rate", "pivot_x", "pivot_y")
+    for k, label in enumerate(labels):
+        bound = 1e-11 if k < 3 else 1e-8 if k < 6 else 1e-12
+        np.testing.assert_allclose(observed[label], expected[:, k], rtol=0, atol=bound, err_msg=label)
+    assert max(float(np.max(error)) for error in mechanism.errors(trajectory).values()) < 1e-9
+    assert np.max(np.abs(expected[:, 6:])) > 1e-7
