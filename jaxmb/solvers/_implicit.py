@@ -61,25 +61,23 @@ def linearize(field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " fr
 
 
 class Inverses(NamedTuple):
-    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`, in stiff directions `-1/J`; and
-    `relaxation`, which is the same there and a multiple of `a` in slow ones.
-    """
+    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; and `slope`: `P⁻¹ J`."""
 
     newton: Float[Array, "free free"]
     rate: Float[Array, "free free"]
-    relaxation: Float[Array, "free free"]
+    slope: Float[Array, "free free"]
 
 
-def inverses_of(matrix: Linearization, free: Int[Array, " free"], a: Any, b: Any) -> Inverses:
-    """The inverses that Newton's method needs, in the free components."""
-    jacobian = matrix.rate[free]
+def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
+    """The inverses that Newton's method needs, each as accurate as if it were one with a single J."""
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
     # complex for all formulas with equal steps; should they become real, those of the nearest complex ones do.
-    imaginary = jnp.sqrt(jnp.maximum(-b - a**2 / 4, a**2 / 1000))
-    root = lax.complex(a / 2, imaginary)
-    once = root * inverse(identity - root * jacobian)
-    return Inverses(jnp.imag(once) / imaginary, jnp.imag(root * once) / imaginary, jnp.real(once))
+    real, imaginary = a / 2, jnp.sqrt(jnp.maximum(-b - a**2 / 4, a**2 / 1000))
+    once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
+    # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
+    along, across = jnp.real(once), jnp.imag(once) / imaginary
+    return Inverses(along + real * across, a * along + (real**2 - imaginary**2) * across, across)
 
 
 # One member of a batch after the other; see `jaxmb.elimination`.
@@ -187,6 +185,13 @@ def _differentiable_jvp(primals, tangents):
     zeros = jax.tree.map(jnp.zeros_like, (values, t))
     columns = jax.vmap(lambda change: push(*zeros, change), out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
     load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + a * moved[1] + b * moved[2])[free]
-    equation = jnp.eye(still.size, dtype=still.dtype) - (a * columns[1] + b * columns[2])[free]
-    change = inverse(equation) @ load
-    return (y, f, g), tuple(along + column @ change for along, column in zip(moved, columns, strict=True))
+    # The matrix of the equation is P, as in `Inverses`, minus b times what g changes by beyond the square of J. Through
+    # the inverse of P rounding errors are not multiplied by the square of the stiffness; in f, nor by the stiffness.
+    jacobian, identity = columns[1][free], jnp.eye(still.size, dtype=still.dtype)
+    inverses = inverses_of(jacobian, a, b)
+    beyond = b * (columns[2][free] - jacobian @ jacobian)
+    smooth = inverse(identity - beyond @ inverses.newton) @ load
+    change = inverses.newton @ smooth
+    dy, df, dg = (along + column @ change for along, column in zip(moved, columns, strict=True))
+    df = df.at[free].set(moved[1][free] + inverses.slope @ smooth, unique_indices=True)
+    return (y, f, g), (dy, df, dg)

@@ -10,9 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 # The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
 # orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
-#
-# The error that a step aims at, in units of the tolerance.
-_TARGET = 0.2
 # How the step of the order below, and of the order above, counts against that of the present order.
 _LOWER, _UPPER = 0.98, 0.95
 # How much of the deviation from the target the next step is to make up for.
@@ -46,6 +43,7 @@ def choose_order(
     may_fall: Bool[Array, ""],
     may_rise: Bool[Array, ""],
     known: Bool[Array, ""],
+    target: float,
     limit: Any = np.inf,
 ) -> tuple[Int[Array, ""], StepEstimate]:
     """Choose, among the present formula and its neighbours in order, the one that allows the longest next step.
@@ -58,6 +56,7 @@ def choose_order(
     - `response`: as in `StepEstimate`.
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
     - `known`: whether there are points enough for the error of the higher formula.
+    - `target`: the error to aim at, in units of the tolerance.
     - `limit`: as in `StepEstimate`.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
@@ -65,7 +64,7 @@ def choose_order(
     errors = lax.stop_gradient(errors)
     dtype = errors.dtype
     errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, dtype))
-    factors = (_TARGET / jnp.maximum(errors, jnp.finfo(dtype).tiny)) ** (1 / powers.astype(dtype))
+    factors = (target / jnp.maximum(errors, jnp.finfo(dtype).tiny)) ** (1 / powers.astype(dtype))
     zero = jnp.zeros((), dtype)
     lower = jnp.where(may_fall, _LOWER * factors[0], zero)
     same = factors[1]

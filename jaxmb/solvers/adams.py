@@ -27,6 +27,8 @@ from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
 from ._order import GAIN, StepEstimate, choose_order
 from ._tolerances import Tolerances, norm_of
 
+# The error that a step aims at, in units of the tolerance.
+_TARGET = 0.2
 # The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
 # 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
 _ORDERS = np.arange(1, LENGTH)
@@ -176,6 +178,7 @@ class Adams(AbstractMultistep):
             may_fall=order > self.min_order,
             may_rise=order < self.max_order,
             known=order < history.points,
+            target=_TARGET,
         )
         y1 = unravel_like(y0, after)
         new_state = AdamsState(

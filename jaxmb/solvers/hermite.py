@@ -24,6 +24,8 @@ from ._tolerances import Tolerances
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
 _NEWTON = 0.01
+# The error that a step aims at, in units of the tolerance.
+_TARGET = 0.1
 # After a matrix has failed that was made for another step, so many steps make their own.
 _DISTRUST = 10
 
@@ -164,14 +166,14 @@ class Hermite(AbstractMultistep):
         family, history, k = FAMILIES[self.family], state.history, state.points
         before = ravel(y0)
         n, dtype = before.size, before.dtype
-        h = (t1 - t0).astype(dtype)
         nodes = family.multiplicity * k
         index = np.arange(family.length, dtype=np.int32)
 
         # The prediction extrapolates y, not f: what Newton's method leaves of stiff components is large in f.
         end = step_end(history, t1)
+        h = (end - history.mesh[0]).astype(dtype)
         values = basis(history.mesh, end[None])[:, 0].astype(dtype)
-        partial_sums = (jnp.asarray(before_each(family.length), dtype) * values) @ history.differences
+        partial_sums = (jnp.asarray(before_each(family.length), dtype) * values[None]) @ history.differences
         recent = jnp.where(index <= nodes, values, jnp.zeros((), dtype))
         predicted = recent @ history.differences[:, -n:]
 
@@ -189,7 +191,11 @@ class Hermite(AbstractMultistep):
         failed = ~newton.solved.converged | broken
 
         ends = coefficients.past @ history.differences[:, :n]
-        ends = unit * ends + h * coefficients.slope[:, None] * f + h**2 * coefficients.curvature[:, None] * g
+        ends = (
+            unit * ends
+            + (h * coefficients.slope)[:, None] * f[None]
+            + (h**2 * coefficients.curvature)[:, None] * g[None]
+        )
         ladder = _ladder(self.points)
         around = jnp.asarray(ladder)[k]
         sizes = self._sizes(ends, around, family, newton, free, scale, y0)
@@ -200,6 +206,7 @@ class Hermite(AbstractMultistep):
             may_fall=k > self.points[0],
             may_rise=(k < self.points[-1]) & (family.multiplicity * (around[2] - 1) <= history.points),
             known=family.multiplicity * (around[2] + 1) <= history.points,
+            target=_TARGET,
             limit=jnp.asarray((1.0, *family.growth), dtype)[k],
         )
 
@@ -247,7 +254,7 @@ class Hermite(AbstractMultistep):
                 return eqx.tree_at(lambda m: m.renewals, new, matrix.renewals)
 
             matrix = cond_of_any_lane(anew, renew, lambda matrix: matrix, matrix)
-            inverses = inverses_of(matrix, free, a, b)
+            inverses = inverses_of(matrix.rate[free], a, b)
             solved = solve(field, t, past, a, b, guess, free, matrix, inverses, size, _NEWTON)
             again = jnp.maximum(matrix.renewals - 1, solved.slow.astype(jnp.int32))
             renewals = jnp.where(solved.converged, again, _DISTRUST)

@@ -1,0 +1,270 @@
+"""The implicit second-derivative methods: orders, stiff problems, derivatives, diffrax's features, and bad input."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from stiff_problems import PROBLEMS, solve, van_der_pol
+
+from jaxmb.solvers import Hermite, MultistepController
+from jaxmb.solvers._formulas import FAMILIES, double, formulas, start
+from jaxmb.solvers._history import advance, basis, before_each
+
+
+def relative_error(problem, rtol, **kwargs):
+    """That of the state, and the solution."""
+    solution = solve(problem, rtol, **kwargs)
+    return np.linalg.norm(solution.ys[-1] - problem.y1) / np.linalg.norm(problem.y1), solution
+
+
+# Orders
+
+
+@eqx.filter_jit
+def _march(family, k, ts, first):
+    """A solution `exp(-t)` from exact values at the points up to `first`, by the formula with k points: its error."""
+    exact = lambda t: jnp.exp(-t)
+    rate = lambda t, y: -exact(t) - 0.1 * (y - exact(t)) + (y - exact(t)) ** 2
+    curvature = lambda t, y: jax.jvp(rate, (t, y), (jnp.ones_like(t), rate(t, y)))[1]
+
+    def recorded(t, y):
+        y, f, g = y[None], rate(t, y)[None], curvature(t, y)[None]
+        return (f, g) if family.integrated else (y, f)
+
+    def step(carry, n):
+        history, y = carry
+        t, h = ts[n], ts[n] - ts[n - 1]
+        rows = formulas(family, history, t)
+        m = family.multiplicity * k
+        past = rows.past[m] @ history.differences[:, 0]
+        past = y + h * past if family.integrated else past
+        a, b = h * rows.slope[m], h**2 * rows.curvature[m]
+        new = y
+        for _ in range(20):
+            residual = lambda new: new - past - a * rate(t, new) - b * curvature(t, new)
+            new = new - residual(new) / jax.grad(residual)(new)
+        new = jnp.where(n <= first, exact(t), new)
+        z, slope = recorded(t, new)
+        sums = jnp.asarray(before_each(family.length)) @ (basis(history.mesh, t[None]) * history.differences)
+        history = advance(history, t, z, sums)
+        return (double(history, slope) if family.multiplicity == 2 else history, new), None
+
+    history = start(family, ts[0], *recorded(ts[0], exact(ts[0])), ts[1] - ts[0])
+    (_, y), _ = jax.lax.scan(step, (history, exact(ts[0])), jnp.arange(1, ts.size))
+    return jnp.abs(y - exact(ts[-1]))
+
+
+# Zero-stable where neighbouring steps differ by up to a factor of two.
+VARIABLE = {"E": range(1, 8), "B": range(1, 4), "H": (1, 2), "Y": (1, 2)}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_order_with_steps_of_any_size(name):
+    family = FAMILIES[name]
+    rng = np.random.default_rng(7)
+    steps = [np.concatenate([[0.0], np.cumsum(2 ** rng.uniform(-0.5, 0.5, 14))]) for _ in range(8)]
+    meshes = [step - step[-1] / 2 for step in steps]
+    for k in VARIABLE[name]:
+        order = family.order(k)
+        # As many steps, of other sizes: the error falls with one power more than the order.
+        scales = np.array([0.2, 0.14]) * 0.5 ** ((9 - order) / 1.5)
+        errors = [
+            np.mean([np.log(_march(family, jnp.array(k), jnp.asarray(scale * mesh), k + 1)) for mesh in meshes])
+            for scale in scales
+        ]
+        assert (errors[0] - errors[1]) / np.log(scales[0] / scales[1]) - 1 >= order - 0.3, (k, errors)
+
+
+# Stiff problems
+
+
+def test_van_der_pol_takes_few_steps():
+    problem = PROBLEMS["van der Pol 1e3"]
+    for rtol, steps, bound in ((1e-8, 700, 1e-6), (1e-10, 1150, 5e-9)):
+        error, solution = relative_error(problem, rtol)
+        assert solution.stats["num_accepted_steps"] <= steps
+        assert error <= bound
+
+
+@pytest.mark.parametrize("name", ["van der Pol 1e6", "HIRES"])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
+def test_error_is_in_proportion_to_the_tolerance(name, rtol):
+    problem = PROBLEMS[name]
+    error, solution = relative_error(problem, rtol)
+    assert error <= 100 * rtol
+    assert solution.stats["num_rejected_steps"] < 0.1 * solution.stats["num_accepted_steps"]
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
+def test_robertson_does_not_break_down(rtol):
+    problem = PROBLEMS["Robertson"]
+    solution = solve(problem, rtol)
+    assert np.all(np.abs(solution.ys[-1] / problem.y1 - 1)[[0, 2]] <= 100 * rtol)
+    assert solution.stats["num_steps"] < 1000
+
+
+@pytest.mark.parametrize("family, points", [("E", (2, 4)), ("H", (1, 2)), ("B", None), ("Y", None), ("E", (1,))])
+def test_every_family(family, points):
+    error, solution = relative_error(PROBLEMS["HIRES"], 1e-6, solver=Hermite(family, points))
+    assert error < 1e-3
+    used = np.flatnonzero(solution.solver_state.tally[1:]) + 1
+    if points is not None:
+        assert set(used) <= {*range(1, points[0]), *points} and points[-1] in used
+
+
+def test_exact_matrix():
+    problem = PROBLEMS["HIRES"]
+    square, exact = (solve(problem, 1e-7, solver=Hermite(matrix=matrix)).ys[-1] for matrix in ("square", "exact"))
+    np.testing.assert_allclose(square, exact, rtol=1e-4)
+
+
+# Derivatives
+
+
+def _end(mu, rtol, adjoint):
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: van_der_pol(t, y, mu)),
+        Hermite(),
+        0.0,
+        70.0,
+        None,
+        jnp.array([2.0, 0.0]),
+        stepsize_controller=MultistepController(rtol, rtol),
+        adjoint=adjoint,
+        max_steps=512,
+    )
+    return solution.ys[-1] @ jnp.array([1.0, 100.0])
+
+
+def test_forward_reverse_and_central_differences():
+    forward = jax.jit(jax.vmap(jax.jacfwd(lambda mu: _end(mu, 1e-9, diffrax.ForwardMode()))))
+    reverse = jax.jit(jax.vmap(jax.grad(lambda mu: _end(mu, 1e-9, diffrax.RecursiveCheckpointAdjoint()))))
+    mus = jnp.array([100.0, 120.0])
+    along, against = forward(mus), reverse(mus)
+    np.testing.assert_allclose(against, along, rtol=1e-10)
+    tight = jax.jit(jax.vmap(lambda mu: _end(mu, 1e-13, diffrax.ForwardMode())))
+    h = 0.1 * jnp.array([1.0, -1.0, 2.0, -2.0])
+    values = [tight(mus + step) for step in h]
+    central = (8 * (values[0] - values[1]) - (values[2] - values[3])) / 1.2
+    np.testing.assert_allclose(along, central, rtol=1e-5)
+
+
+# Diffrax's features
+
+
+def _forced(t, y, args):
+    """A stiff component that follows the cosine, and a slow one; exact from consistent values."""
+    return jnp.stack([-1e4 * (y[0] - jnp.cos(t)) - jnp.sin(t), y[0] - y[1]])
+
+
+def _exact(t):
+    return np.stack([np.cos(t), (np.cos(t) + np.sin(t) + np.exp(-t)) / 2], axis=-1)
+
+
+def _run(t0=0.0, t1=5.0, y0=None, controller=None, **kwargs):
+    y0 = jnp.asarray(_exact(np.asarray(t0)) if y0 is None else y0)
+    controller = MultistepController(1e-8, 1e-8) if controller is None else controller
+    kwargs = {"adjoint": diffrax.ForwardMode(), **kwargs}
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(_forced), Hermite(), t0, t1, None, y0, stepsize_controller=controller, **kwargs
+    )
+
+
+@pytest.mark.parametrize("family, points", [("E", None), ("B", None), ("H", (1,)), ("Y", None)])
+def test_dense_output(family, points):
+    ts = jnp.linspace(0.0, 5.0, 101)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(_forced),
+        Hermite(family, points),
+        0.0,
+        5.0,
+        None,
+        jnp.asarray(_exact(np.array(0.0))),
+        stepsize_controller=MultistepController(1e-7, 1e-7),
+        saveat=diffrax.SaveAt(ts=ts),
+    )
+    np.testing.assert_allclose(solution.ys, _exact(np.asarray(ts)), atol=5e-6)
+
+
+def test_jumps_restart():
+    controller = diffrax.ClipStepSizeController(MultistepController(1e-8, 1e-8), jump_ts=jnp.array([1.0, 2.5]))
+    solution = _run(controller=controller, saveat=diffrax.SaveAt(t1=True, solver_state=True))
+    assert solution.solver_state.tally[0] == 3
+    np.testing.assert_allclose(solution.ys[-1], _exact(np.array(5.0)), atol=1e-6)
+
+
+def test_backward_in_time():
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: 1e4 * (y - jnp.cos(t)) - jnp.sin(t)),
+        Hermite(),
+        5.0,
+        0.0,
+        None,
+        jnp.cos(jnp.array([5.0])),
+        stepsize_controller=MultistepController(1e-8, 1e-8),
+    )
+    np.testing.assert_allclose(solution.ys[-1], [1.0], atol=1e-7)
+
+
+def test_event():
+    event = diffrax.Event(lambda t, y, args, **kwargs: y[0] - 0.5, optx.Newton(1e-8, 1e-8))
+    solution = _run(event=event)
+    np.testing.assert_allclose(solution.ts[-1], np.arccos(0.5), rtol=1e-6)
+
+
+def test_batch_equals_loop():
+    slow = lambda y: _run(y0=y, t1=2.0).ys[-1]
+    starts = jnp.stack([jnp.array([1.0, 1.0]), jnp.array([1.5, 0.0]), jnp.array([-3.0, 2.0])])
+    np.testing.assert_allclose(jax.vmap(slow)(starts), [slow(y) for y in starts], rtol=1e-6)
+
+
+def test_single_precision():
+    problem = PROBLEMS["HIRES"]
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(problem.vector_field),
+        Hermite(),
+        jnp.float32(0.0),
+        jnp.float32(problem.t1),
+        None,
+        jnp.asarray(problem.y0, jnp.float32),
+        stepsize_controller=MultistepController(1e-3, 1e-7),
+    )
+    assert solution.ys.dtype == jnp.float32
+    np.testing.assert_allclose(solution.ys[-1], problem.y1, rtol=0.2)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"family": "A"}, "families E, B, H, Y"),
+        ({"points": (0, 1)}, "1 to 7 points"),
+        ({"points": (4, 2)}, "increasing"),
+        ({"points": ()}, "increasing"),
+        ({"family": "H", "points": (4,)}, "1 to 3 points"),
+        ({"matrix": "broyden"}, "square"),
+        ({"rtol": 1e-3}, "both of"),
+    ],
+)
+def test_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Hermite(**arguments)
+
+
+def test_other_controllers_are_refused():
+    with pytest.raises(ValueError, match="MultistepController"):
+        _run(controller=diffrax.PIDController(1e-6, 1e-6))
+
+
+def test_a_field_that_is_not_finite_ends_the_solve():
+    term = diffrax.ODETerm(lambda t, y, args: jnp.sqrt(0.5 - t) * y)
+    controller = MultistepController(1e-6, 1e-6)
+    solution = diffrax.diffeqsolve(
+        term, Hermite(), 0.0, 1.0, None, jnp.ones(1), stepsize_controller=controller, throw=False
+    )
+    assert solution.result == diffrax.RESULTS.dt_min_reached
