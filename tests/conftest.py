@@ -1,9 +1,3 @@
-import os
-
-# Most of the tests' time is compilation, and most of that the optimisation of machine code, which they do not need.
-# (Notebooks are run as users run them.)
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
-
 import equinox as eqx
 import jax
 import pytest

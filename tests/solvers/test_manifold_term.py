@@ -144,16 +144,15 @@ def test_batch_with_charts_and_failures_equals_loop():
     rates = jnp.array([0.6, 1.0, 2.3])
 
     def run(rate):
-        solution = _solve(Circle(rate, fail=0.1), 4.0, 1e-11)
-        return solution.ys[-1], solution.solver_state.chart["changes"], solution.stats["num_rejected_steps"]
+        solution = _solve(Circle(rate, fail=0.1), 4.0)
+        return solution.ys[-1], solution.stats["num_steps"], solution.solver_state.chart["changes"]
 
     batch = jax.jit(jax.vmap(run))(rates)
     single = jax.jit(run)
     loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(rate) for rate in rates])
-    assert np.all(batch[2] > 0)
-    # Where two orders are as good as each other, rounding decides between them, and with them the number of steps.
-    np.testing.assert_allclose(batch[0], loop[0], atol=1e-9)
+    np.testing.assert_allclose(batch[0], loop[0], atol=1e-12)
     np.testing.assert_array_equal(batch[1], loop[1])
+    np.testing.assert_array_equal(batch[2], loop[2])
 
 
 def test_jump_on_the_manifold():
