@@ -36,6 +36,7 @@ class Family(NamedTuple):
     - `integrated`: whether z is f, and the polynomial is integrated; otherwise z is y.
     - `multiplicity`: conditions at each point of the past, 2 where its slope is one.
     - `highest`: the largest number k of points that is of use.
+    - `stable`: the largest k of an A-stable formula.
     - `growth`: by how much every step may be longer than the one before, with 1, 2, ... points, and the formula stay
         zero-stable; see `largest_growth` of `jaxmb.solvers.stability`.
     """
@@ -43,6 +44,7 @@ class Family(NamedTuple):
     integrated: bool
     multiplicity: int
     highest: int
+    stable: int
     growth: tuple[float, ...]
 
     @property
@@ -59,10 +61,10 @@ _ANY = float("inf")
 # Beyond the highest number of points E and B are stable in no useful sector (A(α) below 13 degrees), and Y in none; H
 # is A-stable with one point only, the rest is there for comparison.
 FAMILIES = {
-    "E": Family(True, 1, 7, (_ANY,) * 7),
-    "B": Family(False, 1, 8, (_ANY, 3.84, 2.14, 1.57, 1.32, 1.19, 1.11, 1.06)),
-    "H": Family(True, 2, 3, (_ANY,) * 3),
-    "Y": Family(False, 2, 3, (_ANY, 1.49, 1.06)),
+    "E": Family(True, 1, 7, 2, (_ANY,) * 7),
+    "B": Family(False, 1, 8, 3, (_ANY, 3.84, 2.14, 1.57, 1.32, 1.19, 1.11, 1.06)),
+    "H": Family(True, 2, 3, 1, (_ANY,) * 3),
+    "Y": Family(False, 2, 3, 1, (_ANY, 1.49, 1.06)),
 }
 
 

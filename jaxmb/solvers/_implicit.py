@@ -12,7 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+
+from ._damping import eigenvalues
 
 # `(t, y) -> ((y on the manifold, f), anything else)`, for raveled y: a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -41,23 +43,34 @@ class Linearization(eqx.Module):
     """How a state and its derivatives in time change with the free components.
 
     **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g, None where `J²` takes its
-    place, with J the free rows of `rate`; `renewals`: how many steps are still to make a matrix of their own.
+    place, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where they are not asked for;
+    `renewals`: how many steps are still to make a matrix of their own.
     """
 
     state: Float[Array, "n free"]
     rate: Float[Array, "n free"]
     acceleration: Float[Array, "n free"] | None
+    spectrum: Complex[Array, " free"] | None
     renewals: Int[Array, ""]
 
 
-def linearize(field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool) -> Linearization:
-    """The derivatives of a field with respect to the free components."""
+def linearize(
+    field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool, spectrum: bool
+) -> Linearization:
+    """The derivatives of a field with respect to the free components; with `exact` those of g, and with the `spectrum`.
+    """
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
     zero = jnp.zeros_like(t)
     fields = lambda t, y: derivatives(field, t, y)[:3] if exact else field(t, y)[0]
     _, push = jax.linearize(fields, t, y)
     state, *others = jax.vmap(lambda along: push(zero, along), out_axes=-1)(unit)
-    return Linearization(state, others[0], others[1] if exact else None, jnp.array(0, jnp.int32))
+    return Linearization(
+        state,
+        others[0],
+        others[1] if exact else None,
+        eigenvalues(others[0][free]) if spectrum else None,
+        jnp.array(0, jnp.int32),
+    )
 
 
 class Inverses(NamedTuple):

@@ -1,5 +1,6 @@
 """The choice of order and step size from the error estimates of neighbouring orders."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 # The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
 # orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
 # How the step of the order below, and of the order above, counts against that of the present order.
-_LOWER, _UPPER = 0.98, 0.95
+LOWER, _UPPER = 0.98, 0.95
 # How much of the deviation from the target the next step is to make up for.
 GAIN = 0.85
 
@@ -35,6 +36,12 @@ class StepEstimate(eqx.Module):
     limit: Float[Array, ""]
 
 
+def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:
+    """By what factors steps may grow for the errors to be what is aimed at; zero if they are not finite."""
+    errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, errors.dtype))
+    return (target / jnp.maximum(errors, jnp.finfo(errors.dtype).tiny)) ** (1 / powers.astype(errors.dtype))
+
+
 def choose_order(
     errors: Float[Array, "3"],
     powers: Float[Array, "3"],
@@ -45,6 +52,7 @@ def choose_order(
     known: Bool[Array, ""],
     target: float,
     limit: Any = np.inf,
+    bounded: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None,
 ) -> tuple[Int[Array, ""], StepEstimate]:
     """Choose, among the present formula and its neighbours in order, the one that allows the longest next step.
 
@@ -58,15 +66,17 @@ def choose_order(
     - `known`: whether there are points enough for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
     - `limit`: as in `StepEstimate`.
+    - `bounded`: makes factors by which steps may grow, for the three formulas, those that stability allows.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
     """
     errors = lax.stop_gradient(errors)
     dtype = errors.dtype
-    errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, dtype))
-    factors = (target / jnp.maximum(errors, jnp.finfo(dtype).tiny)) ** (1 / powers.astype(dtype))
+    factors = growth_factors(errors, powers, target)
+    retry = factors[1]
+    factors = factors if bounded is None else bounded(factors)
     zero = jnp.zeros((), dtype)
-    lower = jnp.where(may_fall, _LOWER * factors[0], zero)
+    lower = jnp.where(may_fall, LOWER * factors[0], zero)
     same = factors[1]
     higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
     # With every point since the start in use there is no estimate for the next order, but it is better as a rule.
@@ -76,5 +86,5 @@ def choose_order(
     growth = jnp.maximum(jnp.maximum(lower, higher), same)
     change = rise.astype(jnp.int32) - fall.astype(jnp.int32)
     return change, StepEstimate(
-        error=errors[1], growth=growth, retry=same, response=response.astype(dtype), limit=jnp.asarray(limit, dtype)
+        error=errors[1], growth=growth, retry=retry, response=response.astype(dtype), limit=jnp.asarray(limit, dtype)
     )

@@ -1,10 +1,12 @@
 """Implicit multistep methods with second derivatives, of variable order and variable step."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -12,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Args, Chart, Y
+from ._damping import are_damped
 from ._evaluation import field_of, first_chart, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
@@ -19,7 +22,7 @@ from ._implicit import Inverses, Linearization, Solved, derivatives, differentia
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._lanes import cond_of_any_lane
 from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
-from ._order import GAIN, StepEstimate, choose_order
+from ._order import GAIN, LOWER, StepEstimate, choose_order, growth_factors
 from ._tolerances import Tolerances
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
@@ -202,9 +205,12 @@ class Hermite(AbstractMultistep):
         )
         ladder = _ladder(self.points)
         around = jnp.asarray(ladder)[k]
-        sizes = self._sizes(ends, around, family, newton, free, scale, y0)
+        candidates = jnp.append(around, self._stable or 1)
+        sizes = self._sizes(ends, candidates, family, newton, free, scale, y0)
+        sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
+        bounded = None if self._stable is None else functools.partial(self._bounded, around, h, newton.matrix.spectrum)
         change, estimate = choose_order(
-            jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes),
+            sizes[:3],
             family.order(around) + 1,
             jnp.asarray(_responses(family), dtype)[k],
             may_fall=k > self.points[0],
@@ -212,7 +218,15 @@ class Hermite(AbstractMultistep):
             known=family.multiplicity * (around[2] + 1) <= history.points,
             target=_TARGET,
             limit=jnp.asarray((1.0, *family.growth), dtype)[k],
+            bounded=bounded,
         )
+        points = around[1 + change]
+        if self._stable is not None:
+            # Between here and there may be formulas for which this step is of just the wrong length.
+            growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
+            better = (k > self._stable) & (growth > estimate.growth)
+            points = jnp.where(better, candidates[3], points)
+            estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))
 
         z, slope = self._recorded(y, f, g)
         advanced = advance(history, end, z, partial_sums)
@@ -227,7 +241,7 @@ class Hermite(AbstractMultistep):
         new_state = HermiteState(
             history=doubled if family.multiplicity == 2 else advanced,
             slope=slope,
-            points=around[1 + change],
+            points=points,
             matrix=matrix,
             tally=state.tally + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
             work=state.work + newton.work,
@@ -254,7 +268,7 @@ class Hermite(AbstractMultistep):
             anew = (matrix.renewals > 0) | (k > 0)
 
             def renew(matrix):
-                new = linearize(field, t, guess, free, self.matrix == "exact")
+                new = linearize(field, t, guess, free, self.matrix == "exact", self._stable is not None)
                 return eqx.tree_at(lambda m: m.renewals, new, matrix.renewals)
 
             matrix = cond_of_any_lane(anew, renew, lambda matrix: matrix, matrix)
@@ -271,16 +285,29 @@ class Hermite(AbstractMultistep):
         proceed = lambda carry: ~carry[1].converged & (carry[0] < 3)
         return _Newton(*lax.while_loop(proceed, attempt, carry)[1:])
 
-    def _sizes(self, ends, around, family, newton, free, scale, like) -> Float[Array, "3"]:
-        """Weighted norms of the errors of the lower, the present and the higher formula.
+    def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
+        """Weighted norms of the errors of the formulas with these numbers of points.
 
         A formula's error in the equation is what the next one would change; Newton's matrix makes it one of y.
         """
         ends = lax.stop_gradient(ends)
-        changes = ends[family.multiplicity * (around + 1)] - ends[family.multiplicity * around]
+        changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
         errors = changes[:, free] @ (matrix.state @ inverses.newton).T
         return jnp.stack([self._size(error, scale, like) for error in errors])
+
+    @property
+    def _stable(self) -> int | None:
+        """The A-stable formula with the most points, if others may be chosen instead of it."""
+        stable = [k for k in self.points if k <= FAMILIES[self.family].stable]
+        return stable[-1] if stable and stable[-1] < self.points[-1] else None
+
+    def _bounded(self, points, h, spectrum, factors) -> Float[Array, " formulas"]:
+        """The factors by which steps may grow, where those of that length damp what should be damped."""
+        steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
+        then, now = jax.vmap(lambda steps: are_damped(self.family, points, steps, spectrum))(steps)
+        zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)
+        return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
 
     def _start(self, terms, t0, t1, y0, args, chart, tally, work) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
@@ -290,7 +317,9 @@ class Hermite(AbstractMultistep):
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         free = free_components(terms, flat, chart)
         none = jnp.zeros((flat.size, free.size), flat.dtype)
-        matrix = Linearization(none, none, none if self.matrix == "exact" else None, jnp.asarray(1, jnp.int32))
+        exact = none if self.matrix == "exact" else None
+        spectrum = None if self._stable is None else jnp.zeros(free.size, jnp.result_type(flat.dtype, np.complex64))
+        matrix = Linearization(none, none, exact, spectrum, jnp.asarray(1, jnp.int32))
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, tally.at[0].add(1), work, chart)
