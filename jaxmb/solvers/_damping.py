@@ -30,8 +30,8 @@ _RIGHT = 1e-3
 
 @functools.cache
 def sectors(family: str) -> NDArray[np.float64]:
-    """For each number of points k, from none on, and each of the sizes of `h λ`: within which angle of the negative real
-    axis solutions do not grow; infinite where they do not in the whole left half-plane.
+    """For each number of points k, from none on, and each of the sizes of `h λ`: within which angle of the negative
+    real axis solutions do not grow; infinite where they do not in the whole left half-plane.
     """
     highest = FAMILIES[family].highest
     out = np.full((highest + 1, _SIZES.size), np.inf)
@@ -69,16 +69,16 @@ def _eigenvalues_jvp(primals, tangents):
     return out, jnp.zeros_like(out)
 
 
-def are_damped(family: str, points: Any, steps: Float[Array, " formulas"], spectrum: Complex[Array, " n"]) -> Bool[
-    Array, " formulas"
-]:
+def are_damped(
+    family: str, points: Any, steps: Float[Array, " formulas"], spectrum: Complex[Array, " n"]
+) -> Bool[Array, " formulas"]:
     """Whether the formulas with these numbers of points, each with its step, let no component grow that should not."""
     dtype = steps.dtype
-    sizes = jnp.abs(steps)[:, None] * jnp.abs(spectrum)
+    sizes = jnp.abs(steps)[:, None] * jnp.abs(spectrum)[None]
     bins = jnp.round(jnp.log2(sizes / jnp.asarray(_SIZES[0], dtype)) * _PER_OCTAVE)
     bins = jnp.clip(bins, 0, _SIZES.size - 1).astype(jnp.int32)
     # From the negative real axis; undamped vibrations are at a right angle.
     angle = jnp.abs(jnp.angle(-spectrum))
     limits = jnp.asarray(sectors(family), dtype)[jnp.asarray(points)[:, None], bins]
     grows = jnp.real(spectrum) > jnp.asarray(_RIGHT, dtype) * jnp.abs(spectrum)
-    return jnp.all(grows | (angle <= limits), axis=1)
+    return jnp.all(grows[None] | (angle[None] <= limits), axis=1)

@@ -57,8 +57,7 @@ class Linearization(eqx.Module):
 def linearize(
     field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool, spectrum: bool
 ) -> Linearization:
-    """The derivatives of a field with respect to the free components; with `exact` those of g, and with the `spectrum`.
-    """
+    """The derivatives of a field with respect to the free components; if asked for, those of g, and the spectrum."""
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
     zero = jnp.zeros_like(t)
     fields = lambda t, y: derivatives(field, t, y)[:3] if exact else field(t, y)[0]

@@ -25,13 +25,19 @@ _WITHOUT_ESTIMATE = 0.25
 _REPEATED = (0.95, 0.5, 0.1)
 # A step cut short by somebody else is forgotten at most by this factor; beyond it differences would be rounding errors.
 _RECOVERY = 100.0
+# After a step that gave no estimate, so many steps grow by at most this factor: the longest step that can be solved is
+# not tried for every time.
+_CAUTION, _CAUTIOUS = 4, 1.4
 
 
 class ControllerState(eqx.Module):
-    """The step that was last asked for, and how often it has been rejected since the last good one."""
+    """The step that was last asked for, how often it has been rejected since the last good one, and for how many more
+    steps growth is kept small.
+    """
 
     intended: Float[Array, ""]
     rejections: Int[Array, ""]
+    caution: Int[Array, ""]
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
@@ -128,7 +134,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         if dt0 is None:
             dt0 = self._first_step(terms, t0, t1, y0, args, func)
         dt0 = self._bound(dt0, t0.dtype)
-        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), jnp.asarray(0, np.int32))
+        none = jnp.asarray(0, np.int32)
+        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), none, none)
 
     def adapt_step_size(
         self,
@@ -157,6 +164,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         scalar = lambda x: jnp.asarray(x, y_error.error.dtype)
         allowed = (scalar(self.safety) * y_error.growth) ** y_error.response
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
+        caution = controller_state.caution
+        growth = jnp.where(caution > 0, jnp.minimum(growth, scalar(_CAUTIOUS)), growth)
         # The last step of a stretch may be short only because the stretch ended there.
         recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
@@ -173,7 +182,12 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         result = diffrax.RESULTS.where(
             ~keep & (next_dt <= smallest), diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful
         )
-        state = ControllerState(lax.stop_gradient(next_dt), jnp.where(keep, 0, rejections + 1).astype(np.int32))
+        none = jnp.asarray(0, np.int32)
+        state = ControllerState(
+            intended=lax.stop_gradient(next_dt),
+            rejections=jnp.where(keep, none, rejections + 1),
+            caution=jnp.where(keep, jnp.maximum(caution - 1, none), jnp.where(y_error.retry > 0, caution, _CAUTION)),
+        )
         return keep, next_t0, next_t0 + next_dt, False, state, result
 
     def _bound(self, dt: Any, dtype: Any) -> Any:
