@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from ._damping import eigenvalues
+from ._lanes import cond_of_any_lane
 
 # `(t, y) -> ((y on the manifold, f), anything else)`, for raveled y: a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -22,6 +23,10 @@ Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Floa
 _MAX_ITERATIONS = 10
 # A matrix is made anew after a step whose corrections shrank by less than this factor from one to the next.
 _SLOW = 0.2
+# After a matrix has failed that was made for another step, so many steps make their own.
+_DISTRUST = 10
+# The number of attempts is three; this stands for success.
+_DONE = 9
 
 
 class Derivatives(NamedTuple):
@@ -111,14 +116,28 @@ def _inverse_jvp(primals, tangents):
 
 
 class Solved(NamedTuple):
-    """The end of a step, without derivatives; whether Newton's method `converged`, how many `evaluations` of f and g it
-    took, and whether it was `slow`.
+    """The end of a step, without derivatives; whether Newton's method `converged`; its last matrix, with the inverses;
+    and its `work`: evaluations of f and g, and matrices made.
     """
 
     end: Derivatives
     converged: Bool[Array, ""]
-    evaluations: Int[Array, ""]
-    slow: Bool[Array, ""]
+    matrix: Linearization
+    inverses: Inverses
+    work: Int[Array, "2"]
+
+
+class _Iterate(NamedTuple):
+    """`change` is the correction that comes next, `size` its norm; `iteration` counts from zero in each `attempt`."""
+
+    attempt: Int[Array, ""]
+    iteration: Int[Array, ""]
+    end: Derivatives
+    change: Float[Array, " free"]
+    size: Float[Array, ""]
+    matrix: Linearization
+    inverses: Inverses
+    work: Int[Array, "2"]
 
 
 def solve(
@@ -127,41 +146,80 @@ def solve(
     past: Float[Array, " n"],
     a: Any,
     b: Any,
-    guess: Float[Array, " n"],
+    predicted: Float[Array, " n"],
+    before: Float[Array, " n"],
     free: Int[Array, " free"],
     matrix: Linearization,
-    inverses: Inverses,
     size: Callable[[Array], Any],
     tol: float,
+    renew: Callable[[Float[Array, " n"]], Linearization],
 ) -> Solved:
-    """Solve `y = past + a f + b g` for the free components by Newton's method with a fixed matrix.
+    """Solve `y = past + a f + b g` for the free components by Newton's method.
 
-    **Arguments:** `guess` of y; `matrix`, and its `inverses`; `size`: the norm of a correction in units
-    of the tolerance, and `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is
-    there: what is left of it would be multiplied by the stiffness in them, and spoil predictions.
+    With the matrix that is there from the `predicted` y; failing that, with a new one from there, and from the state
+    `before` the step.
+
+    **Arguments:** `matrix`: the one that is there; `size`: the norm of a correction in units of the tolerance, and
+    `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is there: what is left
+    of it would be multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state.
     """
 
-    def correct(carry):
-        change, y, _, before, k, _ = carry
-        new = derivatives(field, t, y - matrix.state @ change)
+    def iterate(carry: _Iterate) -> _Iterate:
+        first = carry.iteration == 0
+        start = jnp.where(carry.attempt < 2, predicted, before)
+        anew = first & ((carry.matrix.renewals > 0) | (carry.attempt > 0))
+
+        def made(old):
+            return eqx.tree_at(lambda m: m.renewals, renew(start), old.renewals)
+
+        matrix = cond_of_any_lane(anew, made, lambda old: old, carry.matrix)
+        inverses = cond_of_any_lane(
+            first, lambda _: inverses_of(matrix.rate[free], a, b), lambda old: old, carry.inverses
+        )
+        end = derivatives(field, t, jnp.where(first, start, carry.end.y - matrix.state @ carry.change))
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
-        mismatch = new.g[free] - matrix.rate[free] @ new.f[free]
-        change = inverses.newton @ ((new.y - past)[free] - b * mismatch) - inverses.rate @ new.f[free]
+        mismatch = end.g[free] - matrix.rate[free] @ end.f[free]
+        change = inverses.newton @ ((end.y - past)[free] - b * mismatch) - inverses.rate @ end.f[free]
         now = size(matrix.state @ change)
-        return change, new.y, new, now, k + 1, now / before
+        rate = jnp.where(first, jnp.zeros_like(now), now / carry.size)
+        count = carry.iteration + 1
+        converged = now <= tol
+        failed = ~converged & ((count >= _MAX_ITERATIONS) | ((count > 2) & ~(rate < 2.0)) | ~jnp.isfinite(now))
+        slow = (count > 2) & (rate > _SLOW)
+        renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
+        renewals = jnp.where(converged, renewals, jnp.where(failed, _DISTRUST, matrix.renewals))
+        # A matrix made for the prediction is not made for it again.
+        following = jnp.where(anew & (carry.attempt == 0), 2, carry.attempt + 1)
+        return _Iterate(
+            attempt=jnp.where(converged, _DONE, jnp.where(failed, following, carry.attempt)).astype(jnp.int32),
+            iteration=jnp.where(failed, 0, count).astype(jnp.int32),
+            end=end,
+            change=change,
+            size=now,
+            matrix=eqx.tree_at(lambda m: m.renewals, matrix, renewals.astype(jnp.int32)),
+            inverses=inverses,
+            work=carry.work + jnp.stack([jnp.ones_like(count), anew.astype(jnp.int32)]),
+        )
 
-    def proceed(carry):
-        *_, now, k, rate = carry
-        return (now > tol) & (k < _MAX_ITERATIONS) & ((k < 3) | (rate < 2.0))
-
-    one = jnp.ones((), past.dtype)
-    nothing = jnp.zeros(free.shape[0], past.dtype)
-    carry = correct((nothing, guess, None, one * jnp.inf, jnp.array(0, jnp.int32), one))
-    change, _, end, now, k, rate = lax.while_loop(proceed, correct, carry)
-    moved = matrix.rate @ change
-    twice = matrix.rate @ moved[free] if matrix.acceleration is None else matrix.acceleration @ change
-    end = end._replace(f=end.f - moved, g=end.g - twice)
-    return Solved(end, now <= tol, k, (k > 2) & (rate > _SLOW))
+    number = jnp.zeros((), jnp.int32)
+    square = jnp.zeros((free.shape[0],) * 2, past.dtype)
+    shapes = eqx.filter_eval_shape(derivatives, field, t, predicted)
+    blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
+    carry = _Iterate(
+        attempt=number,
+        iteration=number,
+        end=jax.tree.map(blank, shapes),
+        change=square[0],
+        size=jnp.ones((), past.dtype),
+        matrix=matrix,
+        inverses=Inverses(square, square, square),
+        work=jnp.zeros(2, jnp.int32),
+    )
+    last = lax.while_loop(lambda carry: carry.attempt < 3, iterate, carry)
+    moved = last.matrix.rate @ last.change
+    twice = last.matrix.rate @ moved[free] if matrix.acceleration is None else last.matrix.acceleration @ last.change
+    end = last.end._replace(f=last.end.f - moved, g=last.end.g - twice)
+    return Solved(end, last.attempt == _DONE, last.matrix, last.inverses, last.work)
 
 
 @eqx.filter_custom_jvp

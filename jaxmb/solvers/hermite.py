@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -18,9 +18,8 @@ from ._damping import are_damped
 from ._evaluation import field_of, first_chart, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
-from ._implicit import Inverses, Linearization, Solved, derivatives, differentiable, inverses_of, linearize, solve
+from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
-from ._lanes import cond_of_any_lane
 from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
 from ._order import GAIN, LOWER, StepEstimate, choose_order, growth_factors
 from ._tolerances import Tolerances
@@ -29,8 +28,6 @@ from ._tolerances import Tolerances
 _NEWTON = 0.01
 # The error that a step aims at, in units of the tolerance.
 _TARGET = 0.05
-# After a matrix has failed that was made for another step, so many steps make their own.
-_DISTRUST = 10
 
 
 class HermiteState(eqx.Module):
@@ -199,9 +196,9 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.scale(before, before)
         newton = self._newton(field, t1, past, a, b, predicted, before, free, state.matrix, scale, y0)
-        y, f, g = differentiable(newton.solved.end[:3], field, t1, past, a, b, free)
-        chart, broken = newton.solved.end.rest
-        failed = ~newton.solved.converged | broken
+        y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
+        chart, broken = newton.end.rest
+        failed = ~newton.converged | broken
 
         ends = coefficients.past @ history.differences[:, :n]
         ends = (
@@ -263,33 +260,11 @@ class Hermite(AbstractMultistep):
         result = diffrax.RESULTS.where(failed, FAILED, diffrax.RESULTS.successful)
         return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
 
-    def _newton(self, field, t, past, a, b, predicted, before, free, matrix, scale, like) -> "_Newton":
-        """Newton's method with the matrix that is there; failing that, with a new one, and from the step's start."""
+    def _newton(self, field, t, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
         field, t, past, a, b, predicted, before = freeze((field, t, past, a, b, predicted, before))
-
-        def attempt(carry):
-            k, _, matrix, _, work = carry
-            guess = jnp.where(k < 2, predicted, before)
-            anew = (matrix.renewals > 0) | (k > 0)
-
-            def renew(matrix):
-                new = linearize(field, t, guess, free, self.matrix == "exact", self._stable is not None)
-                return eqx.tree_at(lambda m: m.renewals, new, matrix.renewals)
-
-            matrix = cond_of_any_lane(anew, renew, lambda matrix: matrix, matrix)
-            inverses = inverses_of(matrix.rate[free], a, b)
-            solved = solve(field, t, past, a, b, guess, free, matrix, inverses, size, _NEWTON)
-            again = jnp.maximum(matrix.renewals - 1, solved.slow.astype(jnp.int32))
-            renewals = jnp.where(solved.converged, again, _DISTRUST)
-            matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals.astype(jnp.int32))
-            # A matrix made for the prediction is not made for it again.
-            k = jnp.where(anew & (k == 0), 2, k + 1)
-            return k, solved, matrix, inverses, work + jnp.stack([solved.evaluations, anew.astype(jnp.int32)])
-
-        carry = attempt((jnp.array(0), None, matrix, None, jnp.zeros(2, jnp.int32)))
-        proceed = lambda carry: ~carry[1].converged & (carry[0] < 3)
-        return _Newton(*lax.while_loop(proceed, attempt, carry)[1:])
+        renew = lambda y: linearize(field, t, y, free, self.matrix == "exact", self._stable is not None)
+        return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.
@@ -335,13 +310,6 @@ class Hermite(AbstractMultistep):
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
-
-
-class _Newton(NamedTuple):
-    solved: Solved
-    matrix: Linearization
-    inverses: Inverses
-    work: Int[Array, "2"]
 
 
 def _ladder(points: tuple[int, ...]) -> np.ndarray:
