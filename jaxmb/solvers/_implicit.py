@@ -162,6 +162,11 @@ def solve(
     **Arguments:** `matrix`: the one that is there; `size`: the norm of a correction in units of the tolerance, and
     `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is there: what is left
     of it would be multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state.
+
+    After the first evaluation g is taken along the rate that the correction before has made of f. In f what is left of
+    y's error is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times
+    the square of the step: Newton's method would converge from near by only, on Robertson's reaction from nearer than
+    rounding allows.
     """
 
     def iterate(carry: _Iterate) -> _Iterate:
@@ -176,11 +181,18 @@ def solve(
         inverses = cond_of_any_lane(
             first, lambda _: inverses_of(matrix.rate[free], a, b), lambda old: old, carry.inverses
         )
-        end = derivatives(field, t, jnp.where(first, start, carry.end.y - matrix.state @ carry.change))
+        at = jnp.where(first, start, carry.end.y - matrix.state @ carry.change)
+        (y, f), push, rest = jax.linearize(field, t, at, has_aux=True)
+        along = jnp.where(first, f, carry.end.f)
+        g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
-        mismatch = end.g[free] - matrix.rate[free] @ end.f[free]
-        change = inverses.newton @ ((end.y - past)[free] - b * mismatch) - inverses.rate @ end.f[free]
+        mismatch = g[free] - matrix.rate[free] @ along[free]
+        change = inverses.newton @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
         now = size(matrix.state @ change)
+        corrected = f - matrix.rate @ change
+        g = g + matrix.rate @ (corrected - along)[free]
+        if matrix.acceleration is not None:
+            g = g + (matrix.rate @ matrix.rate[free] - matrix.acceleration) @ change
         rate = jnp.where(first, jnp.zeros_like(now), now / carry.size)
         count = carry.iteration + 1
         converged = now <= tol
@@ -193,7 +205,7 @@ def solve(
         return _Iterate(
             attempt=jnp.where(converged, _DONE, jnp.where(failed, following, carry.attempt)).astype(jnp.int32),
             iteration=jnp.where(failed, 0, count).astype(jnp.int32),
-            end=end,
+            end=Derivatives(y, corrected, g, rest),
             change=change,
             size=now,
             matrix=eqx.tree_at(lambda m: m.renewals, matrix, renewals.astype(jnp.int32)),
@@ -216,10 +228,7 @@ def solve(
         work=jnp.zeros(2, jnp.int32),
     )
     last = lax.while_loop(lambda carry: carry.attempt < 3, iterate, carry)
-    moved = last.matrix.rate @ last.change
-    twice = last.matrix.rate @ moved[free] if matrix.acceleration is None else last.matrix.acceleration @ last.change
-    end = last.end._replace(f=last.end.f - moved, g=last.end.g - twice)
-    return Solved(end, last.attempt == _DONE, last.matrix, last.inverses, last.work)
+    return Solved(last.end, last.attempt == _DONE, last.matrix, last.inverses, last.work)
 
 
 @eqx.filter_custom_jvp
