@@ -52,6 +52,15 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self):  # pyright: ignore
         return self.solver.interpolation_cls
 
+    # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
+    @property
+    def root_finder(self) -> Any:
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self) -> int:
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
     def order(self, terms):
         return self.solver.order(terms)
 
