@@ -37,8 +37,8 @@ from jaxmb.solvers import Hermite, MultistepController
 MAX_STEPS = 200_000
 ERROR = 1e-8
 REPEATS = 7
-# Some of their runs take half a minute.
-MECHANISM_REPEATS = 2
+# Some of their runs take a minute.
+MECHANISM_REPEATS = 1
 
 ODES = {"vdpol": "van der Pol 1e3", "robertson": "Robertson", "hires": "HIRES"}
 MECHANISMS = ("flyball", "stiff_four_bar")
@@ -52,7 +52,7 @@ TOLERANCES = {
     "vdpol": {"Hermite": (-5, -12, 2), "Kvaerno5": (-5, -12, 2), "CVODE": (-5, -13, 2)},
     "robertson": {"Hermite": (-4, -9, 2), "Kvaerno5": (-4, -10, 2), "CVODE": (-4, -12, 2)},
     "hires": {"Hermite": (-5, -12, 2), "Kvaerno5": (-2, -8, 2), "CVODE": (-5, -13, 2)},
-    "flyball": {"Hermite": (-4, -12, 1), "Kvaerno5": (-2, -3, 1), "CVODE": (-4, -12, 1)},
+    "flyball": {"Hermite": (-4, -12, 1), "Kvaerno5": (-2, -3, 1), "CVODE": (-4, -9, 1)},
     "stiff_four_bar": {"Hermite": (-3, -10, 1), "Kvaerno5": (-2, -4, 1), "CVODE": (-3, -6, 1)},
 }
 
