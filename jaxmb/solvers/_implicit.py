@@ -5,6 +5,7 @@ directional derivative of `f`, exact. On a manifold the unknowns are the free co
 them f and g, follow from the constraints.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,8 +26,8 @@ _MAX_ITERATIONS = 10
 _SLOW = 0.2
 # After a matrix has failed that was made for another step, so many steps make their own.
 _DISTRUST = 10
-# The number of attempts is three; this stands for success.
-_DONE = 9
+# How often Newton's method is begun for a step; and what stands for success.
+_ATTEMPTS, _DONE = 3, 9
 
 
 class Derivatives(NamedTuple):
@@ -128,16 +129,13 @@ class Solved(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """`change` is the correction that comes next, `size` its norm; `iteration` counts from zero in each `attempt`."""
+    """`change` is the correction that comes next, `size` its norm, and `rate` that over the norm of the one before."""
 
-    attempt: Int[Array, ""]
-    iteration: Int[Array, ""]
     end: Derivatives
     change: Float[Array, " free"]
     size: Float[Array, ""]
-    matrix: Linearization
-    inverses: Inverses
-    work: Int[Array, "2"]
+    rate: Float[Array, ""]
+    count: Int[Array, ""]
 
 
 def solve(
@@ -169,66 +167,52 @@ def solve(
     rounding allows.
     """
 
-    def iterate(carry: _Iterate) -> _Iterate:
-        first = carry.iteration == 0
-        start = jnp.where(carry.attempt < 2, predicted, before)
-        anew = first & ((carry.matrix.renewals > 0) | (carry.attempt > 0))
+    shapes = eqx.filter_eval_shape(derivatives, field, t, predicted)
+    blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
+    nothing = jax.tree.map(blank, shapes)
+    none, one = jnp.zeros((), jnp.int32), jnp.ones((), past.dtype)
 
-        def made(old):
-            return eqx.tree_at(lambda m: m.renewals, renew(start), old.renewals)
-
-        matrix = cond_of_any_lane(anew, made, lambda old: old, carry.matrix)
-        inverses = cond_of_any_lane(
-            first, lambda _: inverses_of(matrix.rate[free], a, b), lambda old: old, carry.inverses
-        )
-        at = jnp.where(first, start, carry.end.y - matrix.state @ carry.change)
-        (y, f), push, rest = jax.linearize(field, t, at, has_aux=True)
-        along = jnp.where(first, f, carry.end.f)
+    def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
+        (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
+        along = jnp.where(carry.count == 0, f, carry.end.f)
         g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
         change = inverses.newton @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
-        now = size(matrix.state @ change)
         corrected = f - matrix.rate @ change
         g = g + matrix.rate @ (corrected - along)[free]
         if matrix.acceleration is not None:
             g = g + (matrix.rate @ matrix.rate[free] - matrix.acceleration) @ change
-        rate = jnp.where(first, jnp.zeros_like(now), now / carry.size)
-        count = carry.iteration + 1
-        converged = now <= tol
-        failed = ~converged & ((count >= _MAX_ITERATIONS) | ((count > 2) & ~(rate < 2.0)) | ~jnp.isfinite(now))
-        slow = (count > 2) & (rate > _SLOW)
-        renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
-        renewals = jnp.where(converged, renewals, jnp.where(failed, _DISTRUST, matrix.renewals))
-        # A matrix made for the prediction is not made for it again.
-        following = jnp.where(anew & (carry.attempt == 0), 2, carry.attempt + 1)
-        return _Iterate(
-            attempt=jnp.where(converged, _DONE, jnp.where(failed, following, carry.attempt)).astype(jnp.int32),
-            iteration=jnp.where(failed, 0, count).astype(jnp.int32),
-            end=Derivatives(y, corrected, g, rest),
-            change=change,
-            size=now,
-            matrix=eqx.tree_at(lambda m: m.renewals, matrix, renewals.astype(jnp.int32)),
-            inverses=inverses,
-            work=carry.work + jnp.stack([jnp.ones_like(count), anew.astype(jnp.int32)]),
-        )
+        now = size(matrix.state @ change)
+        return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.count + 1)
 
-    number = jnp.zeros((), jnp.int32)
-    square = jnp.zeros((free.shape[0],) * 2, past.dtype)
-    shapes = eqx.filter_eval_shape(derivatives, field, t, predicted)
-    blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
-    carry = _Iterate(
-        attempt=number,
-        iteration=number,
-        end=jax.tree.map(blank, shapes),
-        change=square[0],
-        size=jnp.ones((), past.dtype),
-        matrix=matrix,
-        inverses=Inverses(square, square, square),
-        work=jnp.zeros(2, jnp.int32),
-    )
-    last = lax.while_loop(lambda carry: carry.attempt < 3, iterate, carry)
-    return Solved(last.end, last.attempt == _DONE, last.matrix, last.inverses, last.work)
+    def proceed(carry: _Iterate) -> Bool[Array, ""]:
+        hopeful = (carry.count < 3) | (carry.rate < 2.0)
+        # Before the first iteration the size is infinite.
+        return ~(carry.size <= tol) & (carry.count < _MAX_ITERATIONS) & hopeful
+
+    def attempt(carry):
+        k, matrix, _, _, work = carry
+        start = jnp.where(k < 2, predicted, before)
+        anew = (matrix.renewals > 0) | (k > 0)
+        renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start), old.renewals)
+        matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
+        inverses = inverses_of(matrix.rate[free], a, b)
+        first = _Iterate(nothing._replace(y=start), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
+        last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
+        converged = last.size <= tol
+        slow = (last.count > 2) & (last.rate > _SLOW)
+        renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
+        renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
+        matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
+        # A matrix made for the prediction is not made for it again.
+        k = jnp.where(converged, _DONE, jnp.where(anew & (k == 0), 2, k + 1)).astype(jnp.int32)
+        return k, matrix, inverses, last.end, work + jnp.stack([last.count, anew.astype(jnp.int32)])
+
+    square = jnp.zeros((free.size, free.size), past.dtype)
+    carry = none, matrix, Inverses(square, square, square), nothing, jnp.zeros(2, jnp.int32)
+    k, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
+    return Solved(end, k == _DONE, matrix, inverses, work)
 
 
 @eqx.filter_custom_jvp
