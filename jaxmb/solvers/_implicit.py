@@ -238,7 +238,9 @@ def _differentiable_jvp(primals, tangents):
     values, structure = eqx.partition(field, eqx.is_inexact_array)
 
     def at(values, t, change):
-        return derivatives(eqx.combine(values, structure), t, y.at[free].add(change))[:3]
+        # What g is for a rate that is held: the other part of its change is J times that of the rate.
+        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, y.at[free].add(change), has_aux=True)
+        return state, rate, push(jnp.ones_like(t), f)[1]
 
     still = jnp.zeros(free.shape[0], y.dtype)
     _, push = jax.linearize(at, values, t, still)
@@ -247,14 +249,22 @@ def _differentiable_jvp(primals, tangents):
     moved = push(dvalues, dense(dt, t), still)
     zeros = jax.tree.map(jnp.zeros_like, (values, t))
     columns = jax.vmap(lambda change: push(*zeros, change), out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
-    load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + a * moved[1] + b * moved[2])[free]
-    # The matrix of the equation is P, as in `Inverses`, minus b times what g changes by beyond the square of J. Through
-    # the inverse of P rounding errors are not multiplied by the square of the stiffness; in f, nor by the stiffness.
+    # The matrix of the equation is P, as in `Inverses`, minus b times what g changes by at a held rate.
     jacobian, identity = columns[1][free], jnp.eye(still.size, dtype=still.dtype)
     inverses = inverses_of(jacobian, a, b)
-    beyond = b * (columns[2][free] - jacobian @ jacobian)
-    smooth = inverse(identity - beyond @ inverses.newton) @ load
-    change = inverses.newton @ smooth
+    beyond = b * columns[2][free]
+    rest = inverse(identity - inverses.newton @ beyond)
+    load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + b * moved[2])[free]
+
+    def correction(change):
+        # What is large is kept together as in `solve`, and nothing rests on the last digits of an inverse.
+        rate = moved[1][free] + jacobian @ change
+        mismatch = change - load - beyond @ change
+        return rest @ (inverses.newton @ mismatch - inverses.rate @ rate), rate
+
+    change = -correction(still)[0]
+    left, rate = correction(change)
+    rate = rate - jacobian @ left
     dy, df, dg = (along + column @ change for along, column in zip(moved, columns, strict=True))
-    df = df.at[free].set(moved[1][free] + inverses.slope @ smooth, unique_indices=True)
-    return (y, f, g), (dy, df, dg)
+    df = df.at[free].set(rate, unique_indices=True)
+    return (y, f, g), (dy, df, dg + columns[1] @ rate)
