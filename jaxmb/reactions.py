@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._types import Scalar, State
-from .rotations import cross, rotate
+from .rotations import cross
 from .system import RigidBodySystem
 
 
@@ -57,7 +57,7 @@ def _on_last_body(system, group, k, poses, wrenches):
             arm = system.layout.space.direction(pose, point)
             moment = moment - (arm[0] * force[1] - arm[1] * force[0])
         return force, moment
-    force, moment = wrench[:3], rotate(pose[3:], wrench[3:])
+    force, moment = wrench[:3], system.layout.space.direction(pose, wrench[3:])
     if point is not None:
         moment = moment - cross(system.layout.space.direction(pose, point), force)
     return force, moment

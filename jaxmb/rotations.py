@@ -81,6 +81,11 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     return _bilinear(_CROSS, a, b)
 
 
+def skew(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix `ã` of the vector product, `ã b = a × b`."""
+    return jnp.sum(_constant(_CROSS, a) * a[None, :, None], axis=1)
+
+
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:
     """Euler parameters of the inverse rotation."""
     return p * _constant(_CONJUGATE, p)
@@ -102,6 +107,20 @@ def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array,
     This is the adjoint of `rates`.
     """
     return _bilinear(_RATES.transpose(2, 1, 0), p, gradient)
+
+
+def matrix_rates(R: Float[Array, "3 3"], omega: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`Ṙ = R ω̃′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
+    return jnp.sum(R[:, :, None] * skew(omega)[None, :, :], axis=1)
+
+
+def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The body torque that does the work of the gradient with respect to a rotation matrix.
+
+    This is the adjoint of `matrix_rates`.
+    """
+    work = jnp.sum(R[:, :, None] * gradient[:, None, :], axis=0)
+    return jnp.sum(_constant(_CROSS, R) * work[:, None, :], axis=(0, 2))
 
 
 def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Array, "3"]:

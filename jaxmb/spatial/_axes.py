@@ -15,39 +15,40 @@ from .._resolve import fill, label, unit, vector
 Vector3 = Float[Array, "3"]
 
 
-def perpendiculars(axis: Vector3) -> tuple[Vector3, Vector3]:
+def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     """Two directions that make a right-handed orthogonal triad `(u, v, axis)`, u of unit length.
 
     They are worked out from `axis` wherever they are needed, so that derivatives with respect to `axis` are right.
     """
     # The coordinate axis least parallel to `axis` (no single one serves them all): a choice without derivative.
     k = jnp.argmin(jnp.abs(jax.lax.stop_gradient(axis)))
-    u = rot.cross((jnp.arange(3) == k).astype(axis.dtype), axis)
-    u = u / rot.norm(u)
-    return u, rot.cross(axis, u)
+    skew = rot.skew(axis)
+    u = jnp.sum(skew * (jnp.arange(3) == k).astype(axis.dtype)[:, None], axis=0)
+    u = u / jnp.sqrt(jnp.sum(u * u))
+    return jnp.stack([u, jnp.sum(skew * u[None, :], axis=1)])
 
 
-def direction_in_a(space, poses: Float[Array, "k 7"], v_b: Vector3) -> Vector3:
+def direction_in_a(space, poses: Float[Array, "k p"], v_b: Vector3) -> Vector3:
     """Components in A of a direction fixed in B."""
     return space.body_direction(poses[0], space.direction(poses[1], v_b))
 
 
-def shift_in_a(space, part, poses: Float[Array, "k 7"]) -> Vector3:
+def shift_in_a(space, part, poses: Float[Array, "k p"]) -> Vector3:
     """Components in A of `d`, from point A to point B [m]."""
     return space.body_point(poses[0], space.point(poses[1], part.point_b)) - part.point_a
 
 
-def relative_orientation(poses: Float[Array, "k 7"]) -> Float[Array, "4"]:
+def relative_orientation(poses: Float[Array, "k p"]) -> Float[Array, "4"]:
     """Euler parameters of B relative to A."""
-    return rot.multiply(rot.conjugate(poses[0, 3:]), poses[1, 3:])
+    return rot.multiply(rot.conjugate(poses[0, 3:7]), poses[1, 3:7])
 
 
-def turn_vector(part, poses: Float[Array, "k 7"]) -> Vector3:
+def turn_vector(part, poses: Float[Array, "k p"]) -> Vector3:
     """Twice the vector part of the turn from `part.orientation` to the relative attitude [rad, for small turns]."""
     return 2.0 * rot.multiply(rot.conjugate(part.orientation), relative_orientation(poses))[1:]
 
 
-def cosine_sine(space, part, poses: Float[Array, "k 7"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def cosine_sine(space, part, poses: Float[Array, "k p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cosine and sine of the angle from `x_a` to `x_b` about `axis_a`, as products of direction components.
 
     Only the parts perpendicular to `axis_a` count; the two have a common factor, which is 1 where `x_a` and `x_b` are
@@ -58,14 +59,14 @@ def cosine_sine(space, part, poses: Float[Array, "k 7"]) -> tuple[Float[Array, "
     return jnp.dot(rot.cross(y_a, part.axis_a), x), jnp.dot(y_a, x)
 
 
-def angle(space, part, poses: Float[Array, "k 7"]) -> Float[Array, ""]:
+def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
     """The angle [rad] from `x_a` to `x_b` about `axis_a`, in (−π, π]; zero where it is undefined."""
     c, s = cosine_sine(space, part, poses)
     defined = c * c + s * s > 0
     return jnp.where(defined, jnp.arctan2(s, jnp.where(defined, c, 1.0)), 0.0)
 
 
-def resolve_axis(part, space, poses: Float[Array, "k 7"]):
+def resolve_axis(part, space, poses: Float[Array, "k p"]):
     """Fill `axis_a` of a part from its world axis, or check it."""
     if (part.axis is None) == (part.axis_a is None):
         raise ValueError(
@@ -78,7 +79,7 @@ def resolve_axis(part, space, poses: Float[Array, "k 7"]):
     return eqx.tree_at(lambda p: (p.axis_a, p.axis), part, (axis, None), is_leaf=lambda x: x is None)
 
 
-def resolve_references(part, space, poses: Float[Array, "k 7"]):
+def resolve_references(part, space, poses: Float[Array, "k p"]):
     """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, or check them."""
     if (part.x_a is None) != (part.x_b is None):
         raise ValueError(
@@ -94,7 +95,7 @@ def resolve_references(part, space, poses: Float[Array, "k 7"]):
     return eqx.tree_at(lambda p: (p.x_a, p.x_b), part, (x_a, x_b))
 
 
-def resolve_orientation(part, poses: Float[Array, "k 7"]):
+def resolve_orientation(part, poses: Float[Array, "k p"]):
     """Fill `orientation`, Euler parameters of B relative to A, with that of the given poses, or check it."""
     if part.orientation is None:
         return fill(part, "orientation", rot.normalize(relative_orientation(poses)))

@@ -36,7 +36,7 @@ def _separation(space, part, poses):
 
 def _across(axis_a, w):
     """The components `u·w`, `v·w` of a vector in A across the axis: zero where it is parallel to the axis."""
-    return jnp.stack([jnp.dot(across, w) for across in perpendiculars(axis_a)])
+    return jnp.sum(perpendiculars(axis_a) * w[None, :], axis=1)
 
 
 def _parallel(space, part, poses):

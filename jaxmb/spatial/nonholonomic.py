@@ -62,7 +62,7 @@ def _lowest_rim_point(space, part, pose):
 
 
 def _tangential(normal, v):
-    return jnp.stack([jnp.dot(tangent, v) for tangent in perpendiculars(normal)])
+    return jnp.sum(perpendiculars(normal) * v[None, :], axis=1)
 
 
 class RollingDisk(AbstractLink):

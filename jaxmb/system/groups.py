@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._parts import AbstractLink
 from .._types import Scalar
-from .layout import Layout
+from .layout import Layout, pick
 
 
 class Group(eqx.Module):
@@ -35,10 +35,7 @@ class Group(eqx.Module):
 
     def own(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
         """What each part's bodies have, from poses or velocities of all bodies and the ground."""
-        return of_bodies[self.body_index]
-
-    def rates(self, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]) -> Float[Array, "k p"]:
-        return jax.vmap(self.layout.space.rates)(poses, velocities)
+        return pick(of_bodies, self.body_index)
 
 
 def stack(parts: Sequence[tuple[AbstractLink, tuple[int, ...]]], layout: Layout) -> tuple[Group, ...]:
@@ -70,13 +67,15 @@ def _anonymous(part: AbstractLink) -> AbstractLink:
 
 
 class AbstractConstraintGroup(eqx.Module):
-    """Kernels of stacked constraints, from what each says about velocities."""
+    """Kernels of stacked constraints."""
 
     group: Group
 
     @abc.abstractmethod
-    def _rate(self, part, t, poses, v) -> Array:
-        """Residuals of one part between the velocities of its bodies, shape (rows,)."""
+    def velocity(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> Float[Array, "parts rows"]:
+        """Residuals between velocities."""
 
     @abc.abstractmethod
     def jacobian(
@@ -84,16 +83,7 @@ class AbstractConstraintGroup(eqx.Module):
     ) -> Float[Array, "parts rows k v"]:
         """Derivative with respect to velocities, body by body."""
 
-    @property
-    def rows(self) -> int:
-        return self.group.rows
-
-    def velocity(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts rows"]:
-        """Residuals between velocities."""
-        return self._map(lambda part, poses, v: self._rate(part, t, poses, v), poses, velocities)
-
+    @abc.abstractmethod
     def wrenches(
         self,
         t: Scalar,
@@ -103,11 +93,7 @@ class AbstractConstraintGroup(eqx.Module):
     ) -> Float[Array, "parts k v"]:
         """What the constraints do to their bodies, `Aᵀ λ` body by body."""
 
-        def single(part, poses, v, multipliers):
-            return jax.vjp(lambda w: self._rate(part, t, poses, w), v)[1](multipliers)[0]
-
-        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities), multipliers)
-
+    @abc.abstractmethod
     def acceleration(
         self,
         t: Scalar,
@@ -117,62 +103,101 @@ class AbstractConstraintGroup(eqx.Module):
     ) -> Float[Array, "parts rows"]:
         """The time derivative of the residuals between velocities."""
 
-        def single(part, poses, v, a):
-            rate = lambda t, poses, v: self._rate(part, t, poses, v)
-            return jax.jvp(rate, (t, poses, v), (jnp.ones_like(t), self.group.rates(poses, v), a))[1]
-
-        return self._map(single, poses, velocities, accelerations)
+    @property
+    def rows(self) -> int:
+        return self.group.rows
 
     @property
     def _space(self):
         return self.group.layout.space
 
-    def _map(self, single, poses, *velocities):
-        return jax.vmap(single)(self.group.part, self.group.own(poses), *map(self.group.own, velocities))
+    def _map(self, single, *of_bodies, more=()):
+        """`single(part, …)` of every part, with what its own bodies have and `more` of the parts themselves."""
+        return jax.vmap(single)(self.group.part, *map(self.group.own, of_bodies), *more)
 
 
 class ConstraintGroup(AbstractConstraintGroup):
     """Kernels of stacked constraints between positions."""
 
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
-        return self._map(lambda part, poses: part.residual(self._space, poses, t), poses)
+        return self._map(lambda part, x: part.residual(self._space, x, t), poses)
 
-    def coordinate_jacobian(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows k p"]:
-        return self._map(lambda part, poses: jax.jacfwd(lambda x: part.residual(self._space, x, t))(poses), poses)
+    def along(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], moves: Float[Array, "b_ground n p"]
+    ) -> Float[Array, "parts rows k n"]:
+        """Derivatives along `n` motions of every body, one at a time."""
 
-    def jacobian(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts rows k v"]:
-        """Derivative along unit velocities: `Φ_q N`, body by body."""
+        def single(part, x, moves):
+            k, n, size = moves.shape
+            residual = lambda x: part.residual(self._space, x, t)
+            # One body moves, the others rest.
+            one = jnp.eye(k, dtype=x.dtype)[:, None, :, None] * moves[:, :, None, :]
+            push = lambda dx: jax.jvp(residual, (x,), (dx,))[1]
+            return jax.vmap(push, out_axes=-1)(one.reshape(k * n, k, size)).reshape(-1, k, n)
+
+        return self._map(single, poses, moves)
+
+    def jacobian(self, t, poses, velocities):
+        del velocities
+        unit = jnp.eye(self._space.velocity_size, dtype=poses.dtype)
+        moves = jax.vmap(lambda x: jax.vmap(lambda v: self._space.rates(x, v))(unit))(poses)
+        return self.along(t, poses, moves)
+
+    def velocity(self, t, poses, velocities):
+        return self._map(lambda part, x, xdot: self._rate(part, t, x, xdot), poses, self._rates(poses, velocities))
+
+    def wrenches(self, t, poses, velocities, multipliers):
         del velocities
 
-        def single(part, poses):
-            residual = lambda x: part.residual(self._space, x, t)
-            along = lambda v: jax.jvp(residual, (poses,), (self.group.rates(poses, v),))[1]
-            k, size = poses.shape[0], self._space.velocity_size
-            unit = jnp.eye(k * size, dtype=poses.dtype).reshape(-1, k, size)
-            return jax.vmap(along, out_axes=-1)(unit).reshape(-1, k, size)
+        def single(part, x, multipliers):
+            _, pull = jax.vjp(lambda x: part.residual(self._space, x, t), x)
+            return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
-        return self._map(single, poses)
+        return self._map(single, poses, more=(multipliers,))
 
-    def _rate(self, part, t, poses, v):
-        rates = self.group.rates(poses, v)
+    def acceleration(self, t, poses, velocities, accelerations):
+        rates = self._rates(poses, velocities)
+        _, second = jax.jvp(self._rates, (poses, velocities), (rates, accelerations))
+
+        def single(part, x, xdot, xddot):
+            rate = lambda t, x, xdot: self._rate(part, t, x, xdot)
+            return jax.jvp(rate, (t, x, xdot), (jnp.ones_like(t), xdot, xddot))[1]
+
+        return self._map(single, poses, rates, second)
+
+    def _rates(self, poses, velocities):
+        return jax.vmap(self._space.rates)(poses, velocities)
+
+    def _rate(self, part, t, x, xdot):
+        """Residuals of one part between the rates of its bodies' poses."""
         if part.rheonomic:
-            return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
-        return jax.jvp(lambda x: part.residual(self._space, x, t), (poses,), (rates,))[1]
+            return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, x), (jnp.ones_like(t), xdot))[1]
+        return jax.jvp(lambda x: part.residual(self._space, x, t), (x,), (xdot,))[1]
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
     """Kernels of stacked constraints between velocities."""
 
-    def jacobian(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts rows k v"]:
-        single = lambda part, poses, v: jax.jacfwd(lambda w: part.residual(self._space, poses, w, t))(v)
+    def velocity(self, t, poses, velocities):
+        return self._map(lambda part, x, v: part.residual(self._space, x, v, t), poses, velocities)
+
+    def jacobian(self, t, poses, velocities):
+        single = lambda part, x, v: jax.jacfwd(lambda w: part.residual(self._space, x, w, t))(v)
         return self._map(single, poses, velocities)
 
-    def _rate(self, part, t, poses, v):
-        return part.residual(self._space, poses, v, t)
+    def wrenches(self, t, poses, velocities, multipliers):
+        def single(part, x, v, multipliers):
+            return jax.vjp(lambda w: part.residual(self._space, x, w, t), v)[1](multipliers)[0]
+
+        return self._map(single, poses, velocities, more=(multipliers,))
+
+    def acceleration(self, t, poses, velocities, accelerations):
+        def single(part, x, xdot, v, a):
+            residual = lambda t, x, v: part.residual(self._space, x, v, t)
+            return jax.jvp(residual, (t, x, v), (jnp.ones_like(t), xdot, a))[1]
+
+        rates = jax.vmap(self._space.rates)(poses, velocities)
+        return self._map(single, poses, rates, velocities, accelerations)
 
 
 class ForceGroup(eqx.Module):

@@ -3,8 +3,12 @@
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from ..rotations import cross
 
 
 class AbstractInertia(eqx.Module):
@@ -70,6 +74,6 @@ def _block_product(J, w):
 
 
 def _inverse_3x3(J):
-    a, b, c = J[:, 0], J[:, 1], J[:, 2]
-    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
-    return adjugate / jnp.sum(a * jnp.cross(b, c), axis=-1)[:, None, None]
+    # Row k of the cofactors is the product of the two rows after row k.
+    cofactors = jax.vmap(jax.vmap(cross))(J[:, np.array([1, 2, 0])], J[:, np.array([2, 0, 1])])
+    return cofactors.swapaxes(1, 2) / jnp.sum(J[:, 0] * cofactors[:, 0], axis=-1)[:, None, None]

@@ -14,7 +14,7 @@ from ..rotations import cross, rotate
 from ._base import AbstractSystem
 from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
-from .layout import Layout
+from .layout import Layout, pick
 
 if TYPE_CHECKING:
     from .describe import Description
@@ -138,9 +138,8 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
         """Poses of the bodies and of the ground, as parts take them."""
-        space = self.layout.space
-        ground = space.prepare(jnp.asarray(space.ground, q.dtype))[None]
-        return jnp.concatenate([jax.vmap(space.prepare)(self.poses(q)), ground])
+        ground = jnp.asarray(self.layout.space.ground, q.dtype)
+        return jax.vmap(self.layout.space.prepare)(jnp.concatenate([self.poses(q), ground[None]]))
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
         """Velocities of the bodies and of the ground."""
@@ -151,13 +150,13 @@ class RigidBodySystem(AbstractSystem):
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
-        return jnp.concatenate([q, ground])[self.layout.pose_index[:-1]]
+        return pick(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
     def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
         """Velocities of the bodies."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
-        return jnp.concatenate([u, jnp.zeros(1, u.dtype)])[self.layout.velocity_index[:-1]]
+        return pick(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
 
     def rates(self, t, q, u):
         if self.rates_are_velocities:
@@ -192,7 +191,10 @@ class RigidBodySystem(AbstractSystem):
         if self.rates_are_velocities:
             return self._jacobian(t, q, jnp.zeros(self.nu, q.dtype), self.constraints)
         poses = self.prepared_poses(q)
-        blocks = [g.coordinate_jacobian(t, poses) for g in self.constraints]
+        unit = jnp.eye(self.layout.space.pose_size, dtype=q.dtype)
+        along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(unit)
+        moves = jax.vmap(along)(poses[:, : self.layout.space.pose_size])
+        blocks = [g.along(t, poses, moves) for g in self.constraints]
         jacobian = self._assemble(blocks, self.constraints, q.dtype, of_poses=True)
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
@@ -230,7 +232,7 @@ class RigidBodySystem(AbstractSystem):
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
-        return _join([*blocks, jnp.zeros(1, dtype)], dtype)[source]
+        return pick(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
 
     # Dynamics
 
@@ -259,7 +261,7 @@ class RigidBodySystem(AbstractSystem):
         if not wrenches:
             return jnp.zeros(self.nu, dtype)
         source = self.layout.force_source(bodies)
-        return jnp.sum(_join([*wrenches, jnp.zeros(1, dtype)], dtype)[source], axis=1)
+        return jnp.sum(pick(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
 
     def _own_wrenches(self, u):
         """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
