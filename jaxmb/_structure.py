@@ -31,7 +31,7 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     for what in ("velocities", "accelerations"):
         _check_left_over(system, what, *map(np.asarray, found[what]))
     _check_locked(system, np.asarray(found["jacobian"])[: system.position_rows])
-    position, velocity = int(found["holonomic"].rank), int(found["everything"].rank)
+    position, velocity = int(found["position rank"]), int(found["everything"].rank)
     coordinate = position + system.coordinate_rows - system.position_rows
     implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
     return Ranks(position, coordinate, velocity), implied
@@ -45,23 +45,24 @@ def _analyse(system):
     scale = system.velocity_scale()
     residual = jnp.zeros((), q.dtype)
     if system.position_rows:
-        q = nearest(system, t, q, system.coordinate_scale())
-        residual = residual_size(system, t, q)
+        q, near = nearest(system, t, q, system.coordinate_scale())
+        residual = residual_size(system, t, q, near)
     jacobian = system.jacobian(t, q, u)
     stage = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
     out = {
         "q": q,
         "residual": residual,
         "jacobian": jacobian,
-        "holonomic": full_pivot(jacobian[: system.position_rows], scale=scale),
+        "position rank": full_pivot(jacobian[: system.position_rows], scale=scale).rank,
         "everything": full_pivot(jacobian, scale=scale, stage=stage),
         "velocities": (jnp.zeros(0), jnp.zeros(0)),
         "accelerations": (jnp.zeros(0), jnp.zeros(0)),
     }
-    if system.velocity_rows and system.linear:
+    if system.velocity_rows and system.linear and not system.homogeneous:
         # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is
         # contradiction.
-        solve = lambda b: jnp.linalg.lstsq(jacobian * scale[None, :], -b, rcond=1e-8)[0] * scale
+        inverse = scale[:, None] * jnp.linalg.pinv(jacobian * scale[None, :], rtol=1e-8)
+        solve = lambda b: -(inverse @ b)
         asked = system.velocity_residual(t, q, jnp.zeros_like(u))
         u = solve(asked)
         out["velocities"] = jacobian @ u + asked, asked

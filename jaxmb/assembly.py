@@ -95,11 +95,10 @@ def positions(
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
     start = lax.stop_gradient(guess)
     frozen = lax.stop_gradient(system)
-    q = nearest(frozen, lax.stop_gradient(t), start, scale)
-    q, ok = lax.stop_gradient(q), residual_size(frozen, t, q) <= tolerance(q.dtype)
+    q, jacobian = lax.stop_gradient(nearest(frozen, lax.stop_gradient(t), start, scale))
+    ok = residual_size(frozen, t, q, jacobian) <= tolerance(q.dtype)
 
     # The minimiser, exactly: Newton on the optimality conditions with the independent rows.
-    jacobian = frozen.coordinate_jacobian(t, q)
     pivots = full_pivot(jacobian, scale=scale)
     ok = ok & (pivots.rank == rank)
     rows = pivots.order.rows[:rank]
@@ -121,14 +120,15 @@ def positions(
     )
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
     refined = lax.custom_root(optimality, nearby, _newton, _tangent_solve)[: system.nq]
-    ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined) <= tolerance(q.dtype))
+    ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined, jacobian) <= tolerance(q.dtype))
     return jnp.where(ok, refined, q), ok
 
 
 def _newton(residual, x):
     def correct(carry):
         x, _, k = carry
-        step = _tangent_solve(lambda v: jax.jvp(residual, (x,), (v,))[1], residual(x))
+        value, push = jax.linearize(residual, x)
+        step = _tangent_solve(push, value)
         return x - step, jnp.max(jnp.abs(step) / (1.0 + jnp.abs(x))), k + 1
 
     def proceed(carry):
@@ -139,7 +139,7 @@ def _newton(residual, x):
 
 
 def _tangent_solve(linear, b):
-    return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
+    return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)
 
 
 @eqx.filter_jit
@@ -168,41 +168,50 @@ def velocities(
 
 def nearest(
     system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
-) -> Float[Array, "nq"]:
+) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
     """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
 
     Implied rows are allowed: the normal equations are regularised at rounding level.
+
+    **Returns:** the configuration, and the Jacobian that its last correction was made with.
     """
 
     def size(q):
         return jnp.sum(system.coordinate_residual(t, q) ** 2)
 
     def body(carry):
-        q, _, k = carry
+        q, _, _, k = carry
         residual = system.coordinate_residual(t, q)
-        jacobian = system.coordinate_jacobian(t, q) * scale[None, :]
-        gram = jacobian @ jacobian.T
+        jacobian = system.coordinate_jacobian(t, q)
+        scaled = jacobian * scale[None, :]
+        gram = scaled @ scaled.T
         shift = 1e-13 * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
-        step = -scale * (jacobian.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), residual))
+        step = -scale * (scaled.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), residual))
         # Rotations by more than about a radian leave the region where the linearisation means anything.
         longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
         step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
         lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
         sizes = jax.vmap(lambda a: size(q + a * step))(lengths)
         q = q + lengths[jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))] * step
-        return q, jnp.max(jnp.abs(step)), k + 1
+        return q, jacobian, jnp.max(jnp.abs(step)), k + 1
 
     def proceed(carry):
-        q, step, k = carry
+        q, _, step, k = carry
         return (k < _ITERATIONS) & (step > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
 
-    q, _, _ = lax.while_loop(proceed, body, (start, jnp.array(jnp.inf, start.dtype), 0))
-    return q
+    none = jnp.zeros((system.coordinate_rows, system.nq), start.dtype)
+    q, jacobian, _, _ = lax.while_loop(proceed, body, (start, none, jnp.array(jnp.inf, start.dtype), 0))
+    return q, jacobian
 
 
-def residual_size(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, ""]:
-    """Largest constraint residual, each row scaled to unit norm of its gradient times the system's size."""
-    jacobian = system.coordinate_jacobian(t, q) * system.coordinate_scale()[None, :]
+def residual_size(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
+) -> Float[Array, ""]:
+    """Largest constraint residual, each row scaled to unit norm of its gradient times the system's size.
+
+    `jacobian`: that of the coordinates there or nearby.
+    """
+    jacobian = jacobian * system.coordinate_scale()[None, :]
     norms = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1))
     floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
     return jnp.max(jnp.abs(system.coordinate_residual(t, q)) / jnp.maximum(norms, floor))

@@ -107,28 +107,30 @@ def full_pivot(
     work = (
         work / jnp.maximum(jnp.maximum(size, eps**0.75 * jnp.max(size, initial=0.0)), jnp.finfo(A.dtype).tiny)[:, None]
     )
-    stage = jnp.zeros(m, int) if stage is None else stage
     unused = jnp.iinfo(jnp.int32).max
+    rows, columns = jnp.arange(m), jnp.arange(n)
 
     def step(k, carry):
         work, row_order, column_order, smallest, largest, rank = carry
-        open_ = (row_order == unused)[:, None] & (column_order == unused)[None, :]
-        candidates = jnp.where(open_, jnp.abs(work), 0.0)
-        candidates = jnp.where(candidates > zero, candidates, 0.0)
-        first = jnp.where((stage == 0)[:, None], candidates, 0.0)
-        candidates = jnp.where(jnp.any(first > 0), first, candidates)
+        size = jnp.abs(work)
+        open_row = row_order == unused
+        open_ = open_row[:, None] & (column_order == unused)[None, :] & (size > zero)
+        candidates = jnp.where(open_, size, 0.0)
+        if stage is not None:
+            first = jnp.where((stage == 0)[:, None], candidates, 0.0)
+            candidates = jnp.where(jnp.any(first > 0), first, candidates)
         best = jnp.argmax(candidates)
-        r, c = best // n, best % n
+        r = lax.div(best, n)
+        c = best - r * n
+        here, there = rows == r, columns == c
         pivot = candidates[r, c]
         found = pivot > 0
-        ratio = jnp.where(row_order == unused, work[:, c] / jnp.where(found, work[r, c], 1.0), 0.0)
-        ratio = jnp.where(found, ratio.at[r].set(0.0), 0.0)
+        ratio = jnp.where(open_row & ~here & found, work[:, c] / jnp.where(found, work[r, c], 1.0), 0.0)
         work = work - ratio[:, None] * work[r][None, :]
-        row_order = jnp.where(found, row_order.at[r].set(k), row_order)
-        column_order = jnp.where(found, column_order.at[c].set(k), column_order)
+        row_order = jnp.where(here & found, k, row_order)
+        column_order = jnp.where(there & found, k, column_order)
         smallest = jnp.where(found, jnp.minimum(smallest, pivot), smallest)
-        largest = jnp.where(found, jnp.maximum(largest, pivot), largest)
-        return work, row_order, column_order, smallest, largest, rank + jnp.where(found, 1, 0)
+        return work, row_order, column_order, smallest, jnp.maximum(largest, pivot), rank + found.astype(rank.dtype)
 
     start = (
         work,

@@ -75,7 +75,8 @@ def correct_positions(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], 
     return q - split.correction @ system.coordinate_residual(t, q)
 
 
-@eqx.filter_custom_jvp
+# Functions with rules of their own are compiled ones around it, so that each is traced once for all its places.
+@eqx.filter_jit
 def evaluate(
     system: AbstractSystem,
     formulation: AbstractFormulation,
@@ -88,6 +89,11 @@ def evaluate(
 
     **Arguments:** `u`: independent velocities exact, dependent ones a guess; `order` of elimination.
     """
+    return _evaluate(system, formulation, t, q, u, order)
+
+
+@eqx.filter_custom_jvp
+def _evaluate(system, formulation, t, q, u, order):
     jacobian = system.jacobian(t, q, u)
     solved = factor(jacobian, order, system.velocity_rank)
     residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
@@ -97,7 +103,7 @@ def evaluate(
     return Evaluation(u, udot, solved)
 
 
-@eqx.filter_custom_jvp
+@eqx.filter_jit
 def restore(
     system: AbstractSystem,
     t: Scalar,
@@ -105,7 +111,7 @@ def restore(
     u: Float[Array, "nu"],
     near: Evaluation,
     split: Split,
-    tol: float,
+    tol: Scalar,
 ) -> Restored:
     """Restore a state to the manifold and find the accelerations of a constrained system there.
 
@@ -114,6 +120,11 @@ def restore(
     **Arguments:** `q`, `u`: the state, independent entries exact, dependent ones a guess; `near`: the evaluation of a
     state close by at the same time; `tol`: size of the last Newton correction, relative to the system's size.
     """
+    return _restore(system, t, q, u, near, split, tol)
+
+
+@eqx.filter_custom_jvp
+def _restore(system, t, q, u, near, split, tol):
     solved, udot = near.factor, near.udot
     q, iterations, failed = restore_positions(system, t, q, split, tol)
     # Wrong by the distance of the two states, the factor leaves the square and the cube of what there was.
@@ -176,7 +187,7 @@ def restore_positions(
 # Derivatives
 
 
-@evaluate.def_jvp
+@_evaluate.def_jvp
 def _evaluate_jvp(primals, tangents):
     system, formulation, t, q, u, order = primals
     dsystem, _, dt, dq, du, _ = tangents
@@ -189,7 +200,7 @@ def _evaluate_jvp(primals, tangents):
     return out, Evaluation(along[3], _push_accelerations(at, along, out.udot, solved), dfactor)
 
 
-@restore.def_jvp
+@_restore.def_jvp
 def _restore_jvp(primals, tangents):
     system, t, q, u, near, split, tol = primals
     dsystem, dt, dq, du, _, _, _ = tangents

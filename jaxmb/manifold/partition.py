@@ -4,6 +4,8 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,10 +34,6 @@ _GROWTH = 1.1
 # The same for the solution of the rows that were kept. Where others are redundant, the kept ones can lose rank at a
 # position where all of them do not, and H shows nothing of it.
 _ROW_GROWTH = 4.0
-
-
-# Traced once for all the places of a step.
-_evaluate = eqx.filter_jit(evaluate)
 
 
 class Partition(AbstractManifold):
@@ -132,7 +130,7 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def init_chart(self, t, y, args):
         system, y = lax.stop_gradient((self.system, y))
-        split, fresh, singular = _choose(system, t, y)
+        split, fresh, singular = _choose(system, t, y, _of_coordinates(system, t, y))
         return Chart(split, fresh, fresh, jnp.stack([0, 0, 0, 1, singular.astype(int)]))
 
     def evaluate(self, t, y, chart, args):
@@ -141,7 +139,7 @@ class PartitionTerm(AbstractManifoldTerm):
         if system.velocity_rows == 0:
             u, udot, factors = y.u, system.inertia(t, q).solve(system.force(t, q, y.u)), None
         else:
-            out = _evaluate(system, self.formulation, t, q, y.u, split.velocity)
+            out = evaluate(system, self.formulation, t, q, y.u, split.velocity)
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
@@ -158,7 +156,7 @@ class PartitionTerm(AbstractManifoldTerm):
         else:
             before = lax.stop_gradient((near.y.u, near.f.u))
             before = Evaluation(*before, near.factors)
-            out = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+            out: Any = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
             q, u, udot, iterations, failed = out.q, out.u, out.udot, out.iterations, out.failed
         age, _, newton, charts, singular = chart.counters
         counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
@@ -180,31 +178,45 @@ class PartitionTerm(AbstractManifoldTerm):
         return jnp.concatenate([independent, system.nq + velocity.columns[system.velocity_rank :]])
 
     def update_chart(self, t, y, chart, args):
-        system, y, chart = lax.stop_gradient((self.system, y, chart))
-        if chart.split.coordinate is not None and system.coordinate_rank > 0:
-            stale = self._worse(chart) | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
+        del args
+        return _updated(*lax.stop_gradient((self.system, t, y, chart)), self.max_influence)
 
-            def refresh(chart):
-                split, own = _refreshed(system, t, y, chart.split.velocity, chart.split.coordinate)
-                quality = jnp.maximum(chart.quality, own)
-                return Chart(split, quality, chart.fresh, chart.counters.at[0].set(0))
 
-            keep = lambda chart: Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1))
-            chart = cond_of_any_lane(stale, refresh, keep, chart)
+@eqx.filter_jit
+def _updated(system, t, y, chart, max_influence):
+    """The chart, refreshed or chosen anew where it has become worse."""
+    bounds = np.array([max_influence, _ROW_GROWTH])[: chart.fresh.size]
+    worse = lambda chart: jnp.any(chart.quality > bounds * chart.fresh)
 
+    def renewed(chart, jacobian):
         def renew(chart):
-            split, fresh, singular = _choose(system, t, y)
+            split, fresh, singular = _choose(system, t, y, jacobian)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
             return Chart(split, fresh, fresh, counters)
 
-        return cond_of_any_lane(self._worse(chart), renew, lambda chart: chart, chart)
+        return cond_of_any_lane(worse(chart), renew, lambda chart: chart, chart)
 
-    def _worse(self, chart):
-        bounds = np.array([self.max_influence, _ROW_GROWTH])[: chart.fresh.size]
-        return jnp.any(chart.quality > bounds * chart.fresh)
+    if chart.split.coordinate is None or system.coordinate_rank == 0:
+        return renewed(chart, _of_coordinates(system, t, y))
+    stale = worse(chart) | (chart.age >= _AGE) | (chart.iterations >= _SLOW)
+
+    def refresh(chart):
+        jacobian = _of_coordinates(system, t, y)
+        split, own = _refreshed(system, jacobian, chart.split.velocity, chart.split.coordinate)
+        quality = jnp.maximum(chart.quality, own)
+        # Only a chart that has been refreshed can be worse.
+        return renewed(Chart(split, quality, chart.fresh, chart.counters.at[0].set(0)), jacobian)
+
+    keep = lambda chart: Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1))
+    return cond_of_any_lane(stale, refresh, keep, chart)
 
 
-def _choose(system, t, y):
+def _of_coordinates(system, t, y):
+    """The coordinates' Jacobian, where that of the velocities does not serve both."""
+    return None if shared(system) else system.coordinate_jacobian(t, y.q)
+
+
+def _choose(system, t, y, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled."""
     jacobian = system.jacobian(t, y.q, y.u)
     velocity = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
@@ -213,14 +225,14 @@ def _choose(system, t, y):
     quality = _velocity_quality(system, solved, velocity.order)
     if shared(system):
         return Split(velocity.order, None, solved.correction), quality, singular
-    pivots = full_pivot(system.coordinate_jacobian(t, y.q), scale=system.coordinate_scale())
-    split, own = _refreshed(system, t, y, velocity.order, pivots.order)
+    pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
+    split, own = _refreshed(system, of_coordinates, velocity.order, pivots.order)
     return split, jnp.maximum(quality, own), singular | (pivots.rank != system.coordinate_rank)
 
 
-def _refreshed(system, t, y, velocity, coordinate):
-    """The split with the position factor of this state, and the coordinates' quality."""
-    solved = factor(system.coordinate_jacobian(t, y.q), coordinate, system.coordinate_rank)
+def _refreshed(system, jacobian, velocity, coordinate):
+    """The split with the position factor of this state, from its Jacobian, and the coordinates' quality."""
+    solved = factor(jacobian, coordinate, system.coordinate_rank)
     own = _quality(system, solved, system.coordinate_scale(), coordinate, system.coordinate_rank)
     return Split(velocity, coordinate, solved.correction), own
 

@@ -126,7 +126,7 @@ def _root(residual, gram: Array) -> Array:
         return lax.while_loop(proceed, correct, (start, jnp.array(jnp.inf, start.dtype), 0))[0]
 
     def tangent_solve(linear, b):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
+        return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)
 
     start = jnp.zeros(gram.shape[0], gram.dtype)
     gram = lax.stop_gradient(gram)

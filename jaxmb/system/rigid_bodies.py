@@ -174,8 +174,9 @@ class RigidBodySystem(AbstractSystem):
         sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
         return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
 
-    # Constraints
+    # Constraints. Each kernel is a compiled function, so that it is traced once for all its places in a program.
 
+    @eqx.filter_jit
     def position_residual(self, t, q):
         poses = self.prepared_poses(q)
         return _join([g.residual(t, poses) for g in self.constraints], q.dtype)
@@ -187,6 +188,7 @@ class RigidBodySystem(AbstractSystem):
         p = self.poses(q)[_rotating(self.layout), 3:]
         return jnp.concatenate([residual, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
 
+    @eqx.filter_jit
     def coordinate_jacobian(self, t, q):
         if self.rates_are_velocities:
             return self._jacobian(t, q, jnp.zeros(self.nu, q.dtype), self.constraints)
@@ -201,11 +203,13 @@ class RigidBodySystem(AbstractSystem):
         rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
         return jnp.concatenate([jacobian, rows])
 
+    @eqx.filter_jit
     def velocity_residual(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         groups = (*self.constraints, *self.velocity_constraints)
         return _join([g.velocity(t, poses, velocities) for g in groups], q.dtype)
 
+    @eqx.filter_jit
     def jacobian(self, t, q, u):
         return self._jacobian(t, q, u, (*self.constraints, *self.velocity_constraints))
 
@@ -214,6 +218,7 @@ class RigidBodySystem(AbstractSystem):
         blocks = [g.jacobian(t, poses, velocities) for g in groups]
         return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
+    @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         wrenches, bodies, row = [], [], 0
@@ -224,6 +229,7 @@ class RigidBodySystem(AbstractSystem):
             row += own.size
         return self._add_up(wrenches, bodies, u.dtype)
 
+    @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
         poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
@@ -246,6 +252,7 @@ class RigidBodySystem(AbstractSystem):
             return DiagonalInertia(bodies.reshape(-1))
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
 
+    @eqx.filter_jit
     def force(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         wrenches = [g.wrenches(t, poses, velocities) for g in self.forces]
