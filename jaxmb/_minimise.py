@@ -15,6 +15,9 @@ from jaxtyping import Array, Float
 # Residuals of the unknowns z, given how to differentiate the simulation in them; infinite where it fails.
 Residuals = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[Array, "residuals"]]
 
+# Residuals and their Jacobian; infinite where the simulation fails.
+Linearised = Callable[[Float[Array, "n"]], tuple[Float[Array, "residuals"], Float[Array, "residuals n"]]]
+
 # In place of infinite residuals: no sum of squares comes near it, and it has a square.
 _FAILED = 1e100
 
@@ -27,25 +30,40 @@ class Minimum(NamedTuple):
     success: bool
 
 
-def levenberg_marquardt(residuals: Residuals, z: Float[Array, "n"], tol: float, limit: int) -> Minimum:
-    """Minimise `|r(z)|²`, with forward-mode derivatives; trials that fail are rejected.
+def levenberg_marquardt(linearised: Linearised, z: Float[Array, "n"], tol: float, limit: int) -> Minimum:
+    """Minimise `|r(z)|²`; trials that fail are rejected.
 
-    **Arguments:** `tol`: change of unknowns and of residuals at which to stop, absolute and relative; `limit`: largest
-    number of trials.
+    **Arguments:** `linearised`: residuals and their Jacobian; `tol`: change of unknowns and of residuals at which to
+    stop, absolute and relative; `limit`: largest number of trials.
     """
-    z, steps, result = _levenberg_marquardt(residuals, z, tol, limit)
-    return Minimum(z, int(steps), bool(result == optx.RESULTS.successful))
+    solver, state = optx.LevenbergMarquardt(rtol=tol, atol=tol), None
+    for iteration in range(limit):
+        trial = z if state is None else state.y_eval
+        z, state = _levenberg_marquardt(solver, (trial, *linearised(trial)), z, state)
+        stuck = bool(state.result != optx.RESULTS.successful)
+        if stuck or bool(state.terminate):
+            return Minimum(z, iteration + 1, not stuck)
+    return Minimum(z, limit, False)
 
 
 @eqx.filter_jit
-def _levenberg_marquardt(residuals: Residuals, z: Float[Array, "n"], tol: float, limit: int):
-    def fn(z, _):
-        r = residuals(z, diffrax.ForwardMode())
-        return jnp.where(jnp.isfinite(r), r, _FAILED)
+def _levenberg_marquardt(solver: Any, known: tuple[Array, Array, Array], z: Float[Array, "n"], state: Any):
+    """One step of the solver, from its state (None: the first); what it asks for at the trial point is known there."""
+    at, residuals, jacobian = known
+    finite = jnp.isfinite(residuals)
+    known = at, jnp.where(finite, residuals, _FAILED), jnp.where(finite[:, None], jacobian, 0.0)
 
-    solver = optx.LevenbergMarquardt(rtol=tol, atol=tol)
-    sol = optx.least_squares(fn, solver, z, options={"jac": "fwd"}, max_steps=limit, throw=False)
-    return sol.value, sol.stats["num_steps"], sol.result
+    # The tangent at the trial point, the only place where it is evaluated: so the program of the simulation and its
+    # derivatives is compiled once, outside, for all who need it.
+    def fn(z, known):
+        at, residuals, jacobian = known
+        return residuals + jacobian @ (z - at), None
+
+    rest: Any = known, {"jac": "fwd"}
+    if state is None:
+        state = solver.init(fn, z, *rest, *eqx.filter_eval_shape(fn, z, known), frozenset())
+    z, state, _ = solver.step(fn, z, *rest, state, frozenset())
+    return z, state
 
 
 def descend(

@@ -155,7 +155,7 @@ def identify(
     kind = "lm" if method == "lm" else "optax"
     limit = _ITERATIONS[kind] if max_iterations is None else max_iterations
     if isinstance(method, str):
-        solution = levenberg_marquardt(problem.residuals, start, tol, limit)
+        solution = levenberg_marquardt(lambda z: _linearised(problem, z)[:2], start, tol, limit)
     else:
         solution = descend(method, problem.residuals, start, tol, limit)
     return _summary(problem, solution, known_noise=sigma is not None or residual is not None)

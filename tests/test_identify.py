@@ -199,13 +199,14 @@ def test_failed_trials_are_rejected():
     """A square root near its branch point, on whose far side the iteration tries to land."""
     trials = []
 
-    def residuals(z, adjoint):
+    def residuals(z):
         jax.debug.callback(lambda x: trials.append(float(x)), z[0])
         there = z[0] > 0
         root = jnp.sqrt(jnp.where(there, z[0], 1.0))
         return jnp.where(there, jnp.stack([root - 0.1, 10 * (z[1] - z[0] ** 2)]), jnp.inf)
 
-    solution = levenberg_marquardt(residuals, jnp.array([3.0, 1.0]), tol=1e-10, limit=100)
+    linearised = lambda z: (residuals(z), jax.jacfwd(residuals)(z))
+    solution = levenberg_marquardt(linearised, jnp.array([3.0, 1.0]), tol=1e-10, limit=100)
     jax.effects_barrier()
     assert min(trials) < 0
     assert solution.success
