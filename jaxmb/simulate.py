@@ -1,7 +1,7 @@
 """From a system and a state to a motion."""
 
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -19,7 +19,7 @@ from .formulations import AbstractFormulation, Multipliers, Partitioned
 from .formulations._base import stages
 from .manifold import AbstractManifold, Free, Partition, Projection, project
 from .manifold.partition import Chart
-from .solvers import AbstractMultistep, Adams, AdamsState, HermiteState, MultistepController
+from .solvers import AbstractMultistep, Adams, AdamsState, Hermite, HermiteState, MultistepController
 from .system import AbstractSystem
 from .trajectory import Trajectory
 
@@ -39,7 +39,7 @@ def simulate(
     t0: Scalar = 0.0,
     dt0: Scalar | None = None,
     saveat: diffrax.SaveAt | ArrayLike | None = None,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | Literal["auto", "switch"] | None = None,
     formulation: AbstractFormulation | None = None,
     manifold: AbstractManifold | None = None,
     rtol: Scalar = 1e-8,
@@ -63,7 +63,10 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver.
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. With `"auto"` it is
+        `Adams`, which finds out whether stability limits its steps instead of accuracy: `stats["stiff"]`, and in how
+        many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion found stiff is
+        simulated again, with `Hermite` from `t0` on; not under `jit`, `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
         `Multipliers()`, which needs no search for pivots.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
@@ -96,7 +99,8 @@ def simulate(
     rtol = number(_checked_tolerance(rtol, atol, state.q.dtype))
     atol = rtol / 100 if atol is None else number(atol)
     times = number(t0), number(t1), None if dt0 is None else number(dt0)
-    solver = Adams() if solver is None else solver
+    choice = solver
+    solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
     if manifold is None:
         constrained = Partition() if isinstance(solver, AbstractMultistep) else Projection()
         manifold = Free() if system.velocity_rows == 0 else constrained
@@ -127,6 +131,34 @@ def simulate(
         meter,
         restore=event is not None or isinstance(manifold, Free),
     )
+    if choice == "switch" and trajectory.stats["stiff"]:
+        again = simulate(
+            system,
+            state,
+            t1=t1,
+            t0=t0,
+            dt0=dt0,
+            saveat=saveat,
+            solver=Hermite(),
+            formulation=formulation,
+            manifold=manifold,
+            rtol=rtol,
+            atol=atol,
+            stepsize_controller=stepsize_controller,
+            adjoint=adjoint,
+            event=event,
+            max_steps=max_steps,
+            throw=throw,
+            progress_meter=progress_meter,
+        )
+        found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
+        return eqx.tree_at(lambda trajectory: trajectory.stats, again, again.stats | found)
+    if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
+        warnings.warn(
+            f"The motion is stiff: in {trajectory.stats['stiff_steps']} of {trajectory.stats['num_steps']} steps of "
+            "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
+            stacklevel=2,
+        )
     if throw:
         result = trajectory.result
         bad = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
@@ -168,6 +200,17 @@ def _integrate(
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
+
+
+def _named(name: str, state: State) -> Adams:
+    if name not in ("auto", "switch"):
+        raise ValueError(f"A solver is an object, or one of the words 'auto' and 'switch'; got {name!r}.")
+    if name == "switch" and any(isinstance(x, Tracer) for x in jax.tree.leaves(state)):
+        raise ValueError(
+            "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
+            "once with solver='auto', outside, and then choose Adams() or Hermite()."
+        )
+    return Adams(stiffness="count" if name == "auto" else "stop")
 
 
 def _checked_tolerance(rtol: Any, atol: Any, dtype) -> Any:
@@ -259,6 +302,8 @@ def _statistics(solution) -> dict[str, Array]:
     if isinstance(state, AdamsState):
         stats["num_evaluations"] = state.tally[0] + 2 * stats["num_steps"]
         stats["orders"] = state.tally[1:]
+        if state.stiffness is not None:
+            stats["stiff"], stats["stiff_steps"] = state.stiffness.found, state.stiffness.steps
     if isinstance(state, HermiteState):
         stats["num_evaluations"], stats["num_matrices"] = state.work
         stats["points"] = state.tally[1:]

@@ -6,10 +6,12 @@ them f and g, follow from the constraints.
 """
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -43,6 +45,38 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
     """The state, on the manifold, and its derivatives in time."""
     (y, f), push, rest = jax.linearize(field, t, y, has_aux=True)
     return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
+
+
+def probed_derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
+    """The same; with a warning if differences of f to a state nearby contradict its derivative."""
+    eps = jnp.finfo(y.dtype).eps
+    size = jnp.abs(y) + jnp.mean(jnp.abs(y))
+    signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
+    aside = lax.stop_gradient(eps ** (1 / 3) * signs * jnp.where(size > 0, size, jnp.ones_like(size)))
+
+    # A loop, so that the field is compiled once for both states.
+    def at(y, _):
+        (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
+        times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
+        _, (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
+        return y + aside, (Derivatives(state, f, g, rest), slope)
+
+    _, (both, slopes) = lax.scan(at, y, None, length=2)
+    f = lax.stop_gradient(both.f)
+    change, expected = f[1] - f[0], lax.stop_gradient(jnp.mean(slopes, axis=0))
+    wrong = jnp.abs(change - expected)
+    rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
+    contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
+    lax.cond(eqxi.unvmap_any(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
+    return jax.tree.map(lambda x: x[0], both)
+
+
+def _warn():
+    warnings.warn(
+        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and would be wrong "
+        "without a sign: look for `stop_gradient`, for rounding, and for integers on the way from the state.",
+        stacklevel=2,
+    )
 
 
 class Linearization(eqx.Module):

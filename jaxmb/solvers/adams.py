@@ -1,7 +1,7 @@
 """The Adams method of Shampine and Gordon, of variable order and variable step."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -25,6 +25,7 @@ from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolat
 from ._interpolation import RateInterpolation
 from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
 from ._order import GAIN, StepEstimate, choose_order
+from ._stiffness import Stiffness, none_found, observed
 from ._tolerances import Tolerances, norm_of
 
 # The error that a step aims at, in units of the tolerance.
@@ -46,12 +47,14 @@ class AdamsState(eqx.Module):
         order `k`. The number of evaluations of the vector field, rejected steps included, is
         `tally[0] + 2 * solution.stats["num_steps"]`, and two more if the first step was not given as `dt0`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
+    - `stiffness`: what the accepted steps show of it, if that was asked for, otherwise `None`.
     """
 
     history: History
     order: Int[Array, ""]
     tally: Int[Array, " length"]
     chart: Chart | None
+    stiffness: Stiffness | None
 
 
 class Adams(AbstractMultistep):
@@ -92,6 +95,7 @@ class Adams(AbstractMultistep):
     tolerances: Tolerances
     min_order: int = eqx.field(static=True)
     max_order: int = eqx.field(static=True)
+    stiffness: str = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RateInterpolation]] = RateInterpolation
@@ -101,6 +105,7 @@ class Adams(AbstractMultistep):
         *,
         min_order: int = 1,
         max_order: int = HIGHEST_ORDER,
+        stiffness: Literal["ignore", "count", "stop"] = "ignore",
         rtol: Any = None,
         atol: Any = None,
         norm: Callable[[PyTree], Any] = optx.rms_norm,
@@ -109,11 +114,16 @@ class Adams(AbstractMultistep):
 
         - `min_order`, `max_order`: bounds of the order; equal values fix it, once enough steps have been made from
             order one on.
+        - `stiffness`: whether to count the steps that stability limits instead of accuracy, in `AdamsState.stiffness`,
+            and to stop, with `diffrax.RESULTS.nonlinear_divergence`, when a motion is found stiff by that.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
 
-        **Raises:** `ValueError` if the bounds are not orders of the method, or if only one tolerance is given.
+        **Raises:** `ValueError` if the bounds are not orders of the method, for another word for `stiffness`, or if
+        only one tolerance is given.
         """
+        if stiffness not in ("ignore", "count", "stop"):
+            raise ValueError(f"`Adams` can 'ignore' or 'count' stiffness, or 'stop'; got `stiffness={stiffness!r}`.")
         if not 1 <= min_order <= max_order <= HIGHEST_ORDER:
             raise ValueError(
                 f"`Adams` has the orders 1 to {HIGHEST_ORDER}, and `min_order` is at most `max_order`; got "
@@ -122,6 +132,7 @@ class Adams(AbstractMultistep):
         self.tolerances = tolerances_of("Adams", rtol, atol, norm)
         self.min_order = min_order
         self.max_order = max_order
+        self.stiffness = stiffness
 
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
         del terms
@@ -130,7 +141,8 @@ class Adams(AbstractMultistep):
     def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> AdamsState:
         self._check(terms, y0)
         chart = first_chart(terms, t0, y0, args)
-        return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32))
+        stiffness = None if self.stiffness == "ignore" else none_found()
+        return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32), stiffness)
 
     def step(
         self,
@@ -144,7 +156,7 @@ class Adams(AbstractMultistep):
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], AdamsState, diffrax.RESULTS]:
         def restart():
             chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return _start(terms, t0, t1, y0, args, chart, solver_state.tally)
+            return _start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.stiffness)
 
         state = restart_after(made_jump, restart, solver_state)
         history, order, chart = state.history, state.order, state.chart
@@ -186,6 +198,7 @@ class Adams(AbstractMultistep):
             order=order + change,
             tally=state.tally + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, second.chart, args),
+            stiffness=self._observed(state, h, before, predicted, after, first.f, f, y0),
         )
         used = (order >= INDEX)[:, None]
         dense_info = {
@@ -197,7 +210,18 @@ class Adams(AbstractMultistep):
         result = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, FAILED, result)
+        if self.stiffness == "stop":
+            result = diffrax.RESULTS.where(state.stiffness.found, FAILED, result)
         return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
+
+    def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
+        if state.stiffness is None:
+            return None
+        scale = self.tolerances.scale(before, after)
+        size = lambda change: self._size(lax.stop_gradient(change), scale, like)
+        correction = size(after - predicted), size(second - first)
+        change = size(after - before), size(second - state.history.differences[0])
+        return observed(state.stiffness, state.order, lax.stop_gradient(h), correction, change)
 
     def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
         """Weighted norms of the errors in the controlled components."""
@@ -212,11 +236,11 @@ class Adams(AbstractMultistep):
         return jnp.stack([norm_of(self.tolerances.norm, error, y0) for error in errors])
 
 
-def _start(terms, t0, t1, y0, args, chart, tally) -> AdamsState:
+def _start(terms, t0, t1, y0, args, chart, tally, stiffness) -> AdamsState:
     first = evaluate(terms, t0, ravel(y0), y0, chart, args)
     f, chart = first.f, first.chart
     if first.failed is not False:
         # It spreads to the error estimate, and fails the step.
         f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
     tally = tally + (INDEX == 0).astype(np.int32)
-    return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart)
+    return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart, stiffness)

@@ -18,7 +18,7 @@ from ._damping import are_damped
 from ._evaluation import field_of, first_chart, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
-from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, solve
+from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
 from ._order import GAIN, LOWER, StepEstimate, choose_order, growth_factors
@@ -155,7 +155,7 @@ class Hermite(AbstractMultistep):
         self._check(terms, y0)
         chart = first_chart(terms, t0, y0, args)
         tally = jnp.zeros(FAMILIES[self.family].highest + 1, np.int32)
-        return self._start(terms, t0, t1, y0, args, chart, tally, jnp.zeros(2, np.int32))
+        return self._start(terms, t0, t1, y0, args, chart, tally, jnp.zeros(2, np.int32), probed_derivatives)
 
     def step(
         self,
@@ -169,7 +169,7 @@ class Hermite(AbstractMultistep):
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], HermiteState, diffrax.RESULTS]:
         def restart():
             chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return self._start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.work)
+            return self._start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.work, derivatives)
 
         state = restart_after(made_jump, restart, solver_state)
         family, history, k = FAMILIES[self.family], state.history, state.points
@@ -290,7 +290,7 @@ class Hermite(AbstractMultistep):
         zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)
         return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
 
-    def _start(self, terms, t0, t1, y0, args, chart, tally, work) -> HermiteState:
+    def _start(self, terms, t0, t1, y0, args, chart, tally, work, derivatives) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
         first = derivatives(field_of(terms, t0, y0, chart, args), t0, flat)
         chart, failed = first.rest
