@@ -113,11 +113,15 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; and `slope`: `P⁻¹ J`."""
+    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; and `slope`: `P⁻¹ J`.
+
+    `beyond` is what the true b has more than that of P.
+    """
 
     newton: Float[Array, "free free"]
     rate: Float[Array, "free free"]
     slope: Float[Array, "free free"]
+    beyond: Float[Array, ""]
 
 
 def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
@@ -125,11 +129,13 @@ def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
     # complex for all formulas with equal steps; should they become real, those of the nearest complex ones do.
-    real, imaginary = a / 2, jnp.sqrt(jnp.maximum(-b - a**2 / 4, a**2 / 1000))
+    square, least = -b - a**2 / 4, a**2 / 1000
+    real, imaginary = a / 2, jnp.sqrt(jnp.maximum(square, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
-    return Inverses(along + real * across, a * along + (real**2 - imaginary**2) * across, across)
+    rate = a * along + (real**2 - imaginary**2) * across
+    return Inverses(along + real * across, rate, across, jnp.maximum(least - square, jnp.zeros_like(square)))
 
 
 # One member of a batch after the other; see `jaxmb.elimination`.
@@ -169,7 +175,7 @@ class _Iterate(NamedTuple):
     change: Float[Array, " free"]
     size: Float[Array, ""]
     rate: Float[Array, ""]
-    count: Int[Array, ""]
+    iterations: Int[Array, ""]
 
 
 def solve(
@@ -208,7 +214,7 @@ def solve(
 
     def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
         (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
-        along = jnp.where(carry.count == 0, f, carry.end.f)
+        along = jnp.where(carry.iterations == 0, f, carry.end.f)
         g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
@@ -218,12 +224,12 @@ def solve(
         if matrix.acceleration is not None:
             g = g + (matrix.rate @ matrix.rate[free] - matrix.acceleration) @ change
         now = size(matrix.state @ change)
-        return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.count + 1)
+        return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
     def proceed(carry: _Iterate) -> Bool[Array, ""]:
-        hopeful = (carry.count < 3) | (carry.rate < 2.0)
+        hopeful = (carry.iterations < 3) | (carry.rate < 2.0)
         # Before the first iteration the size is infinite.
-        return ~(carry.size <= tol) & (carry.count < _MAX_ITERATIONS) & hopeful
+        return ~(carry.size <= tol) & (carry.iterations < _MAX_ITERATIONS) & hopeful
 
     def attempt(carry):
         k, matrix, _, _, work = carry
@@ -235,16 +241,16 @@ def solve(
         first = _Iterate(nothing._replace(y=start), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol
-        slow = (last.count > 2) & (last.rate > _SLOW)
+        slow = (last.iterations > 2) & (last.rate > _SLOW)
         renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
         renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
         matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
         # A matrix made for the prediction is not made for it again.
         k = jnp.where(converged, _DONE, jnp.where(anew & (k == 0), 2, k + 1)).astype(jnp.int32)
-        return k, matrix, inverses, last.end, work + jnp.stack([last.count, anew.astype(jnp.int32)])
+        return k, matrix, inverses, last.end, work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
 
     square = jnp.zeros((free.size, free.size), past.dtype)
-    carry = none, matrix, Inverses(square, square, square), nothing, jnp.zeros(2, jnp.int32)
+    carry = none, matrix, Inverses(square, square, square, square[0, 0]), nothing, jnp.zeros(2, jnp.int32)
     k, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
 
@@ -287,13 +293,13 @@ def _differentiable_jvp(primals, tangents):
     jacobian, identity = columns[1][free], jnp.eye(still.size, dtype=still.dtype)
     inverses = inverses_of(jacobian, a, b)
     beyond = b * columns[2][free]
-    rest = inverse(identity - inverses.newton @ beyond)
+    rest = inverse(identity - inverses.newton @ (beyond + inverses.beyond * jacobian @ jacobian))
     load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + b * moved[2])[free]
 
     def correction(change):
         # What is large is kept together as in `solve`, and nothing rests on the last digits of an inverse.
         rate = moved[1][free] + jacobian @ change
-        mismatch = change - load - beyond @ change
+        mismatch = change - load - beyond @ change - inverses.beyond * jacobian @ rate
         return rest @ (inverses.newton @ mismatch - inverses.rate @ rate), rate
 
     change = -correction(still)[0]

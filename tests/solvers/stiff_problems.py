@@ -113,10 +113,12 @@ def solve(problem, rtol, solver=None, **kwargs):
         problem.t1,
         None,
         jnp.asarray(problem.y0),
-        jax.tree.map(jnp.asarray, problem.args),
         stepsize_controller=MultistepController(rtol, rtol * problem.relative),
-        adjoint=diffrax.ForwardMode(),
         saveat=diffrax.SaveAt(t1=True, solver_state=True),
-        max_steps=20000,
-        **kwargs,
+        **{
+            "args": jax.tree.map(jnp.asarray, problem.args),
+            "adjoint": diffrax.ForwardMode(),
+            "max_steps": 20000,
+            **kwargs,
+        },
     )

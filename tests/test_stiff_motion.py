@@ -1,0 +1,221 @@
+"""Stiff mechanisms by `Hermite`: accuracy for few steps, extreme cases, derivatives, and how stiffness is found."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from oracles import linkages
+
+import jaxmb as mb
+from jaxmb import mechanisms, planar
+from jaxmb.solvers import Hermite
+
+
+@functools.cache
+def library(name):
+    return mechanisms.get(name)
+
+
+@functools.cache
+def bushing():
+    """The library's stiff four-bar as one program: stiffness, damping, mass of the coupler, tolerance -> its end."""
+    mechanism = library("stiff_four_bar")
+    rigid = np.array([1.0, 1.0, 0.0])
+
+    @jax.jit
+    def run(stiffness, damping, mass, rtol):
+        values = {"D.stiffness": stiffness * rigid, "D.damping": damping * rigid, "coupler.mass": mass}
+        changed = mb.with_parameters(mechanism.system, values)
+        out = mb.simulate(
+            changed,
+            mechanism.state,
+            t1=1.0,
+            rtol=rtol,
+            solver=Hermite(),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=30000,
+            throw=False,
+        )
+        return out.ys, out.stats, out.result == mb.RESULTS.successful
+
+    return lambda stiffness=1e8, damping=1e2, mass=3.0, rtol=1e-6: run(stiffness, damping, mass, rtol)
+
+
+def test_few_steps_at_every_tolerance():
+    mechanism = library("stiff_four_bar")
+    references = mechanism.references
+    assert references.labels[:3] == ("crank", "coupler", "rocker") and references.times[-1] == 1.0
+    for rtol, steps, bound in ((1e-4, 800, 1e-4), (1.2e-6, 2000, 1e-6), (1e-8, 6000, 1e-8)):
+        ys, stats, successful = bushing()(rtol=rtol)
+        error = np.max(np.abs((np.asarray(ys.q[-1])[2::3] - references.values[-1, :3]) / references.scales[:3]))
+        assert successful and error < bound and stats["num_accepted_steps"] <= steps, (rtol, error, stats)
+        assert stats["num_rejected_steps"] < 0.1 * int(stats["num_accepted_steps"])
+
+
+def test_stiffness_does_not_make_steps_shorter():
+    """Where the vibration that the start excites is below the tolerance or nearly so."""
+    steps = [int(bushing()(stiffness=k, rtol=1e-4)[1]["num_accepted_steps"]) for k in (1e8, 1e10)]
+    assert steps[1] < 1.15 * steps[0]
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e2])
+@pytest.mark.parametrize("stiffness", [1e2, 1e4, 1e6, 1e8, 1e10, 1e12, 1e14])
+def test_every_stiffness(stiffness, damping):
+    """From a soft spring to the rigid joint, which the last ones are near."""
+    ys, _, successful = bushing()(stiffness=stiffness, damping=damping, rtol=1e-5)
+    assert successful and np.all(np.isfinite(ys.q)) and np.all(np.isfinite(ys.u))
+    if stiffness >= 1e6:
+        rigid = linkages.four_bar(np.array([1.0]))[0, :3]
+        np.testing.assert_allclose(ys.q[-1, 2::3], rigid, atol=2e-4 + 1e3 / stiffness)
+
+
+@pytest.mark.parametrize("ratio", [1e-8, 1e-4, 1e4, 1e8])
+def test_every_ratio_of_masses(ratio):
+    loose, tight = (bushing()(mass=3.0 * ratio, rtol=rtol) for rtol in (1e-5, 1e-7))
+    assert loose[2] and tight[2]
+    np.testing.assert_allclose(loose[0].q, tight[0].q, atol=2e-4 * np.max(np.abs(tight[0].q)))
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7, 1e-9, 1e-11])
+def test_every_tolerance(rtol):
+    ys, _, successful = bushing()(rtol=rtol)
+    expected = library("stiff_four_bar").references.values[-1, :3]
+    assert successful
+    np.testing.assert_allclose(ys.q[-1, 2::3], expected, rtol=20 * rtol)
+
+
+def test_flyball_to_the_end():
+    mechanism = library("flyball")
+    trajectory = mb.simulate(
+        mechanism.system, mechanism.state, t1=10.0, saveat=mechanism.references.times, rtol=1e-9, solver=Hermite()
+    )
+    errors = mechanism.errors(trajectory)
+    assert max(float(np.max(error)) for error in errors.values()) < 1e-7
+    assert trajectory.stats["num_accepted_steps"] < 1000
+
+
+def overdamped(stiffness, t, x0):
+    """Position of 1 kg on a spring with a damper of 1e6 N s/m that is let go at rest."""
+    roots = np.roots([1.0, 1e6, stiffness])
+    weights = np.linalg.solve([[1.0, 1.0], roots], [x0, 0.0])
+    return weights @ np.exp(np.outer(roots, np.atleast_1d(t)))
+
+
+def slider():
+    body = planar.Body("mass", mass=1.0, inertia=1.0)
+    spring = planar.Bushing(
+        "spring", "mass", "ground", stiffness=(1e8, 1e8, 1.0), damping=(1e6, 1e6, 1.0), point=(0, 0)
+    )
+    return mb.Scene([body], forces=[spring]).compile()
+
+
+def test_a_start_on_a_fast_transient():
+    """A millionth of a second after the start the motion is ten thousand times slower."""
+    system, ts = slider(), np.array([1e-7, 1e-6, 1e-5, 1e-3, 0.05])
+    start = mb.State(jnp.array([1e-3, 0.0, 0.0]), jnp.zeros(3))
+    out = mb.simulate(system, start, t1=0.05, saveat=ts, rtol=1e-8, atol=1e-13, solver=Hermite())
+    np.testing.assert_allclose(out.ys.q[:, 0], overdamped(1e8, ts, 1e-3), rtol=1e-6)
+    assert out.stats["num_steps"] < 400
+
+
+def test_a_force_that_jumps():
+    """A spring that becomes ten times as stiff where half the way is gone: to the event, and on from it."""
+    system = slider()
+    start = mb.State(jnp.array([1e-3, 0.0, 0.0]), jnp.zeros(3))
+    event = diffrax.Event(lambda t, y, args, **kwargs: y.q[0] - 5e-4, optx.Newton(1e-12, 1e-12))
+    options = {"rtol": 1e-9, "atol": 1e-14, "solver": Hermite()}
+    first = mb.simulate(system, start, t1=1.0, event=event, **options)
+    assert first.result == mb.RESULTS.event_occurred
+    roots = np.roots([1.0, 1e6, 1e8])
+    weights = np.linalg.solve([[1.0, 1.0], roots], [1e-3, 0.0])
+    slow = np.argmax(roots)
+    np.testing.assert_allclose(first.ts[-1], np.log(5e-4 / weights[slow]) / roots[slow], rtol=1e-6)
+
+    stiffer = mb.with_parameters(system, {"spring.stiffness": jnp.array([1e9, 1e9, 1.0])})
+    middle = jax.tree.map(lambda y: y[-1], first.ys)
+    second = mb.simulate(stiffer, middle, t0=first.ts[-1], t1=first.ts[-1] + 1e-3, **options)
+    roots = np.roots([1.0, 1e6, 1e9])
+    weights = np.linalg.solve([[1.0, 1.0], roots], [middle.q[0], middle.u[0]])
+    np.testing.assert_allclose(second.ys.q[-1, 0], weights @ np.exp(1e-3 * roots), rtol=1e-6)
+
+
+# Derivatives
+
+# The time, and how far to go for central differences, in parts of each parameter: vibrations come round often.
+GRADIENTS = {
+    "stiff_four_bar": (0.02, {"D.stiffness": 1e-3, "D.damping": 1e-1}),
+    "flyball": (0.1, {"spring1.stiffness": 1e-2, "spring1.damping": 1e-2}),
+}
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_forward_reverse_and_central_differences(name):
+    """In logarithms of the parameters."""
+    time, steps = GRADIENTS[name]
+    mechanism = library(name)
+    start = mb.parameters(mechanism.system)
+    weights = jnp.cos(jnp.arange(mechanism.system.nq + mechanism.system.nu).astype(float))
+
+    def loss(x, rtol, adjoint):
+        changed = {parameter: start[parameter] * jnp.exp(own) for parameter, own in zip(steps, x, strict=True)}
+        system = mb.with_parameters(mechanism.system, changed)
+        out = mb.simulate(
+            system, mechanism.state, t1=time, rtol=rtol, solver=Hermite(), adjoint=adjoint, max_steps=4096, throw=False
+        )
+        return weights @ jnp.concatenate([out.ys.q[-1], out.ys.u[-1]])
+
+    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
+    zero = jnp.zeros(len(steps))
+    forward, _ = derivatives_and_value(zero, 1e-11)
+    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(x, 1e-11, None))))(zero[None])[0]
+    scale = np.max(np.abs(forward))
+    assert np.all(forward != 0)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-10 * scale)
+    value = lambda k: np.array([derivatives_and_value(zero + k * h, 1e-12)[1] for h in np.diag(list(steps.values()))])
+    h = np.array(list(steps.values()))
+    plain, double = (value(1.0) - value(-1.0)) / (2 * h), (value(2.0) - value(-2.0)) / (4 * h)
+    np.testing.assert_allclose(forward, (4 * plain - double) / 3, rtol=1e-5, atol=1e-7 * scale)
+
+
+# Stiffness that is found
+
+
+def test_auto_says_that_a_motion_is_stiff():
+    mechanism = library("stiff_four_bar")
+    with pytest.warns(UserWarning, match="Hermite"):
+        found = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver="auto")
+    assert found.stats["stiff"] and found.stats["stiff_steps"] > 100
+    switched = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver="switch")
+    assert switched.stats["stiff"] and "points" in switched.stats
+    assert switched.stats["num_steps"] < found.stats["num_steps"]
+    np.testing.assert_allclose(switched.ys.q, found.ys.q, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("solver", ["auto", "switch"])
+def test_auto_leaves_other_motions_to_adams(solver):
+    mechanism = library("four_bar")
+    plain = mb.simulate(mechanism.system, mechanism.state, t1=1.0, rtol=1e-6)
+    found = mb.simulate(mechanism.system, mechanism.state, t1=1.0, rtol=1e-6, solver=solver)
+    assert not found.stats["stiff"] and "orders" in found.stats
+    np.testing.assert_allclose(found.ys.q, plain.ys.q, rtol=1e-9)
+
+
+def test_bad_words():
+    mechanism = library("four_bar")
+    with pytest.raises(ValueError, match="'auto' and 'switch'"):
+        mb.simulate(mechanism.system, mechanism.state, t1=1.0, solver="stiff")  # pyright: ignore
+    with pytest.raises(ValueError, match="under jit"):
+        jax.jit(lambda s: mb.simulate(mechanism.system, s, t1=1.0, solver="switch").ys)(mechanism.state)
+
+
+def test_implicit_solvers_of_diffrax():
+    mechanism = library("four_bar")
+    other = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver=diffrax.Kvaerno5())
+    own = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-10)
+    np.testing.assert_allclose(other.ys.q, own.ys.q, atol=1e-6)
