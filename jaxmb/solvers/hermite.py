@@ -80,7 +80,7 @@ class Hermite(AbstractMultistep):
     Where a solution jumps from one slow motion to another, as relaxation oscillations do, give reverse mode a
     checkpoint for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer it makes steps
     a second time, rounding then makes them a little longer or shorter, and jumps come too early or too late (van der
-    Pol's equation with μ = 100 over two jumps, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
+    Pol's equation with μ = 100 over a jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
 
     ??? cite "Reference"
 
