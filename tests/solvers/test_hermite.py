@@ -134,14 +134,14 @@ def _end(mu, rtol, adjoint):
         jnp.array([2.0, 0.0]),
         stepsize_controller=MultistepController(rtol, rtol),
         adjoint=adjoint,
-        max_steps=1024,
+        max_steps=2048,
     )
     return solution.ys[-1] @ jnp.array([1.0, 100.0])
 
 
 def test_forward_reverse_and_central_differences():
     """Over one jump, and over two."""
-    adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
+    adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
     forward = jax.jit(jax.vmap(jax.jacfwd(lambda mu: _end(mu, 1e-11, diffrax.ForwardMode()))))
     reverse = jax.jit(jax.vmap(jax.grad(lambda mu: _end(mu, 1e-11, adjoint))))
     mus = jnp.array([100.0, 55.0])
