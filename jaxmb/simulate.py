@@ -162,6 +162,9 @@ def simulate(
     if throw:
         result = trajectory.result
         bad = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+        # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
+        spoiled = lambda y: y * jnp.where(bad, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
+        trajectory = eqx.tree_at(lambda trajectory: trajectory.ys, trajectory, jax.tree.map(spoiled, trajectory.ys))
         trajectory = result.error_if(trajectory, bad)
     return trajectory.trimmed()
 

@@ -112,6 +112,18 @@ def test_other_numbers_do_not_compile_anew(rod):
     assert len(traces) == 1 and np.all(np.isfinite(values))
 
 
+def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
+    """Taken alone, without the value that the error goes with."""
+
+    def end(mass, max_steps):
+        changed = mb.with_parameters(rod, {"rod.inertia": mass})
+        return mb.simulate(changed, mb.assemble(rod), t1=1.0, max_steps=max_steps).ys.q[-1, 2]
+
+    gradient = jax.jit(jax.vmap(jax.grad(end), in_axes=(0, None)), static_argnums=1)
+    assert np.all(np.isfinite(gradient(jnp.array([1.0, 2.0]), 200)))
+    assert np.all(np.isnan(gradient(jnp.array([1.0, 2.0]), 5)))
+
+
 def test_trajectory_outside_its_use_is_an_error(rod):
     with pytest.raises(ValueError, match="saveat must be a vector"):
         mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=jnp.zeros((2, 2)))
