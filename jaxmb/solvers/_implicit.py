@@ -113,14 +113,12 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; and `slope`: `P⁻¹ J`.
-
-    `beyond` is what the true b has more than that of P.
+    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of P is less
+    than the one asked for.
     """
 
     newton: Float[Array, "free free"]
     rate: Float[Array, "free free"]
-    slope: Float[Array, "free free"]
     beyond: Float[Array, ""]
 
 
@@ -135,7 +133,7 @@ def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
     rate = a * along + (real**2 - imaginary**2) * across
-    return Inverses(along + real * across, rate, across, jnp.maximum(least - square, jnp.zeros_like(square)))
+    return Inverses(along + real * across, rate, jnp.maximum(least - square, jnp.zeros_like(square)))
 
 
 # One member of a batch after the other; see `jaxmb.elimination`.
@@ -250,7 +248,7 @@ def solve(
         return k, matrix, inverses, last.end, work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
 
     square = jnp.zeros((free.size, free.size), past.dtype)
-    carry = none, matrix, Inverses(square, square, square, square[0, 0]), nothing, jnp.zeros(2, jnp.int32)
+    carry = none, matrix, Inverses(square, square, square[0, 0]), nothing, jnp.zeros(2, jnp.int32)
     k, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
 

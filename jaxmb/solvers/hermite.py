@@ -285,6 +285,7 @@ class Hermite(AbstractMultistep):
 
     def _bounded(self, points, h, spectrum, factors) -> Float[Array, " formulas"]:
         """The factors by which steps may grow, where those of that length damp what should be damped."""
+        # A step is not cut by more, nor grows by more, at once.
         steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
         then, now = jax.vmap(lambda steps: are_damped(self.family, points, steps, spectrum))(steps)
         zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)

@@ -124,12 +124,12 @@ def test_exact_matrix():
 # Derivatives
 
 
-def _end(mu, rtol, adjoint):
+def _end(mu, t1, rtol, adjoint):
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: van_der_pol(t, y, mu)),
         Hermite(),
         0.0,
-        100.0,
+        t1,
         None,
         jnp.array([2.0, 0.0]),
         stepsize_controller=MultistepController(rtol, rtol),
@@ -139,18 +139,20 @@ def _end(mu, rtol, adjoint):
     return solution.ys[-1] @ jnp.array([1.0, 100.0])
 
 
-def test_forward_reverse_and_central_differences():
-    """Over one jump, and over two."""
+@pytest.mark.parametrize(
+    "t1, mus, rtol, same, h", [(70.0, (100.0, 120.0), 1e-9, 1e-10, 0.1), (100.0, (100.0, 55.0), 1e-11, 1e-8, 0.01)]
+)
+def test_forward_reverse_and_central_differences(t1, mus, rtol, same, h):
+    """Before the first jump, and after one or two."""
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
-    forward = jax.jit(jax.vmap(jax.jacfwd(lambda mu: _end(mu, 1e-11, diffrax.ForwardMode()))))
-    reverse = jax.jit(jax.vmap(jax.grad(lambda mu: _end(mu, 1e-11, adjoint))))
-    mus = jnp.array([100.0, 55.0])
+    forward = jax.jit(jax.vmap(jax.jacfwd(lambda mu: _end(mu, t1, rtol, diffrax.ForwardMode()))))
+    reverse = jax.jit(jax.vmap(jax.grad(lambda mu: _end(mu, t1, rtol, adjoint))))
+    mus = jnp.array(mus)
     along, against = forward(mus), reverse(mus)
-    np.testing.assert_allclose(against, along, rtol=1e-8)
-    tight = jax.jit(jax.vmap(lambda mu: _end(mu, 1e-13, diffrax.ForwardMode())))
-    h = 0.01 * jnp.array([1.0, -1.0, 2.0, -2.0])
-    values = [tight(mus + step) for step in h]
-    central = (8 * (values[0] - values[1]) - (values[2] - values[3])) / 0.12
+    np.testing.assert_allclose(against, along, rtol=same)
+    tight = jax.jit(jax.vmap(lambda mu: _end(mu, t1, 1e-13, diffrax.ForwardMode())))
+    values = [tight(mus + k * h) for k in (1.0, -1.0, 2.0, -2.0)]
+    central = (8 * (values[0] - values[1]) - (values[2] - values[3])) / (12 * h)
     np.testing.assert_allclose(along, central, rtol=1e-5)
 
 
