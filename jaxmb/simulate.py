@@ -113,46 +113,31 @@ def simulate(
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-    term, solver = manifold.prepare(system, formulation, solver, rtol)
-
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    trajectory = _integrate(
-        system,
-        formulation,
-        term,
-        solver,
-        times,
-        state,
-        _save_at(saveat),
-        stepsize_controller,
-        adjoint,
-        event,
-        max_steps,
-        meter,
-        restore=event is not None or isinstance(manifold, Free),
-    )
-    if choice == "switch" and trajectory.stats["stiff"]:
-        again = simulate(
+
+    def motion(solver):
+        term, prepared = manifold.prepare(system, formulation, solver, rtol)
+        return _integrate(
             system,
+            formulation,
+            term,
+            prepared,
+            times,
             state,
-            t1=t1,
-            t0=t0,
-            dt0=dt0,
-            saveat=saveat,
-            solver=Hermite(),
-            formulation=formulation,
-            manifold=manifold,
-            rtol=rtol,
-            atol=atol,
-            stepsize_controller=stepsize_controller,
-            adjoint=adjoint,
-            event=event,
-            max_steps=max_steps,
-            throw=throw,
-            progress_meter=progress_meter,
+            _save_at(saveat),
+            stepsize_controller,
+            adjoint,
+            event,
+            max_steps,
+            meter,
+            restore=event is not None or isinstance(manifold, Free),
         )
+
+    trajectory = motion(solver)
+    if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        return eqx.tree_at(lambda trajectory: trajectory.stats, again, again.stats | found)
+        trajectory = motion(Hermite())
+        trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
             f"The motion is stiff: in {trajectory.stats['stiff_steps']} of {trajectory.stats['num_steps']} steps of "
