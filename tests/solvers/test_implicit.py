@@ -1,0 +1,46 @@
+"""The derivative of an implicit step, against that of the equation solved to rounding."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmb.solvers._implicit import derivatives, differentiable
+
+
+class Field(eqx.Module):
+    parameter: jax.Array
+
+    def __call__(self, t, y):
+        f = jnp.stack([-self.parameter * jnp.sin(y[0]) + y[1] * t, -3.0 * y[1] + y[0] ** 2])
+        return (y, f), None
+
+
+def solved(x, a, b):
+    """The step's end as unrolled Newton iterations, which autodiff goes through."""
+    field, t, past = Field(x[0]), x[1], x[2:]
+
+    def residual(y):
+        _, f, g, _ = derivatives(field, t, y)
+        return y - past - a * f - b * g
+
+    y = past
+    for _ in range(8):
+        y = y - jnp.linalg.solve(jax.jacfwd(residual)(y), residual(y))
+    return derivatives(field, t, y)[:3]
+
+
+@pytest.mark.parametrize("b", [-0.02, -0.002, 0.003], ids=["complex roots", "real roots", "of opposite signs"])
+def test_derivative_of_a_step(b):
+    a, x = 0.15, jnp.array([4.0, 0.7, 0.3, -0.5])
+    end = jax.lax.stop_gradient(solved(x, a, b))
+    one = jnp.asarray(1.0)
+
+    def stepped(x):
+        return differentiable(end, Field(x[0]), x[1], x[2:], a * one, b * one, jnp.arange(2))
+
+    expected = jax.jacfwd(lambda x: solved(x, a, b))(x)
+    for mode in (jax.jacfwd, jax.jacrev):
+        for own, other in zip(jax.jit(mode(stepped))(x), expected, strict=True):
+            np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-12)
