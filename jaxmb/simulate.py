@@ -19,7 +19,7 @@ from .formulations import AbstractFormulation, Multipliers, Partitioned
 from .formulations._base import stages
 from .manifold import AbstractManifold, Free, Partition, Projection, project
 from .manifold.partition import Chart
-from .solvers import AbstractMultistep, Adams, AdamsState, Hermite, HermiteState, MultistepController
+from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController
 from .system import AbstractSystem
 from .trajectory import Trajectory
 
@@ -293,7 +293,10 @@ def _statistics(solution) -> dict[str, Array]:
         if state.stiffness is not None:
             stats["stiff"], stats["stiff_steps"] = state.stiffness.found, state.stiffness.steps
     if isinstance(state, HermiteState):
-        stats["num_evaluations"], stats["num_matrices"] = state.work
+        is_own = lambda leaf: isinstance(leaf, ControllerState)
+        controllers = filter(is_own, jax.tree.leaves(solution.controller_state, is_leaf=is_own))
+        work = state.work + sum(controller.wasted for controller in controllers)
+        stats["num_evaluations"], stats["num_matrices"] = state.tally[0] + work[0], work[1]
         stats["points"] = state.tally[1:]
     chart = _chart(solution)
     if isinstance(chart, Chart):

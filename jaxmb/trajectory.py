@@ -68,10 +68,9 @@ class Trajectory(eqx.Module):
 
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
-    accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`,
-    for accepted steps only, `num_evaluations` of f with its time derivative, `num_matrices` made, and `points`: steps
-    with 1, 2, … points of the past);
-    `result`, how it ended. `trajectory["crank"]` is the motion of a body.
+    accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
+    `num_evaluations` of f with its time derivative, `num_matrices` made, and `points`: accepted steps with 1, 2, …
+    points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body.
     """
 
     system: RigidBodySystem

@@ -1,3 +1,5 @@
+import os
+
 import equinox as eqx
 import jax
 import pytest
@@ -5,6 +7,19 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_configure(config):
+    """Let all modules, workers and notebooks, and the next run, share the programs that are compiled."""
+    settings = {
+        "jax_compilation_cache_dir": str(config.cache.mkdir("programs")),
+        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        # With a bound on its size the cache is locked while it is written.
+        "jax_compilation_cache_max_size": 2**30,
+    }
+    for name, value in settings.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)
 
 
 @pytest.fixture(autouse=True, scope="module")

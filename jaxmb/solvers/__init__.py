@@ -4,5 +4,5 @@ from . import stability as stability
 from ._base import AbstractManifoldTerm as AbstractManifoldTerm, ManifoldEvaluation as ManifoldEvaluation
 from ._multistep import AbstractMultistep as AbstractMultistep
 from .adams import Adams as Adams, AdamsState as AdamsState
-from .controller import MultistepController as MultistepController
+from .controller import ControllerState as ControllerState, MultistepController as MultistepController
 from .hermite import Hermite as Hermite, HermiteState as HermiteState

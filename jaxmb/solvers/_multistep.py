@@ -1,5 +1,6 @@
-"""What the multistep solvers have in common: tolerances, restarts, and how errors are measured."""
+"""What the multistep solvers have in common: tolerances, starts and restarts, and how errors are measured."""
 
+import abc
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ._base import Args, Y
-from ._evaluation import check_real, check_term, derivative
+from ._base import Args, Chart, Y
+from ._evaluation import check_real, check_term, derivative, first_chart, next_chart
+from ._order import StepEstimate
 from ._tolerances import Tolerances, norm_of
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ else:
 
 # A step whose constraints or implicit equation were not solved; it only counts if the steps are fixed, otherwise its
 # error is infinite.
-FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+_FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
 class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
@@ -41,10 +43,40 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     def func(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, y0: Y, args: Args) -> Y:
         return derivative(terms, t0, y0, args)
 
-    def _check(self, terms: PyTree[diffrax.AbstractTerm], y0: Y) -> None:
+    def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> Any:
         self.tolerances.check(type(self).__name__)
         check_term(terms)
         check_real(y0)
+        return self._start(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
+
+    def step(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        args: Args,
+        solver_state: Any,
+        made_jump: Any,
+    ) -> tuple[Y, StepEstimate | None, dict[str, Any], Any, diffrax.RESULTS]:
+        def restart():
+            chart = next_chart(terms, t0, y0, solver_state.chart, args)
+            return self._start(terms, t0, t1, y0, args, chart, solver_state)
+
+        state = _restart_after(made_jump, restart, solver_state)
+        y1, estimate, dense_info, state, failed = self._take(terms, t1, y0, args, state)
+        result: Any = diffrax.RESULTS.successful
+        if failed is not False:
+            result = diffrax.RESULTS.where(failed, _FAILED, result)
+        return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
+
+    @abc.abstractmethod
+    def _start(self, terms, t0, t1, y0, args, chart: Chart | None, before: Any) -> Any:
+        """The solver state at a start; `before`: that before a jump, None at the first start."""
+
+    @abc.abstractmethod
+    def _take(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
+        """A step: what `step` returns, but whether it failed instead of the result."""
 
     def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
         """The weighted norm of an error."""
@@ -62,7 +94,7 @@ def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], An
     return Tolerances(rtol, atol, norm, fixed=True)
 
 
-def restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
+def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
     """The state of a solver after a jump, made anew, or else the same."""
     if made_jump is False:
         return state

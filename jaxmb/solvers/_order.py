@@ -27,6 +27,8 @@ class StepEstimate(eqx.Module):
     - `retry`: the same for the order just used; zero if there is no usable estimate.
     - `response`: the power of these factors by which to change the next step, when those before are what they are.
     - `limit`: the largest factor by which the next step may grow.
+    - `work`: what the step took: evaluations of the vector field, and matrices made. Not integers, which diffrax does
+        not expect in an error.
     """
 
     error: Float[Array, ""]
@@ -34,6 +36,7 @@ class StepEstimate(eqx.Module):
     retry: Float[Array, ""]
     response: Float[Array, ""]
     limit: Float[Array, ""]
+    work: Float[Array, "2"]
 
 
 def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:
@@ -51,6 +54,7 @@ def choose_order(
     may_rise: Bool[Array, ""],
     known: Bool[Array, ""],
     target: float,
+    work: Int[Array, "2"],
     limit: Any = np.inf,
     bounded: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None,
 ) -> tuple[Int[Array, ""], StepEstimate]:
@@ -65,7 +69,7 @@ def choose_order(
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
     - `known`: whether there are points enough for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
-    - `limit`: as in `StepEstimate`.
+    - `work`, `limit`: as in `StepEstimate`.
     - `bounded`: makes factors by which steps may grow, for the three formulas, those that stability allows.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
@@ -86,5 +90,10 @@ def choose_order(
     growth = jnp.maximum(jnp.maximum(lower, higher), same)
     change = rise.astype(jnp.int32) - fall.astype(jnp.int32)
     return change, StepEstimate(
-        error=errors[1], growth=growth, retry=retry, response=response.astype(dtype), limit=jnp.asarray(limit, dtype)
+        error=errors[1],
+        growth=growth,
+        retry=retry,
+        response=response.astype(dtype),
+        limit=jnp.asarray(limit, dtype),
+        work=work.astype(dtype),
     )

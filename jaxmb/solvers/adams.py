@@ -11,25 +11,19 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._base import Args, Chart, Y
-from ._evaluation import (
-    controlled_components,
-    evaluate,
-    first_chart,
-    next_chart,
-    ravel,
-    restore,
-    unravel_like,
-)
+from ._base import Chart
+from ._evaluation import controlled_components, evaluate, next_chart, ravel, restore, unravel_like
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start, step_end
 from ._interpolation import RateInterpolation
-from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
-from ._order import GAIN, StepEstimate, choose_order
+from ._multistep import AbstractMultistep, tolerances_of
+from ._order import GAIN, choose_order
 from ._stiffness import Stiffness, none_found, observed
 from ._tolerances import Tolerances, norm_of
 
 # The error that a step aims at, in units of the tolerance.
 _TARGET = 0.2
+# Evaluations and matrices of a step.
+_WORK = np.array([2, 0], np.int32)
 # The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
 # 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
 _ORDERS = np.arange(1, LENGTH)
@@ -138,31 +132,23 @@ class Adams(AbstractMultistep):
         del terms
         return self.max_order + 1
 
-    def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> AdamsState:
-        self._check(terms, y0)
-        chart = first_chart(terms, t0, y0, args)
-        stiffness = None if self.stiffness == "ignore" else none_found()
-        return _start(terms, t0, t1, y0, args, chart, jnp.zeros(LENGTH, np.int32), stiffness)
+    def _start(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
+        first = evaluate(terms, t0, ravel(y0), y0, chart, args)
+        f, chart = first.f, first.chart
+        if first.failed is not False:
+            # It spreads to the error estimate, and fails the step.
+            f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
+        if before is None:
+            tally, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
+        else:
+            tally, stiffness = before.tally, before.stiffness
+        return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally.at[0].add(1), chart, stiffness)
 
-    def step(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: Any,
-        t1: Any,
-        y0: Y,
-        args: Args,
-        solver_state: AdamsState,
-        made_jump: Any,
-    ) -> tuple[Y, StepEstimate | None, dict[str, Any], AdamsState, diffrax.RESULTS]:
-        def restart():
-            chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return _start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.stiffness)
-
-        state = restart_after(made_jump, restart, solver_state)
+    def _take(self, terms, t1, y0, args, state: AdamsState):
         history, order, chart = state.history, state.order, state.chart
         before = ravel(y0)
         dtype = before.dtype
-        h = (t1 - t0).astype(dtype)
+        h = (t1 - history.mesh[0]).astype(dtype)
 
         end = step_end(history, t1)
         ahead = extrapolate(history, end)
@@ -191,6 +177,7 @@ class Adams(AbstractMultistep):
             may_rise=order < self.max_order,
             known=order < history.points,
             target=_TARGET,
+            work=jnp.asarray(_WORK),
         )
         y1 = unravel_like(y0, after)
         new_state = AdamsState(
@@ -207,12 +194,9 @@ class Adams(AbstractMultistep):
             "mesh": new_state.history.mesh,
             "mismatch": predicted + h * last * (f - ahead.partial_sums[order]) - after,
         }
-        result = diffrax.RESULTS.successful
-        if failed is not False:
-            result = diffrax.RESULTS.where(failed, FAILED, result)
-        if self.stiffness == "stop":
-            result = diffrax.RESULTS.where(state.stiffness.found, FAILED, result)
-        return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
+        if self.stiffness == "stop" and state.stiffness is not None:
+            failed = failed | state.stiffness.found
+        return y1, estimate, dense_info, new_state, failed
 
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
@@ -234,13 +218,3 @@ class Adams(AbstractMultistep):
                 errors.dtype
             )
         return jnp.stack([norm_of(self.tolerances.norm, error, y0) for error in errors])
-
-
-def _start(terms, t0, t1, y0, args, chart, tally, stiffness) -> AdamsState:
-    first = evaluate(terms, t0, ravel(y0), y0, chart, args)
-    f, chart = first.f, first.chart
-    if first.failed is not False:
-        # It spreads to the error estimate, and fails the step.
-        f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
-    tally = tally + (INDEX == 0).astype(np.int32)
-    return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally, chart, stiffness)

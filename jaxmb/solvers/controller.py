@@ -31,13 +31,20 @@ _CAUTION, _CAUTIOUS = 4, 1.4
 
 
 class ControllerState(eqx.Module):
-    """The step that was last asked for, how often it has been rejected since the last good one, and for how many more
-    steps growth is kept small.
+    """What `MultistepController` remembers between steps; `diffrax.SaveAt(controller_state=True)` returns it.
+
+    **Fields:**
+
+    - `intended`: the step that was last asked for.
+    - `rejections`: how often it has been rejected since the last good one.
+    - `caution`: for how many more steps growth is kept small.
+    - `wasted`: evaluations of the vector field, and matrices made, in all rejected steps.
     """
 
     intended: Float[Array, ""]
     rejections: Int[Array, ""]
     caution: Int[Array, ""]
+    wasted: Int[Array, "2"]
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
@@ -135,7 +142,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             dt0 = self._first_step(terms, t0, t1, y0, args, func)
         dt0 = self._bound(dt0, t0.dtype)
         none = jnp.asarray(0, np.int32)
-        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), none, none)
+        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), none, none, jnp.zeros(2, np.int32))
 
     def adapt_step_size(
         self,
@@ -187,6 +194,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             intended=lax.stop_gradient(next_dt),
             rejections=jnp.where(keep, none, rejections + 1),
             caution=jnp.where(keep, jnp.maximum(caution - 1, none), jnp.where(y_error.retry > 0, caution, _CAUTION)),
+            wasted=controller_state.wasted + jnp.where(keep, 0, y_error.work).astype(np.int32),
         )
         return keep, next_t0, next_t0 + next_dt, False, state, result
 

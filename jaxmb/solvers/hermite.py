@@ -13,15 +13,15 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._base import Args, Chart, Y
+from ._base import Chart
 from ._damping import are_damped
-from ._evaluation import field_of, first_chart, free_components, freeze, next_chart, ravel, unravel_like
+from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
-from ._multistep import FAILED, AbstractMultistep, restart_after, tolerances_of
-from ._order import GAIN, LOWER, StepEstimate, choose_order, growth_factors
+from ._multistep import AbstractMultistep, tolerances_of
+from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._tolerances import Tolerances
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
@@ -41,7 +41,8 @@ class HermiteState(eqx.Module):
     - `matrix`: what Newton's method works with.
     - `tally`: `tally[0]` counts the starts (the first, and the restarts after jumps), `tally[k]` the accepted steps
         with k points.
-    - `work`: evaluations of f with g, and matrices made, in accepted steps.
+    - `work`: evaluations of f with g, and matrices made, in accepted steps; the first evaluation after a start is in
+        `tally`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     """
 
@@ -151,27 +152,26 @@ class Hermite(AbstractMultistep):
         del terms
         return FAMILIES[self.family].order(self.points[-1])
 
-    def init(self, terms: PyTree[diffrax.AbstractTerm], t0: Any, t1: Any, y0: Y, args: Args) -> HermiteState:
-        self._check(terms, y0)
-        chart = first_chart(terms, t0, y0, args)
-        tally = jnp.zeros(FAMILIES[self.family].highest + 1, np.int32)
-        return self._start(terms, t0, t1, y0, args, chart, tally, jnp.zeros(2, np.int32), probed_derivatives)
+    def _start(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
+        family, flat = FAMILIES[self.family], ravel(y0)
+        first = (probed_derivatives if before is None else derivatives)(field_of(terms, t0, y0, chart, args), t0, flat)
+        chart, failed = first.rest
+        # It spreads to the error estimate, and fails the step.
+        f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
+        free = free_components(terms, flat, chart)
+        none = jnp.zeros((flat.size, free.size), flat.dtype)
+        exact = none if self.matrix == "exact" else None
+        spectrum = None if self._stable is None else lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
+        matrix = Linearization(none, none, exact, spectrum, jnp.asarray(1, jnp.int32))
+        z, slope = self._recorded(flat, f, first.g)
+        history = start(family, t0, z, slope, t1 - t0)
+        if before is None:
+            tally, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
+        else:
+            tally, work = before.tally, before.work
+        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, tally.at[0].add(1), work, chart)
 
-    def step(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: Any,
-        t1: Any,
-        y0: Y,
-        args: Args,
-        solver_state: HermiteState,
-        made_jump: Any,
-    ) -> tuple[Y, StepEstimate | None, dict[str, Any], HermiteState, diffrax.RESULTS]:
-        def restart():
-            chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return self._start(terms, t0, t1, y0, args, chart, solver_state.tally, solver_state.work, derivatives)
-
-        state = restart_after(made_jump, restart, solver_state)
+    def _take(self, terms, t1, y0, args, state: HermiteState):
         family, history, k = FAMILIES[self.family], state.history, state.points
         before = ravel(y0)
         n, dtype = before.size, before.dtype
@@ -220,6 +220,7 @@ class Hermite(AbstractMultistep):
             may_rise=(k < self.points[-1]) & (family.multiplicity * (around[2] - 1) <= history.points),
             known=family.multiplicity * (around[2] + 1) <= history.points,
             target=_TARGET,
+            work=newton.work,
             limit=jnp.asarray((1.0, *family.growth), dtype)[k],
             bounded=bounded,
         )
@@ -257,8 +258,7 @@ class Hermite(AbstractMultistep):
             "mesh": doubled.mesh,
             "mismatch": past + a * f + b * g - y,
         }
-        result = diffrax.RESULTS.where(failed, FAILED, diffrax.RESULTS.successful)
-        return y1, None if self.tolerances.fixed else estimate, dense_info, new_state, result
+        return y1, estimate, dense_info, new_state, failed
 
     def _newton(self, field, t, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
@@ -290,21 +290,6 @@ class Hermite(AbstractMultistep):
         then, now = jax.vmap(lambda steps: are_damped(self.family, points, steps, spectrum))(steps)
         zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)
         return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
-
-    def _start(self, terms, t0, t1, y0, args, chart, tally, work, derivatives) -> HermiteState:
-        family, flat = FAMILIES[self.family], ravel(y0)
-        first = derivatives(field_of(terms, t0, y0, chart, args), t0, flat)
-        chart, failed = first.rest
-        # It spreads to the error estimate, and fails the step.
-        f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
-        free = free_components(terms, flat, chart)
-        none = jnp.zeros((flat.size, free.size), flat.dtype)
-        exact = none if self.matrix == "exact" else None
-        spectrum = None if self._stable is None else lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
-        matrix = Linearization(none, none, exact, spectrum, jnp.asarray(1, jnp.int32))
-        z, slope = self._recorded(flat, f, first.g)
-        history = start(family, t0, z, slope, t1 - t0)
-        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, tally.at[0].add(1), work, chart)
 
     def _recorded(self, y, f, g):
         """What the history is of, and its slope."""

@@ -10,7 +10,7 @@ relative to its largest reference value. All solvers have the same right-hand si
 each. On mechanisms Hermite integrates the independent coordinates of a partition, Kvaerno5 all of them with a
 projection after every step, and CVODE all of them without.
 
-Counts: of Hermite, evaluations of f with its derivative along the solution, in accepted steps; of Kvaerno5, calls of f
+Counts: of Hermite, evaluations of f with its derivative along the solution; of Kvaerno5, calls of f
 (on mechanisms there is nothing to count them with); of CVODE, calls of f, while it does not tell rejected steps.
 """
 
@@ -98,11 +98,14 @@ def ode_solvers(key: str) -> dict[str, Solver]:
                 args,
                 stepsize_controller=controller(rtol, rtol * problem.relative),
                 adjoint=diffrax.ForwardMode(),
-                saveat=diffrax.SaveAt(t1=True, solver_state=isinstance(solver, Hermite)),
+                saveat=diffrax.SaveAt(t1=True, solver_state=True, controller_state=True),
                 max_steps=MAX_STEPS,
                 throw=False,
             )
-            work = solution.solver_state.work[0] if isinstance(solver, Hermite) else None
+            work = None
+            if isinstance(solver, Hermite):
+                state, controller_state = solution.solver_state, solution.controller_state
+                work = state.tally[0] + state.work[0] + controller_state.wasted[0]
             return solution.ys[-1], solution.stats, solution.result == diffrax.RESULTS.successful, work
 
         run = jax.jit(lambda rtol: solve(problem.vector_field, rtol))
