@@ -2,6 +2,7 @@
 
 from . import (
     formulations as formulations,
+    lagrangian as lagrangian,
     manifold as manifold,
     mechanisms as mechanisms,
     planar as planar,

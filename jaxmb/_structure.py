@@ -47,7 +47,7 @@ def _analyse(system):
     if system.position_rows:
         q, near = nearest(system, t, q, system.coordinate_scale())
         residual = residual_size(system, t, q, near)
-    jacobian = system.jacobian(t, q, u)
+    jacobian = system.velocity_jacobian(t, q, u)
     stage = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
     out = {
         "q": q,

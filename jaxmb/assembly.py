@@ -19,7 +19,7 @@ from ._types import Scalar, State, VectorLike
 from .elimination import full_pivot
 from .rotations import normalize
 from .system import AbstractSystem, RigidBodySystem
-from .system.coordinates import coordinate_names, prescribe, rate_names
+from .system.coordinates import prescribe
 
 _ITERATIONS = 100
 
@@ -29,7 +29,7 @@ _REFINEMENTS = 16
 
 
 def assemble(
-    system: RigidBodySystem,
+    system: AbstractSystem,
     guess: State | None = None,
     *,
     fix: Mapping[str, VectorLike] | None = None,
@@ -41,11 +41,11 @@ def assemble(
 
     **Arguments:**
 
-    - `system`: a compiled scene.
+    - `system`: a compiled scene, or another system.
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}`.
     - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"`
-        (body frame) and `"body.velocity"`.
+        (body frame) and `"body.velocity"`; of a `LagrangianSystem` names of coordinates, or `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
         that one member of a batch does not spoil the others.
@@ -57,20 +57,22 @@ def assemble(
     """
     guess = system.guess if guess is None else guess
     t = jnp.asarray(t, guess.q.dtype)
-    q, fixed = prescribe("coordinate", coordinate_names(system), fix or {}, guess.q)
-    u, fixed_rates = prescribe("rate", rate_names(system), rates or {}, guess.u)
+    q, fixed = prescribe("coordinate", system.coordinate_names(), fix or {}, guess.q)
+    u, fixed_rates = prescribe("rate", system.rate_names(), rates or {}, guess.u)
     concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, q, u, t)))
     if concrete:
         _check_finite(q, "coordinates")
         _check_finite(u, "rates")
 
-    q, whole = _normalize_fixed(system, q, fixed)
+    whole = 0
+    if isinstance(system, RigidBodySystem):
+        q, whole = _normalize_fixed(system, q, fixed)
     q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if concrete and throw and not bool(ok):
-        raise ValueError(_cannot_assemble(system, t, q, fixed, coordinate_names(system)))
+        raise ValueError(_cannot_assemble(system, t, q, fixed, system.coordinate_names()))
     u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     if concrete and throw and not bool(ok_rates):
-        raise ValueError(_cannot_move(system, t, q, u, fixed_rates, rate_names(system)))
+        raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
     ok = ok & ok_rates
     if throw and not concrete:
         q = eqx.error_if(
@@ -151,9 +153,9 @@ def velocities(
         return guess, jnp.array(True)
     scale = jnp.where(np.array(held), 0.0, system.velocity_scale())
     u, rank, ok = guess, system.velocity_rank, jnp.array(True)
-    jacobian = system.jacobian(t, q, u)
+    jacobian = system.velocity_jacobian(t, q, u)
     for step in range(1 if system.linear else 8):
-        jacobian = jacobian if step == 0 else system.jacobian(t, q, u)
+        jacobian = jacobian if step == 0 else system.velocity_jacobian(t, q, u)
         pivots = full_pivot(jacobian, scale=scale)
         ok = ok & (pivots.rank == rank)
         rows = pivots.order.rows[:rank]
@@ -241,7 +243,7 @@ def _check_finite(vector, what):
         raise ValueError(f"The guess or the fixed {what} are not finite: {np.asarray(vector)}.")
 
 
-def open_joints(system: RigidBodySystem, t: Scalar, q: Float[Array, "nq"]) -> str:
+def open_joints(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> str:
     """The joints that a configuration leaves open, largest residual first, for messages."""
     residual = np.abs(np.asarray(system.position_residual(t, q)))
     worst: dict[str, float] = {}

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ._types import Scalar, State
 from .rotations import cross
-from .system import RigidBodySystem
+from .system import AbstractSystem, RigidBodySystem
 
 
 class Reaction(NamedTuple):
@@ -24,9 +24,17 @@ class Reaction(NamedTuple):
     multipliers: Float[Array, "*times rows"]
 
 
-def joint_names(system: RigidBodySystem) -> tuple[str, ...]:
+def joint_names(system: AbstractSystem) -> tuple[str, ...]:
     """Names of the parts that exert constraint forces."""
     return tuple(dict.fromkeys(name for name, _ in system.rows))
+
+
+def constraint_force(
+    system: AbstractSystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]
+) -> Float[Array, "nu"]:
+    """The part of `Aᵀ λ` that is of one constraint."""
+    own = jnp.array([row == name for row, _ in system.rows])
+    return system.constraint_force(t, y.q, y.u, jnp.where(own, multipliers, jnp.zeros_like(multipliers)))
 
 
 def reaction(system: RigidBodySystem, name: str, t: Scalar, y: State, multipliers: Float[Array, "rows"]) -> Reaction:

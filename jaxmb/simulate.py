@@ -103,7 +103,7 @@ def simulate(
     solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
     if manifold is None:
         constrained = Partition() if isinstance(solver, AbstractMultistep) else Projection()
-        manifold = Free() if system.velocity_rows == 0 else constrained
+        manifold = Free() if system.acceleration_rows == 0 else constrained
     if formulation is None:
         formulation = Partitioned() if isinstance(manifold, Partition) else Multipliers()
     if stepsize_controller is None:
@@ -271,7 +271,7 @@ def _diagnose(system, start, end, solution):
 
     def smallest_pivot():
         pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
-        return jnp.where(pivots.rank < system.velocity_rank, 0.0, pivots.smallest)
+        return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
     pivot = lax.cond(stuck, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
     singular = stuck & ((pivot < _SINGULAR_PIVOT) | _chart(solution).singular)

@@ -17,7 +17,7 @@ from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
 from .manifold import project
-from .reactions import Reaction, joint_names, reaction
+from .reactions import Reaction, constraint_force, joint_names, reaction
 from .system import RigidBodySystem
 
 
@@ -43,18 +43,18 @@ class BodyMotion(NamedTuple):
     angular_velocity: Array | None
 
 
-class Reactions(Mapping[str, Reaction]):
-    """Forces of the joints by name, worked out when asked for."""
+class _ByConstraint(Mapping[str, Any]):
+    """Something of each constraint by name, worked out when asked for."""
 
-    def __init__(self, trajectory: "Trajectory"):
-        self._trajectory = trajectory
+    def __init__(self, trajectory: "Trajectory", what: Any):
+        self._trajectory, self._what = trajectory, what
 
-    def __getitem__(self, name: str) -> Reaction:
+    def __getitem__(self, name: str) -> Any:
         names = joint_names(self._trajectory.system)
         if name not in names:
             raise unknown("joint", name, names)
         trajectory = self._trajectory
-        return _reactions(trajectory.system, name, trajectory.ts, trajectory.ys, trajectory.multipliers)
+        return _of_constraint(self._what, trajectory.system, name, trajectory.ts, trajectory.ys, trajectory.multipliers)
 
     def __iter__(self) -> Iterator[str]:
         return iter(joint_names(self._trajectory.system))
@@ -70,10 +70,11 @@ class Trajectory(eqx.Module):
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `points`: accepted steps with 1, 2, …
-    points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body.
+    points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, and of a
+    system with coordinates of the user's that of a coordinate, shape (times,).
     """
 
-    system: RigidBodySystem
+    system: Any
     formulation: AbstractFormulation
     ts: Float[Array, "times"]
     ys: Any
@@ -82,8 +83,13 @@ class Trajectory(eqx.Module):
     interpolation: diffrax.AbstractPath | None
     event_mask: Any
 
-    def __getitem__(self, body: str) -> BodyMotion:
+    def __getitem__(self, body: str) -> Any:
         system = self.system
+        if not isinstance(system, RigidBodySystem):
+            names = system.coordinate_names()
+            if body not in names:
+                raise unknown("coordinate", body, names)
+            return self.ys.q[:, names[body][0]]
         if body not in system.body_names:
             raise unknown("body", body, system.body_names)
         k = system.body_names.index(body)
@@ -154,9 +160,16 @@ class Trajectory(eqx.Module):
         return jax.vmap(lambda t, y: accelerations(self.system, self.formulation, t, y.q, y.u))(self.ts, self.ys)
 
     @property
-    def reactions(self) -> Reactions:
-        """Forces of the joints by name: `reactions["A"].force`."""
-        return Reactions(self)
+    def reactions(self) -> Mapping[str, Reaction]:
+        """Forces of the joints of rigid bodies by name: `reactions["A"].force`."""
+        if not isinstance(self.system, RigidBodySystem):
+            raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
+        return _ByConstraint(self, reaction)
+
+    @property
+    def constraint_forces(self) -> Mapping[str, Array]:
+        """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
+        return _ByConstraint(self, constraint_force)
 
     @property
     @eqx.filter_jit
@@ -184,10 +197,13 @@ class Trajectory(eqx.Module):
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
-        for body in self.system.body_names:
-            for field, value in self[body]._asdict().items():
-                if value is not None:
-                    out[f"{body}.{field}"] = np.asarray(value)
+        if isinstance(self.system, RigidBodySystem):
+            for body in self.system.body_names:
+                for field, value in self[body]._asdict().items():
+                    if value is not None:
+                        out[f"{body}.{field}"] = np.asarray(value)
+        else:
+            out |= {name: np.asarray(self[name]) for name in self.system.coordinate_names()}
         out["energy"] = np.asarray(self.energy)
         for name, value in self.stats.items():
             if value is not None:
@@ -200,8 +216,8 @@ class Trajectory(eqx.Module):
 
 
 @eqx.filter_jit
-def _reactions(system, name, ts, ys, multipliers):
-    return jax.vmap(lambda t, y, own: reaction(system, name, t, y, own))(ts, ys, multipliers)
+def _of_constraint(what, system, name, ts, ys, multipliers):
+    return jax.vmap(lambda t, y, own: what(system, name, t, y, own))(ts, ys, multipliers)
 
 
 @eqx.filter_jit

@@ -17,7 +17,7 @@ LAYERS = [
     ["system"],
     ["assembly"],
     ["_structure"],
-    ["scene"],
+    ["scene", "lagrangian"],
     ["formulations"],
     ["solvers"],
     ["manifold"],

@@ -50,7 +50,7 @@ def linearize(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float
     """The Jacobian A at a state and its factor, with a search for pivots."""
     jacobian = system.jacobian(t, q, u)
     pivots = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
-    return jacobian, factor(jacobian, pivots.order, system.velocity_rank)
+    return jacobian, factor(jacobian, pivots.order, system.acceleration_rank)
 
 
 def every_row(m: int, n: int, dtype) -> Factor:
@@ -59,8 +59,9 @@ def every_row(m: int, n: int, dtype) -> Factor:
 
 
 def stages(system: AbstractSystem) -> Array:
-    """Holonomic rows before nonholonomic ones, so that the dependent velocities nest."""
-    return (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
+    """Holonomic rows before nonholonomic ones before those of accelerations, so that the dependent velocities nest."""
+    row = jnp.arange(system.acceleration_rows)
+    return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
 
 
 def accelerations(
@@ -71,12 +72,33 @@ def accelerations(
     u: Float[Array, "nu"],
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
     """Accelerations u̇ and multipliers λ of a system at a state on its constraints."""
-    inertia, force = system.inertia(t, q), system.force(t, q, u)
-    if system.velocity_rows == 0:
-        return inertia.solve(force), jnp.zeros(0, u.dtype)
-    if formulation.partitions or system.velocity_rank < system.velocity_rows:
+    if system.acceleration_rows == 0:
+        return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
+    if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         jacobian, split = linearize(system, t, q, u)
     else:
-        jacobian, split = system.jacobian(t, q, u), every_row(system.velocity_rows, system.nu, u.dtype)
+        jacobian, split = system.jacobian(t, q, u), every_row(system.acceleration_rows, system.nu, u.dtype)
+    return solve_constrained(system, formulation, t, q, u, jacobian, split)
+
+
+def solve_constrained(
+    system: AbstractSystem,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    u: Float[Array, "nu"],
+    jacobian: Float[Array, "m nu"],
+    split: Factor,
+) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+    """Accelerations u̇ and multipliers λ from the Jacobian A and its factor.
+
+    Where constraints are not ideal, their force C follows from the multipliers of ideal ones, and then accelerations
+    from C as from any other force (F. E. Udwadia and P. Phohomsiri, Proc. R. Soc. A 463, 2007): `M u̇ = F + C + Aᵀ λ`.
+    """
+    inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+    udot, multipliers = formulation.solve(inertia, force, jacobian, gamma, split)
+    if system.ideal:
+        return udot, multipliers
+    force = force + system.nonideal_force(t, q, u, multipliers)
     return formulation.solve(inertia, force, jacobian, gamma, split)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Scalar
 from ..elimination import Factor, Order, factor, solve_positive
 from ..formulations import AbstractFormulation
+from ..formulations._base import solve_constrained
 from ..system import AbstractSystem
 
 _MAX_ITERATIONS = 12
@@ -26,12 +27,14 @@ _MAX_ITERATIONS = 12
 class Split(eqx.Module):
     """A chart's index sets, and the matrix that restores positions.
 
-    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `coordinate`: that of the coordinates'
-    Jacobian, None where one order serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq =
-    −Φ` along dependent columns, from a state of this step or of one before.
+    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `acceleration`: that of all rows of A,
+    None where none bind accelerations only; `coordinate`: that of the coordinates' Jacobian, None where one order
+    serves both; `correction` (nq × coordinate rows): approximate solution of `Φ_q δq = −Φ` along dependent columns,
+    from a state of this step or of one before.
     """
 
     velocity: Order
+    acceleration: Order | None
     coordinate: Order | None
     correction: Float[Array, "nq mq"]
 
@@ -99,7 +102,34 @@ def _evaluate(system, formulation, t, q, u, order):
     residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
     u = u - solved.correction @ residual
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    udot, _ = formulation.solve(system.inertia(t, q), system.force(t, q, u), jacobian, gamma, solved)
+    udot, _ = formulation.solve(system.inertia(t, q, u), system.force(t, q, u), jacobian, gamma, solved)
+    return Evaluation(u, udot, solved)
+
+
+@eqx.filter_jit
+def evaluate_general(
+    system: AbstractSystem,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    u: Float[Array, "nu"],
+    split: Split,
+) -> Evaluation:
+    """The same for any constraints, ideal or not, also those that bind accelerations only: from the factors of this
+    very state, which are differentiated with it.
+    """
+
+    def velocity_factor(u):
+        return factor(system.velocity_jacobian(t, q, u), split.velocity, system.velocity_rank)
+
+    solved = velocity_factor(u)
+    u = u - solved.correction @ system.velocity_residual(t, q, u)
+    if not system.linear:
+        solved = velocity_factor(u)
+        u = u - solved.correction @ system.velocity_residual(t, q, u)
+    jacobian = system.jacobian(t, q, u)
+    every = solved if split.acceleration is None else factor(jacobian, split.acceleration, system.acceleration_rank)
+    udot, _ = solve_constrained(system, formulation, t, q, u, jacobian, every)
     return Evaluation(u, udot, solved)
 
 
@@ -133,7 +163,7 @@ def _restore(system, t, q, u, near, split, tol):
         step = solved.correction @ system.velocity_residual(t, q, u)
         u = u - step
         failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(u))))
-    inertia = system.inertia(t, q)
+    inertia = system.inertia(t, q, u)
     multipliers = solved.correction.T @ (inertia.product(udot) - system.force(t, q, u))
     unlevel, unbalance = _equations(system, t, q, u, udot, multipliers)
     udot = udot + _solve_linear(inertia, solved, unlevel, unbalance)
@@ -143,7 +173,7 @@ def _restore(system, t, q, u, near, split, tol):
 def _equations(system, t, q, u, udot, multipliers):
     """Residuals of the equations of motion: `A u̇ − γ` and `M u̇ − F − Aᵀ λ`."""
     applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
-    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q).product(udot) - applied
+    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
 
 
 def _solve_linear(inertia, solved, unlevel, unbalance):
@@ -243,7 +273,7 @@ def _push_velocities(at, along, solved):
 
 def _push_accelerations(at, along, udot, solved):
     system, t, q, u = at
-    inertia = system.inertia(t, q)
+    inertia = system.inertia(t, q, u)
     multipliers = solved.correction.T @ (inertia.product(udot) - system.force(t, q, u))
     unlevel, unbalance = _push(lambda s, t, q, u: _equations(s, t, q, u, udot, multipliers), at, along)
     return _solve_linear(inertia, solved, unlevel, unbalance)

@@ -21,7 +21,16 @@ from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluatio
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
 from ._base import AbstractManifold
-from .constrained import Evaluation, Split, correct_positions, evaluate, restore, restore_positions, shared
+from .constrained import (
+    Evaluation,
+    Split,
+    correct_positions,
+    evaluate,
+    evaluate_general,
+    restore,
+    restore_positions,
+    shared,
+)
 from .free import VectorField
 
 # A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
@@ -136,23 +145,30 @@ class PartitionTerm(AbstractManifoldTerm):
     def evaluate(self, t, y, chart, args):
         system, split, quality = self.system, chart.split, chart.quality
         q = correct_positions(system, t, y.q, lax.stop_gradient(split))
-        if system.velocity_rows == 0:
-            u, udot, factors = y.u, system.inertia(t, q).solve(system.force(t, q, y.u)), None
+        if system.acceleration_rows == 0:
+            u, udot, factors = y.u, system.inertia(t, q, y.u).solve(system.force(t, q, y.u)), None
         else:
-            out = evaluate(system, self.formulation, t, q, y.u, split.velocity)
+            if system.plain:
+                out = evaluate(system, self.formulation, t, q, y.u, split.velocity)
+            else:
+                out = evaluate_general(system, self.formulation, t, q, y.u, split)
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
-                split = Split(split.velocity, None, factors.correction)
+                split = Split(split.velocity, split.acceleration, None, factors.correction)
         f = State(system.rates(t, q, u), udot)
         chart = Chart(split, quality, chart.fresh, chart.counters)
         return ManifoldEvaluation(State(q, u), f, chart, chart.singular, factors)
 
     def restore(self, t, y, near, args):
         system, chart = self.system, near.chart
-        if system.velocity_rows == 0:
+        if system.acceleration_rows == 0:
             q, iterations, failed = restore_positions(system, t, y.q, chart.split, self.newton_tol)
-            u, udot = y.u, system.inertia(t, q).solve(system.force(t, q, y.u))
+            u, udot = y.u, system.inertia(t, q, y.u).solve(system.force(t, q, y.u))
+        elif not system.plain:
+            q, iterations, failed = restore_positions(system, t, y.q, chart.split, self.newton_tol)
+            again = evaluate_general(system, self.formulation, t, q, y.u, lax.stop_gradient(chart.split))
+            u, udot = again.u, again.udot
         else:
             before = lax.stop_gradient((near.y.u, near.f.u))
             before = Evaluation(*before, near.factors)
@@ -202,7 +218,7 @@ def _updated(system, t, y, chart, max_influence):
 
     def refresh(chart):
         jacobian = _of_coordinates(system, t, y)
-        split, own = _refreshed(system, jacobian, chart.split.velocity, chart.split.coordinate)
+        split, own = _refreshed(system, jacobian, chart.split)
         quality = jnp.maximum(chart.quality, own)
         # Only a chart that has been refreshed can be worse.
         return renewed(Chart(split, quality, chart.fresh, chart.counters.at[0].set(0)), jacobian)
@@ -218,23 +234,28 @@ def _of_coordinates(system, t, y):
 
 def _choose(system, t, y, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled."""
-    jacobian = system.jacobian(t, y.q, y.u)
-    velocity = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
+    jacobian, scale, stage = system.jacobian(t, y.q, y.u), system.velocity_scale(), stages(system)
+    rows = system.velocity_rows
+    velocity = full_pivot(jacobian[:rows], scale=scale, stage=stage[:rows])
     singular = velocity.rank != system.velocity_rank
-    solved = factor(jacobian, velocity.order, system.velocity_rank)
+    solved = factor(jacobian[:rows], velocity.order, system.velocity_rank)
     quality = _velocity_quality(system, solved, velocity.order)
+    acceleration = None
+    if system.acceleration_rows > rows:
+        every = full_pivot(jacobian, scale=scale, stage=stage)
+        acceleration, singular = every.order, singular | (every.rank != system.acceleration_rank)
     if shared(system):
-        return Split(velocity.order, None, solved.correction), quality, singular
+        return Split(velocity.order, acceleration, None, solved.correction), quality, singular
     pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-    split, own = _refreshed(system, of_coordinates, velocity.order, pivots.order)
+    split, own = _refreshed(system, of_coordinates, Split(velocity.order, acceleration, pivots.order, jnp.zeros(())))
     return split, jnp.maximum(quality, own), singular | (pivots.rank != system.coordinate_rank)
 
 
-def _refreshed(system, jacobian, velocity, coordinate):
+def _refreshed(system, jacobian, split):
     """The split with the position factor of this state, from its Jacobian, and the coordinates' quality."""
-    solved = factor(jacobian, coordinate, system.coordinate_rank)
-    own = _quality(system, solved, system.coordinate_scale(), coordinate, system.coordinate_rank)
-    return Split(velocity, coordinate, solved.correction), own
+    solved = factor(jacobian, split.coordinate, system.coordinate_rank)
+    own = _quality(system, solved, system.coordinate_scale(), split.coordinate, system.coordinate_rank)
+    return Split(split.velocity, split.acceleration, split.coordinate, solved.correction), own
 
 
 def _velocity_quality(system, solved, order):

@@ -99,7 +99,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     if system.velocity_rank > 0:
         square = system.velocity_scale() ** 2
         for _ in range(1 if system.linear else 3):
-            jacobian = system.jacobian(t, q, u)
+            jacobian = system.velocity_jacobian(t, q, u)
             rows = _independent(jacobian, system.velocity_scale(), system.velocity_rank)
             ahead = jacobian[rows] * square[None, :]
             u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])

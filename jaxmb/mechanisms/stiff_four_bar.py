@@ -4,7 +4,6 @@ import numpy as np
 
 from .. import planar
 from ..scene import Scene
-from ..system.coordinates import coordinate_names, rate_names
 from ._base import Mechanism, References, build, mechanism, point_motion
 from .four_bar import four_bar
 
@@ -46,7 +45,7 @@ def stiff_four_bar(
         point_a=(base, 0.0),
         point_b=foot,
     )
-    coordinates, rates = coordinate_names(rigid.system), rate_names(rigid.system)
+    coordinates, rates = rigid.system.coordinate_names(), rigid.system.rate_names()
     angles = [f"{name}.angle" for name in ("crank", "coupler", "rocker")]
     return build(
         "stiff_four_bar",

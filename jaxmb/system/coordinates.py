@@ -8,34 +8,35 @@ from jaxtyping import Array, Bool, Float
 
 from .._names import unknown
 from .._types import VectorLike
-from .rigid_bodies import RigidBodySystem
+from .layout import Layout
 
 
-def coordinate_names(system: RigidBodySystem) -> dict[str, list[int]]:
+def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`,
     `position`, `orientation` of spatial ones.
     """
-    if system.spatial:
+    if layout.space.dimension == 3:
         fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
-        return _names(system, system.layout.pose_index, fields, {"position": slice(0, 3), "orientation": slice(3, 7)})
-    return _names(system, system.layout.pose_index, ["x", "y", "angle"], {"position": slice(0, 2)})
+        groups = {"position": slice(0, 3), "orientation": slice(3, 7)}
+        return _names(layout, bodies, layout.pose_index, fields, groups)
+    return _names(layout, bodies, layout.pose_index, ["x", "y", "angle"], {"position": slice(0, 2)})
 
 
-def rate_names(system: RigidBodySystem) -> dict[str, list[int]]:
+def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`,
     `angular_velocity` in space.
     """
-    if system.spatial:
+    if layout.space.dimension == 3:
         fields = ["x", "y", "z", "wx", "wy", "wz"]
         groups = {"velocity": slice(0, 3), "angular_velocity": slice(3, 6)}
-        return _names(system, system.layout.velocity_index, fields, groups)
-    return _names(system, system.layout.velocity_index, ["x", "y", "angle"], {"velocity": slice(0, 2)})
+        return _names(layout, bodies, layout.velocity_index, fields, groups)
+    return _names(layout, bodies, layout.velocity_index, ["x", "y", "angle"], {"velocity": slice(0, 2)})
 
 
-def _names(system, index, fields, groups):
+def _names(layout, bodies, index, fields, groups):
     names = {}
-    for body, row, rotates in zip(system.body_names, index[:-1], system.layout.rotates, strict=True):
-        own = len(fields) if rotates else system.layout.space.dimension
+    for body, row, rotates in zip(bodies, index[:-1], layout.rotates, strict=True):
+        own = len(fields) if rotates else layout.space.dimension
         for k in range(own):
             names[f"{body}.{fields[k]}"] = [int(row[k])]
         for group, where in groups.items():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..elimination import solve_positive
 from ..rotations import cross
 
 
@@ -65,7 +66,7 @@ class DenseInertia(AbstractInertia):
         return self.matrix @ v
 
     def solve(self, f):
-        return jnp.linalg.solve(self.matrix, f)
+        return solve_positive(self.matrix, f)
 
 
 def _block_product(J, w):

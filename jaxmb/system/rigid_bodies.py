@@ -12,9 +12,11 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..rotations import cross, rotate
 from ._base import AbstractSystem
+from .coordinates import coordinate_names, rate_names
 from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
+from .places import parameter_places
 
 if TYPE_CHECKING:
     from .describe import Description
@@ -111,6 +113,18 @@ class RigidBodySystem(AbstractSystem):
         return self.ranks.velocity
 
     @property
+    def acceleration_rows(self) -> int:
+        return self.velocity_rows
+
+    @property
+    def acceleration_rank(self) -> int:
+        return self.velocity_rank
+
+    @property
+    def ideal(self) -> bool:
+        return True
+
+    @property
     def rates_are_velocities(self) -> bool:
         return not self.spatial
 
@@ -133,6 +147,15 @@ class RigidBodySystem(AbstractSystem):
             for name in g.group.names
             for k in range(g.rows)
         )
+
+    def coordinate_names(self):
+        return coordinate_names(self.layout, self.body_names)
+
+    def rate_names(self):
+        return rate_names(self.layout, self.body_names)
+
+    def parameter_places(self):
+        return parameter_places(self)
 
     # Kinematics
 
@@ -229,6 +252,9 @@ class RigidBodySystem(AbstractSystem):
             row += own.size
         return self._add_up(wrenches, bodies, u.dtype)
 
+    def nonideal_force(self, t, q, u, multipliers):
+        return jnp.zeros_like(u)
+
     @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
@@ -242,7 +268,7 @@ class RigidBodySystem(AbstractSystem):
 
     # Dynamics
 
-    def inertia(self, t, q) -> AbstractInertia:
+    def inertia(self, t, q, u) -> AbstractInertia:
         if self.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.rotary)
         if self.spatial:
@@ -285,7 +311,7 @@ class RigidBodySystem(AbstractSystem):
     # Energy and momentum
 
     def kinetic_energy(self, t, q, u):
-        return 0.5 * jnp.dot(u, self.inertia(t, q).product(u))
+        return 0.5 * jnp.dot(u, self.inertia(t, q, u).product(u))
 
     def potential_energy(self, t, q):
         poses = self.prepared_poses(q)

@@ -1,0 +1,123 @@
+"""Hamel's equations: motion in a frame, with the structure functions of its vector fields."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import Scalar
+from ..elimination import Order, factor, full_pivot
+from .equations import AbstractEquations
+from .kinematics import Frame
+from .transposition import Transposition, check_shape, share_of_suslov
+
+
+class Hamel(AbstractEquations):
+    r"""Hamel's equations in a frame $X_1, \dots, X_n$ whose first columns are the velocities ξ = u:
+
+    $$\frac{d}{dt} p_c - X_c[\ell] = \gamma^a_c p_a - W_c \cdot p + (N^T Q)_c, \qquad [X_b, X_c] = c^a_{bc} X_a$$
+
+    with $\ell(t, q, \xi) = L(t, q, N \xi + \nu)$, its momenta $p_a$ along all of the frame, and the transitivity
+    coefficients $\gamma^a_c = c^a_{bc} \xi^b + \Psi^a W_c$, $\Psi = N^{-1}$. The drift ν counts as one more field with
+    velocity one. With a frame of a base, moved along by a connection, these are the Hamel-Voronets equations.
+
+    **Arguments:** `transposition`: what is meant by the variation of a velocity: `"holder"` (W = 0), `"suslov"` (varied
+    velocities stay in the frame's columns), a number between zero and one for a mixture of both, or a function
+    `W(t, q, v, dq, parameters)`, shape (nq,). The equations are the same for all.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{hamel1904lagrange,
+          author = {Hamel, G.}, title = {Die Lagrange-Eulerschen Gleichungen der Mechanik}, journal = {Zeitschrift
+          für Mathematik und Physik}, volume = {50}, pages = {1--57}, year = {1904},
+        }
+        ```
+    """
+
+    transposition: Transposition = eqx.field(static=True, default="holder")
+
+    def __check_init__(self):
+        share_of_suslov(self.transposition)
+
+    def check(self, system):
+        if not isinstance(system.kinematics, Frame):
+            raise ValueError(f"Hamel's equations need kinematics=Frame(...), got {type(system.kinematics).__name__}.")
+        frame = complete(system.kinematics.columns_of(jnp.zeros(()), system.guess.q, system.parameters))
+        sizes = np.linalg.svd(np.asarray(frame), compute_uv=False)
+        if not sizes[-1] > 1e-12 * sizes[0]:
+            raise ValueError("The frame's columns are not independent at the guess.")
+        if callable(self.transposition):
+            check_shape(self.transposition, system.guess.q, system.parameters)
+
+    def force(self, system, t, q, u):
+        frame: Any = system.kinematics
+        p = system.parameters
+        one = jnp.ones_like(t)
+        columns = lambda t, q: frame.columns_of(t, q, p)
+        X, v = columns(t, q), system.rates(t, q, u)
+        sigma = u.size
+        # [X_b, X_c] for all columns c, summed over the velocities of b with the drift: d X_c / dt − ∂v/∂q X_c.
+        _, moved = jax.jvp(columns, (t, q), (one, v))
+        turned = jax.vmap(lambda x: jax.jvp(lambda q: system.rates(t, q, u), (q,), (x,))[1], in_axes=1, out_axes=1)(X)
+        inverse = inverse_of(complete(X))
+        structure = inverse @ (moved - turned)
+
+        ell = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), p)
+        momenta = system.momentum(t, q, v) @ complete(X)
+        W = self._transposed(system, t, q, v, X, structure, sigma)
+        transitivity = structure + inverse @ W
+        _, rate = jax.jvp(lambda t, q: jax.grad(ell, 2)(t, q, u), (t, q), (one, v))
+        along = jax.grad(ell, 1)(t, q, u) @ X
+        right = momenta @ transitivity - system.momentum(t, q, v) @ W
+        return along - rate + right + system.applied_force(t, q, v) @ X
+
+    def _transposed(self, system, t, q, v, X, structure, sigma):
+        """W for displacements along each of the columns, shape (nq, columns)."""
+        share = share_of_suslov(self.transposition)
+        if share is None:
+            transposition: Any = self.transposition
+            along = lambda x: jnp.asarray(transposition(t, q, v, x, system.parameters))
+            return jax.vmap(along, in_axes=1, out_axes=1)(X)
+        outside = (jnp.arange(q.size) >= sigma)[:, None]
+        return -share * (complete(X) @ jnp.where(outside, structure, jnp.zeros_like(structure)))
+
+
+def complete(columns: Float[Array, "n k"]) -> Float[Array, "n n"]:
+    """A frame that begins with these columns; the rest are unit vectors, chosen by full pivoting."""
+    n, k = columns.shape
+    if n == k:
+        return columns
+    rest = full_pivot(columns.T).order.columns[k:]
+    return jnp.concatenate([columns, jnp.zeros((n, n - k), columns.dtype).at[rest, jnp.arange(n - k)].set(1.0)], axis=1)
+
+
+def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse, with full pivoting."""
+    n = matrix.shape[0]
+    return factor(matrix, full_pivot(matrix).order, n).correction
+
+
+def pivoted_frame(matrix: Callable[..., Array], order: Order, rank: int) -> Frame:
+    """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
+
+    **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
+    `jaxmb.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the coordinates
+    that the pivots leave.
+    """
+    basis = lambda t, q, p: factor(jnp.asarray(matrix(t, q, p)), order, rank).basis
+    return Frame(basis, columns=order.n - rank)
+
+
+def structure_functions(
+    frame: Frame, t: Scalar, q: Float[Array, "n"], parameters: dict[str, Array]
+) -> Float[Array, "n k k"]:
+    """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c."""
+    columns = lambda q: frame.columns_of(t, q, parameters)
+    X = columns(q)
+    slope = jax.jacfwd(columns)(q)
+    brackets = jnp.einsum("mcn,nb->mbc", slope, X) - jnp.einsum("mbn,nc->mbc", slope, X)
+    return jnp.einsum("am,mbc->abc", inverse_of(complete(X)), brackets)

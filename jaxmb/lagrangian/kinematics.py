@@ -1,0 +1,130 @@
+"""What velocities describe the motion of a Lagrangian system: `q̇ = K(t, q, u)`."""
+
+import abc
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+# Functions of the user take `t`, `q`, then velocities if they depend on them, and the parameters: a dictionary of
+# numbers by name.
+Parameters = dict[str, Array]
+
+
+class AbstractKinematics(eqx.Module):
+    """The map from velocities u to rates q̇.
+
+    - `identity`: whether u is q̇.
+    - `linear`: whether q̇ is linear in u up to a term without it; `homogeneous`: whether that term is zero.
+    """
+
+    identity: AbstractVar[bool]
+    linear: AbstractVar[bool]
+    homogeneous: AbstractVar[bool]
+
+    @abc.abstractmethod
+    def count(self, nq: int) -> int:
+        """The number of velocities for so many coordinates."""
+
+    @abc.abstractmethod
+    def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], parameters: Parameters) -> Array:
+        """q̇, shape (nq,)."""
+
+
+class Rates(AbstractKinematics):
+    """Velocities are the coordinates' rates, `u = q̇`."""
+
+    identity: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
+    homogeneous: ClassVar[bool] = True
+
+    def count(self, nq):
+        return nq
+
+    def rates(self, t, q, u, parameters):
+        return u
+
+
+class Frame(AbstractKinematics):
+    r"""Quasi-velocities in a frame, `q̇ = N(t, q) u + ν(t, q)`.
+
+    With fewer columns than coordinates the frame eliminates constraints: `u` are then free velocities of a system whose
+    constraints `A N = 0` are satisfied by whatever u is, and the equations are projected on the frame's columns.
+
+    **Arguments:**
+
+    - `matrix(t, q, parameters)`: N, shape (nq, nu); its columns are independent wherever the system is.
+    - `columns`: nu, the number of columns.
+    - `drift(t, q, parameters)`: ν, shape (nq,); default zero.
+    """
+
+    matrix: Callable[..., Array] = eqx.field(static=True)
+    columns: int = eqx.field(static=True)
+    drift: Callable[..., Array] | None = eqx.field(static=True, default=None)
+    identity: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
+
+    @property
+    def homogeneous(self) -> bool:
+        return self.drift is None
+
+    def count(self, nq):
+        if not 0 < self.columns <= nq:
+            raise ValueError(
+                f"A frame has at least one column and at most as many as coordinates, {nq}; got {self.columns}."
+            )
+        return self.columns
+
+    def columns_of(self, t: Scalar, q: Float[Array, "nq"], parameters: Parameters) -> Float[Array, "nq columns"]:
+        """N."""
+        return jnp.asarray(self.matrix(t, q, parameters))
+
+    def rates(self, t, q, u, parameters):
+        v = self.columns_of(t, q, parameters) @ u
+        return v if self.drift is None else v + self.drift(t, q, parameters)
+
+
+class Connection(AbstractKinematics):
+    """Velocities are the rates of some coordinates r, the base; a connection gives those of the others, the fibre.
+
+    `ṡ = −A(t, q) ṙ − a(t, q)`: constraints solved for rates, as in Voronets' equations.
+
+    **Arguments:**
+
+    - `base`, `fibre`: indices of the coordinates r and s, all of them together.
+    - `matrix(t, q, parameters)`: A, shape (fibre, base).
+    - `drift(t, q, parameters)`: a, shape (fibre,); default zero.
+    """
+
+    base: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    fibre: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    matrix: Callable[..., Array] = eqx.field(static=True)
+    drift: Callable[..., Array] | None = eqx.field(static=True, default=None)
+    identity: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
+
+    @property
+    def homogeneous(self) -> bool:
+        return self.drift is None
+
+    def count(self, nq):
+        if sorted((*self.base, *self.fibre)) != list(range(nq)):
+            raise ValueError(
+                f"A connection's base {self.base} and fibre {self.fibre} are the {nq} coordinates, each of them once."
+            )
+        return len(self.base)
+
+    def rates(self, t, q, u, parameters):
+        s = -jnp.asarray(self.matrix(t, q, parameters)) @ u
+        if self.drift is not None:
+            s = s - self.drift(t, q, parameters)
+        return jnp.zeros_like(q).at[jnp.array(self.base)].set(u).at[jnp.array(self.fibre)].set(s)

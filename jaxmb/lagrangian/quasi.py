@@ -1,0 +1,168 @@
+"""Nonlinear quasi-velocities, and what can be said about the ones that constraints hold."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float
+
+from .._types import Scalar
+from ..elimination import factor, full_pivot
+from .kinematics import AbstractKinematics, Parameters
+from .system import LagrangianSystem
+
+_ITERATIONS = 50
+
+
+class QuasiVelocities(AbstractKinematics):
+    r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; those of them that are `dependent` are zero.
+
+    As many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also nonlinear
+    ones; virtual displacements are those of Chetaev, along `∂q̇/∂ω_I`. The system's velocities u are the independent
+    ω_I, in their order. The inverse is found by Newton's method from the rates `near`, on whose side of a fold the
+    branch is taken, and differentiated as an implicit function.
+
+    **Arguments:**
+
+    - `omega(t, q, v, parameters)`: shape (nq,).
+    - `dependent`: indices of the components that are zero.
+    - `near`: rates to begin Newton's method with, shape (nq,), or a function `near(t, q, omega, parameters)`, for
+        branches that turn.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{papastavridis1994boltzmann,
+          author = {Papastavridis, J. G.}, title = {On the Boltzmann-Hamel Equations of Motion: A Vectorial
+          Treatment}, journal = {Journal of Applied Mechanics}, volume = {61}, number = {2}, pages = {453--459},
+          year = {1994},
+        }
+        ```
+    """
+
+    omega: Callable[..., Array] = eqx.field(static=True)
+    near: Any
+    dependent: tuple[int, ...] = eqx.field(static=True)
+    identity: ClassVar[bool] = False
+    linear: ClassVar[bool] = False
+    homogeneous: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        omega: Callable[..., Array],
+        near: ArrayLike | Callable[..., Array],
+        dependent: tuple[int, ...] = (),
+    ):
+        self.omega = omega
+        self.near = near if callable(near) else jnp.asarray(near, jnp.result_type(float))
+        self.dependent = tuple(dependent)
+
+    def count(self, nq):
+        if any(not 0 <= k < nq for k in self.dependent) or len(set(self.dependent)) != len(self.dependent):
+            raise ValueError(f"dependent lists some of the {nq} quasi-velocities, each once; got {self.dependent}.")
+        return nq - len(self.dependent)
+
+    def all_of(self, nq: int, u: Float[Array, "nu"]) -> Float[Array, "nq"]:
+        """ω, from the independent ones."""
+        return jnp.zeros(nq, u.dtype).at[np.delete(np.arange(nq), self.dependent)].set(u)
+
+    def rates(self, t, q, u, parameters):
+        return self.rates_of_all(t, q, self.all_of(q.size, u), parameters)
+
+    def rates_of_all(
+        self, t: Scalar, q: Float[Array, "nq"], omega: Float[Array, "nq"], parameters: Parameters
+    ) -> Float[Array, "nq"]:
+        """`q̇(t, q, ω)`; not a number where Newton's method does not converge."""
+        if callable(self.near):
+            near = self.near(t, q, omega, parameters)
+        else:
+            near = self.near
+        return _inverse(self.omega, jnp.asarray(t, q.dtype), q, omega, parameters, lax.stop_gradient(near))
+
+
+@eqx.filter_custom_jvp
+def _inverse(omega, t, q, target, parameters, near):
+    residual = lambda v: omega(t, q, v, parameters) - target
+    slope = jax.jacfwd(residual)
+
+    def correct(carry):
+        v, _, k = carry
+        step = _solve(slope(v), residual(v))
+        return v - step, jnp.max(jnp.abs(step)), k + 1
+
+    def proceed(carry):
+        v, size, k = carry
+        small = 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
+        return (size > small) & (k < _ITERATIONS)
+
+    v, size, _ = lax.while_loop(proceed, correct, (near, jnp.array(jnp.inf, q.dtype), 0))
+    # Where rounding keeps corrections a little larger the inverse is found as well.
+    found = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
+    return jnp.where(found, v, jnp.nan)
+
+
+@_inverse.def_jvp
+def _inverse_jvp(primals, tangents):
+    omega, t, q, target, parameters, near = primals
+    _, dt, dq, dtarget, dparameters, _ = tangents
+    v = _inverse(omega, t, q, target, parameters, near)
+    _, moved = eqx.filter_jvp(lambda t, q, p: omega(t, q, v, p), (t, q, parameters), (dt, dq, dparameters))
+    moved = jnp.zeros_like(v) if moved is None else moved
+    change = -moved if dtarget is None else dtarget - moved
+    return v, _solve(jax.jacfwd(omega, 2)(t, q, v, parameters), change)
+
+
+def _solve(matrix, right):
+    return factor(matrix, lax.stop_gradient(full_pivot(matrix).order), matrix.shape[0]).correction @ right
+
+
+def kinetostatic_forces(
+    system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+) -> Float[Array, "dependent"]:
+    """What holds the dependent quasi-velocities at zero: their generalized forces Λ_D, in the order of `dependent`.
+
+    `Λ_D = (∂q̇/∂ω_D)ᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q)`, the left sides of the equations of those velocities.
+    """
+    kinematics, t = _quasi(system), jnp.asarray(t, q.dtype)
+    omega = kinematics.all_of(q.size, u)
+    columns = jax.jacfwd(lambda omega: kinematics.rates_of_all(t, q, omega, system.parameters))(omega)
+    v, one = system.rates(t, q, u), jnp.ones_like(t)
+    momentum = lambda t, q, u: system.momentum(t, q, system.rates(t, q, u))
+    _, rate = jax.jvp(momentum, (t, q, u), (one, v, udot))
+    missing = rate - jax.grad(system.lagrangian, 1)(t, q, v, system.parameters) - system.applied_force(t, q, v)
+    return missing @ columns[:, list(kinematics.dependent)]
+
+
+def johnsen_hamel_residual(
+    system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+) -> Float[Array, "nq"]:
+    r"""What the Johnsen-Hamel equations leave at accelerations u̇, for all ω_k in order: zero for the independent ones
+    of a motion, and Λ_k for the dependent ones. A diagnostic, in the equations' own terms:
+
+    $$\frac{d}{dt} \frac{\partial L^*}{\partial \omega_k} - \frac{\partial L^*}{\partial \theta_k}
+      - p_l \left(\frac{d}{dt} \frac{\partial \dot q_l}{\partial \omega_k}
+      - \frac{\partial \dot q_l}{\partial \theta_k} \right) - \Theta_k$$
+
+    with $L^*(t, q, \omega) = L(t, q, \dot q)$ and
+    $\partial / \partial \theta_k = (\partial \dot q_l / \partial \omega_k) \, \partial / \partial q_l$.
+    """
+    kinematics, p, t = _quasi(system), system.parameters, jnp.asarray(t, q.dtype)
+    omega, along = kinematics.all_of(q.size, u), kinematics.all_of(q.size, udot)
+    rates = lambda t, q, omega: kinematics.rates_of_all(t, q, omega, p)
+    star = lambda t, q, omega: system.lagrangian(t, q, rates(t, q, omega), p)
+    v = rates(t, q, omega)
+    moving = (t, q, omega), (jnp.ones_like(t), v, along)
+    columns, turned = jax.jvp(jax.jacfwd(rates, 2), *moving)
+    _, first = jax.jvp(jax.grad(star, 2), *moving)
+    second = jax.grad(star, 1)(t, q, omega) @ columns
+    bracket = turned - jax.jacfwd(rates, 1)(t, q, omega) @ columns
+    return first - second - system.momentum(t, q, v) @ bracket - system.applied_force(t, q, v) @ columns
+
+
+def _quasi(system: LagrangianSystem) -> QuasiVelocities:
+    if not isinstance(system.kinematics, QuasiVelocities):
+        raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(system.kinematics).__name__}.")
+    return system.kinematics

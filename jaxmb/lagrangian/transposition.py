@@ -1,0 +1,45 @@
+"""Transpositional relations: what is meant by the variation of a velocity.
+
+Virtual displacements δq always satisfy the constraints. The variation of velocities may be defined as one likes,
+
+    δ(q̇) − d(δq)/dt = W(t, q; q̇, δq),
+
+bilinear in the last two, as long as the principle makes up for it: `∫ (δ_W L − p · W + Q · δq) dt = 0`. Hölder's
+choice is W = 0: varied motions violate the constraints. With Suslov's they satisfy them. All give the same equations of
+motion, those of Lagrange and d'Alembert; without the term p · W they would be those of a variational problem with
+constraints (vakonomic), which are others.
+
+Source: J. Papastavridis, Analytical Mechanics, World Scientific, 2014, §3.8; A. M. Bloch, Nonholonomic Mechanics and
+Control, Springer, 2015.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+# A name; a number between Hölder's choice, zero, and Suslov's, one; or `W(t, q, v, dq, parameters)`, shape (nq,).
+Transposition = str | float | Callable[..., Array]
+
+
+def check_shape(transposition: Callable[..., Array], q: Array, parameters: dict[str, Array]) -> None:
+    """Raise a `ValueError` unless a function returns a variation of all rates."""
+    shape = jnp.shape(transposition(jnp.zeros((), q.dtype), q, q, q, parameters))
+    if shape != q.shape:
+        raise ValueError(f"The transposition W(t, q, v, dq, parameters) must have shape {q.shape}, got {shape}.")
+
+
+def share_of_suslov(transposition: Transposition) -> float | None:
+    """The number that stands for a transposition, None for a function.
+
+    **Raises:** `ValueError` for other words.
+    """
+    if callable(transposition):
+        return None
+    if isinstance(transposition, str):
+        if transposition not in ("holder", "suslov"):
+            raise ValueError(
+                f"A transposition is 'holder', 'suslov', a number between them or a function; got {transposition!r}."
+            )
+        return float(transposition == "suslov")
+    return float(transposition)

@@ -1,0 +1,73 @@
+"""Voronets' equations: constraints eliminated with the curvature of a connection."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .equations import AbstractEquations
+from .kinematics import Connection
+from .transposition import Transposition, check_shape, share_of_suslov
+
+
+class Voronets(AbstractEquations):
+    r"""Voronets' equations in the rates of the base coordinates r, with $\dot s = -A \dot r - a$ and
+    $L_c(t, q, \dot r) = L(t, q, \dot q)$:
+
+    $$\frac{d}{dt} \frac{\partial L_c}{\partial \dot r^\alpha} - \frac{\partial L_c}{\partial r^\alpha}
+      + A^a_\alpha \frac{\partial L_c}{\partial s^a}
+      = p_b \left(W^b_\alpha - B^b_\alpha \right) - p_b W^b_\alpha + Q_\alpha - A^a_\alpha Q_a$$
+
+    $B_\alpha = B_{\alpha\beta} \dot r^\beta + B_{\alpha 0}$ is the curvature of the connection, time being one more
+    coordinate of the base. Constraining L first and forgetting B is the classical mistake.
+
+    **Arguments:** `transposition`: as in `Hamel`; with `"suslov"`, W = B, varied velocities satisfy the constraints.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{voronets1901,
+          author = {Voronets, P. V.}, title = {On the Equations of Motion for Nonholonomic Systems}, journal =
+          {Matematicheskii Sbornik}, volume = {22}, number = {4}, year = {1901},
+        }
+        ```
+    """
+
+    transposition: Transposition = eqx.field(static=True, default="suslov")
+
+    def __check_init__(self):
+        share_of_suslov(self.transposition)
+
+    def check(self, system):
+        if not isinstance(system.kinematics, Connection):
+            raise ValueError(
+                f"Voronets' equations need kinematics=Connection(...), got {type(system.kinematics).__name__}."
+            )
+        if callable(self.transposition):
+            check_shape(self.transposition, system.guess.q, system.parameters)
+
+    def force(self, system, t, q, u):
+        connection: Any = system.kinematics
+        p = system.parameters
+        fibre = jnp.array(connection.fibre)
+        one, v = jnp.ones_like(t), system.rates(t, q, u)
+        # Columns along the base: displacements with δs = −A δr.
+        A = lambda t, q: jnp.asarray(connection.matrix(t, q, p))
+        columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
+        along = lambda fn: jax.vmap(lambda x: jax.jvp(fn, (q,), (x,))[1], in_axes=1, out_axes=1)(columns)
+        # B_αβ ṙ^β + B_α0 = d A_α / dt along the motion less the change of ṡ, as a function of q alone, along column α.
+        _, moved = jax.jvp(A, (t, q), (one, v))
+        curvature = moved + along(lambda q: system.rates(t, q, u)[fibre])
+
+        constrained = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), p)
+        _, rate = jax.jvp(lambda t, q: jax.grad(constrained, 2)(t, q, u), (t, q), (one, v))
+        momentum = system.momentum(t, q, v)
+        curvature = jnp.zeros_like(columns).at[fibre].set(curvature)
+        share = share_of_suslov(self.transposition)
+        if share is None:
+            transposition: Any = self.transposition
+            W = jax.vmap(lambda x: jnp.asarray(transposition(t, q, v, x, p)), in_axes=1, out_axes=1)(columns)
+        else:
+            W = share * curvature
+        right = momentum @ (W - curvature) - momentum @ W
+        return jax.grad(constrained, 1)(t, q, u) @ columns - rate + right + system.applied_force(t, q, v) @ columns
