@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Scalar, VectorLike
 from ..elimination import factor, full_pivot
 from .kinematics import AbstractKinematics, Parameters
 from .system import LagrangianSystem
@@ -53,7 +53,7 @@ class QuasiVelocities(AbstractKinematics):
     def __init__(
         self,
         omega: Callable[..., Array],
-        near: ArrayLike | Callable[..., Array],
+        near: VectorLike | Callable[..., Array],
         dependent: tuple[int, ...] = (),
     ):
         self.omega = omega

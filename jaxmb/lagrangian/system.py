@@ -6,9 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .._types import Scalar, State
+from .._types import Scalar, State, VectorLike
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.rigid_bodies import Ranks
 from ._structure import check_functions, check_nonideal, find_ranks, is_diagonal
@@ -79,11 +79,11 @@ class LagrangianSystem(AbstractSystem):
         nonideal: Sequence[AbstractNonIdeal] = (),
         kinematics: AbstractKinematics | None = None,
         equations: AbstractEquations | None = None,
-        q: ArrayLike,
-        u: ArrayLike | None = None,
-        parameters: Mapping[str, ArrayLike] | None = None,
+        q: VectorLike,
+        u: VectorLike | None = None,
+        parameters: Mapping[str, VectorLike] | None = None,
         coordinates: Sequence[str] | None = None,
-        length: ArrayLike = 1.0,
+        length: VectorLike = 1.0,
     ):
         number = lambda x: jnp.asarray(x, jnp.result_type(float))
         self.lagrangian = _lagrangian(lagrangian, kinetic, potential)

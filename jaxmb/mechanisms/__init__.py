@@ -13,9 +13,11 @@ from .four_bar import four_bar as four_bar
 from .free_body import free_body as free_body
 from .heavy_top import heavy_top as heavy_top
 from .knife_edge import knife_edge as knife_edge
+from .nonholonomic_cart import nonholonomic_cart as nonholonomic_cart
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
 from .rod_chain import rod_chain as rod_chain
+from .roller_racer import roller_racer as roller_racer
 from .rolling_disk import rolling_disk as rolling_disk
 from .slider_crank import slider_crank as slider_crank
 from .spatial_loop import spatial_loop as spatial_loop
@@ -42,12 +44,14 @@ _LIBRARY = {
         bricard,
         flyball,
         rolling_disk,
+        roller_racer,
+        nonholonomic_cart,
     )
 }
 
 
 def names() -> tuple[str, ...]:
-    """The names of all mechanisms, planar ones first."""
+    """The names of all mechanisms, rigid bodies in the plane first, then in space, then systems from a Lagrangian."""
     return tuple(_LIBRARY)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from .._types import State, VectorLike
 from ..assembly import assemble
 from ..scene import Scene
-from ..system import RigidBodySystem, with_parameters
+from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory
 
 Observation = dict[str, Array]
@@ -63,8 +63,9 @@ class Mechanism:
     **Fields:**
 
     - `name`: as in `names()`.
-    - `scene`: its parts, to build on: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`.
-    - `system`, `state`: the compiled scene, and a consistent state of it at t = 0.
+    - `scene`: its parts, to build on: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`;
+        None for a system from a Lagrangian.
+    - `system`, `state`: the system, and a consistent state of it at t = 0.
     - `t1`: the end of the motion that it is known for [s].
     - `references`: values to compare with, or None where there are none (other parameters than the published ones).
     - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the
@@ -74,8 +75,8 @@ class Mechanism:
     """
 
     name: str
-    scene: Scene
-    system: RigidBodySystem
+    scene: Any
+    system: Any
     state: State
     t1: float
     references: References | None
@@ -158,7 +159,7 @@ def point_motion(trajectory: Trajectory, body: str, s: VectorLike) -> tuple[Arra
 
 def build(
     name: str,
-    scene: Scene,
+    scene: Scene | AbstractSystem,
     *,
     t1: float,
     observe: Callable[[Trajectory], Observation],
@@ -167,8 +168,16 @@ def build(
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
 ) -> Mechanism:
-    """Compile and assemble a scene into a mechanism."""
+    """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
-    system = scene.compile()
+    system = scene.compile() if isinstance(scene, Scene) else scene
+    scene = scene if isinstance(scene, Scene) else None
     state = assemble(system, fix=fix, rates=rates)
     return Mechanism(name, scene, system, state, float(t1), references, observe, description, fix, rates)
+
+
+def observe_coordinates(trajectory: Trajectory) -> Observation:
+    """The coordinates of a system from a Lagrangian by their names, and its velocities as `u0`, `u1`, …."""
+    names = trajectory.system.coordinate_names()
+    rates = {f"u{k}": trajectory.ys.u[:, k] for k in range(trajectory.system.nu)}
+    return {name: trajectory[name] for name in names} | rates

@@ -1,0 +1,94 @@
+"""Two platforms with a pin between them, each on an axle whose wheels roll without slipping sideways.
+
+Coordinates: x, y of the middle of the rear axle, its heading θ, and the angle φ of the front platform against it.
+Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre ahead of its axle; `front_mass`,
+`front_inertia` and `front_ahead` of the front one; `pivot`, of the pin ahead of the rear axle, and `handle`, of the front
+axle ahead of the pin.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
+
+COORDINATES = ("x", "y", "theta", "phi")
+FORMS = ("frame", "constraints", "connection")
+
+
+def wheeled(
+    form: str,
+    equations: AbstractEquations | None,
+    parameters: dict[str, Any],
+    *,
+    angle: float,
+    speed: float,
+    rate: float,
+) -> LagrangianSystem:
+    """The system in one of its forms, from speed and turning rate at the start.
+
+    **Raises:** `ValueError` for an unknown form.
+    """
+    if form not in FORMS:
+        raise ValueError(f"The forms are {', '.join(FORMS)}; got {form!r}.")
+    number = lambda x: jnp.asarray(x, jnp.result_type(float))
+    parameters = {name: number(value) for name, value in parameters.items()}
+    q = jnp.stack([number(0.0), number(0.0), number(0.0), number(angle)])
+    u = jnp.stack([number(speed), number(rate)])
+    v = frame(0.0, q, parameters) @ u
+    kinematics, start, constraints = {
+        "frame": (Frame(frame, 2), u, ()),
+        "constraints": (Rates(), v, (Pfaffian("wheels", wheels),)),
+        "connection": (Connection((2, 3), (0, 1), connection), v[2:], ()),
+    }[form]
+    return LagrangianSystem(
+        kinetic=kinetic,
+        constraints=constraints,
+        kinematics=kinematics,
+        equations=equations,
+        q=q,
+        u=start,
+        parameters=parameters,
+        coordinates=COORDINATES,
+    )
+
+
+def kinetic(t, q, v, p):
+    heading, front = q[2], q[2] + q[3]
+    turning = v[2] + v[3]
+    rear = v[:2] + p["ahead"] * v[2] * _across(heading)
+    lever = p["handle"] + p["front_ahead"]
+    other = v[:2] + p["pivot"] * v[2] * _across(heading) + lever * turning * _across(front)
+    translation = p["mass"] * (rear @ rear) + p["front_mass"] * (other @ other)
+    return 0.5 * (translation + p["inertia"] * v[2] ** 2 + p["front_inertia"] * turning**2)
+
+
+def frame(t, q, p):
+    """Columns along the heading, and turning in place: no wheel slips with either."""
+    theta, phi = q[2], q[3]
+    zero, one = jnp.zeros_like(theta), jnp.ones_like(theta)
+    ahead = jnp.stack([jnp.cos(theta), jnp.sin(theta), zero, jnp.sin(phi) / p["handle"]])
+    turn = jnp.stack([zero, zero, one, -_lever(phi, p) / p["handle"]])
+    return jnp.stack([ahead, turn], axis=1)
+
+
+def wheels(t, q, p):
+    """Gradients of the sideways slip of both axles."""
+    front = q[2] + q[3]
+    zero = jnp.zeros_like(front)
+    rear = jnp.concatenate([_across(q[2]), jnp.stack([zero, zero])])
+    return jnp.stack([rear, jnp.concatenate([_across(front), jnp.stack([_lever(q[3], p), p["handle"]])])])
+
+
+def connection(t, q, p):
+    """Of x, y over θ, φ; singular where the platforms are in line."""
+    along = jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+    return -along[:, None] * jnp.stack([_lever(q[3], p), p["handle"]])[None, :] / jnp.sin(q[3])
+
+
+def _lever(phi, p):
+    return p["pivot"] * jnp.cos(phi) + p["handle"]
+
+
+def _across(angle):
+    return jnp.stack([-jnp.sin(angle), jnp.cos(angle)])

@@ -1,0 +1,69 @@
+"""A cart of two platforms with mass, each on wheels."""
+
+from typing import Literal
+
+import numpy as np
+
+from ..lagrangian import AbstractEquations
+from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ._wheeled import wheeled
+
+
+@mechanism()
+def nonholonomic_cart(
+    *,
+    mass: float = 2.0,
+    inertia: float = 0.3,
+    ahead: float = 0.15,
+    front_mass: float = 0.5,
+    front_inertia: float = 0.05,
+    front_ahead: float = -0.05,
+    pivot: float = 0.5,
+    handle: float = 0.2,
+    angle: float = 0.5,
+    speed: float = 1.0,
+    rate: float = 0.0,
+    form: Literal["frame", "constraints", "connection"] = "frame",
+    equations: AbstractEquations | None = None,
+) -> Mechanism:
+    """A cart of two platforms with a pin between them, each on an axle whose wheels do not slip sideways, coasting.
+
+    As `roller_racer`, with mass centres off the axles: it turns until it rolls straight on, as Chaplygin's sleigh does.
+
+    Source: A. M. Bloch, Nonholonomic Mechanics and Control, Springer, 2015, on such systems; data of this package.
+    Reference values from DOP853 on Hamel's equations.
+
+    **Arguments:** `mass` [kg], `inertia` [kg m²] and `ahead` [m], the mass centre ahead of the axle, of the rear
+    platform, and the same of the front one; `pivot` [m], of the pin ahead of the rear axle; `handle` [m], of the front
+    axle ahead of the pin; `angle` φ [rad], `speed` along the heading [m/s] and turning `rate` [rad/s] at the start;
+    `form` and `equations` as in `roller_racer`.
+
+    **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
+    """
+    parameters = {
+        "mass": mass,
+        "inertia": inertia,
+        "ahead": ahead,
+        "front_mass": front_mass,
+        "front_inertia": front_inertia,
+        "front_ahead": front_ahead,
+        "pivot": pivot,
+        "handle": handle,
+    }
+    return build(
+        "nonholonomic_cart",
+        wheeled(form, equations, parameters, angle=angle, speed=speed, rate=rate),
+        t1=5.0,
+        observe=observe_coordinates,
+        description="Cart of two wheeled platforms with a pin, coasting.",
+        references=_REFERENCES,
+    )
+
+
+_REFERENCES = References(
+    times=np.array([5.0]),
+    labels=("x", "y", "theta", "phi", "u0", "u1"),
+    values=np.array([[-0.5119887019, 3.5298075840, 2.4147753904, 3.1627826849, 1.0349349573, 0.0615793993]]),
+    source="DOP853 at 1e-12 on Hamel's equations in the frame of speed and turning rate",
+    tolerance=1e-9,
+)

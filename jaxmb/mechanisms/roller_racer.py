@@ -1,0 +1,68 @@
+"""The roller racer, or Tennessee racer."""
+
+from typing import Literal
+
+import numpy as np
+
+from ..lagrangian import AbstractEquations
+from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ._wheeled import wheeled
+
+
+@mechanism()
+def roller_racer(
+    *,
+    mass: float = 2.0,
+    inertia: float = 0.3,
+    front_inertia: float = 0.05,
+    pivot: float = 0.5,
+    handle: float = 0.2,
+    angle: float = 0.5,
+    speed: float = 1.0,
+    rate: float = 0.0,
+    form: Literal["frame", "constraints", "connection"] = "frame",
+    equations: AbstractEquations | None = None,
+) -> Mechanism:
+    """A racer of two platforms with a pin between them, each on an axle whose wheels do not slip sideways, coasting.
+
+    The rear platform is balanced: its mass centre is on its axle. The mass of the front one counts in rotation only.
+    Coordinates: x, y [m] of the middle of the rear axle, its heading θ and the angle φ of the handlebar [rad].
+
+    Source: P. S. Krishnaprasad and D. P. Tsakiris, Oscillations, SE(2)-snakes and motion control: a study of the roller
+    racer, Dynamical Systems 16(4), 2001. Reference values from DOP853 on Hamel's equations.
+
+    **Arguments:** `mass` [kg] and `inertia` [kg m²] of the rear platform, `front_inertia` [kg m²]; `pivot` [m], of the
+    pin ahead of the rear axle; `handle` [m], of the front axle ahead of the pin; `angle` φ [rad], `speed` along the
+    heading [m/s] and turning `rate` [rad/s] at the start; `form`: the velocities are speed and turning rate, in a frame
+    that satisfies the constraints; or the coordinates' rates, with the constraints; or those of θ and φ, with a connection
+    that is singular where the platforms are in line; `equations`: how they are written, default `Projected()`.
+
+    **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
+    """
+    parameters = {
+        "mass": mass,
+        "inertia": inertia,
+        "ahead": 0.0,
+        "front_mass": 0.0,
+        "front_inertia": front_inertia,
+        "front_ahead": 0.0,
+        "pivot": pivot,
+        "handle": handle,
+    }
+    return build(
+        "roller_racer",
+        wheeled(form, equations, parameters, angle=angle, speed=speed, rate=rate),
+        t1=5.0,
+        observe=observe_coordinates,
+        description="Roller racer: two wheeled platforms with a pin, coasting (Krishnaprasad and Tsakiris).",
+        references=_REFERENCES,
+    )
+
+
+_REFERENCES = References(
+    times=np.array([5.0]),
+    labels=("x", "y", "theta", "phi", "u0", "u1"),
+    values=np.array([[0.5479154961, 0.1185110704, 6.2350455697, 3.5701901507, 0.8833468748, 1.4409397963]]),
+    source="DOP853 at 1e-12 on Hamel's equations in the frame of speed and turning rate",
+    tolerance=1e-9,
+)
