@@ -5,9 +5,12 @@ from typing import Any
 from .._names import unknown
 from ._base import Mechanism as Mechanism, References as References
 from .andrews import andrews as andrews
+from .appell_hamel import appell_hamel as appell_hamel
+from .benenti import benenti as benenti
 from .bricard import bricard as bricard
 from .car_axis import car_axis as car_axis
 from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
+from .constant_speed_particle import constant_speed_particle as constant_speed_particle
 from .flyball import flyball as flyball
 from .four_bar import four_bar as four_bar
 from .free_body import free_body as free_body
@@ -19,10 +22,14 @@ from .pendulum import pendulum as pendulum
 from .rod_chain import rod_chain as rod_chain
 from .roller_racer import roller_racer as roller_racer
 from .rolling_disk import rolling_disk as rolling_disk
+from .rough_ring import rough_ring as rough_ring
 from .slider_crank import slider_crank as slider_crank
 from .spatial_loop import spatial_loop as spatial_loop
 from .spatial_slider_crank import spatial_slider_crank as spatial_slider_crank
+from .spherical_four_bar import spherical_four_bar as spherical_four_bar
 from .stiff_four_bar import stiff_four_bar as stiff_four_bar
+from .three_platform_snake import three_platform_snake as three_platform_snake
+from .tracking_chain import tracking_chain as tracking_chain
 
 _LIBRARY = {
     function.__name__: function
@@ -46,6 +53,13 @@ _LIBRARY = {
         rolling_disk,
         roller_racer,
         nonholonomic_cart,
+        three_platform_snake,
+        appell_hamel,
+        constant_speed_particle,
+        benenti,
+        rough_ring,
+        tracking_chain,
+        spherical_four_bar,
     )
 }
 

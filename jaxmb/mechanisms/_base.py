@@ -170,10 +170,10 @@ def build(
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
-    system = scene.compile() if isinstance(scene, Scene) else scene
-    scene = scene if isinstance(scene, Scene) else None
+    parts = scene if isinstance(scene, Scene) else None
+    system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates)
-    return Mechanism(name, scene, system, state, float(t1), references, observe, description, fix, rates)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates)
 
 
 def observe_coordinates(trajectory: Trajectory) -> Observation:

@@ -2,8 +2,8 @@
 
 Coordinates: x, y of the middle of the rear axle, its heading θ, and the angle φ of the front platform against it.
 Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre ahead of its axle; `front_mass`,
-`front_inertia` and `front_ahead` of the front one; `pivot`, of the pin ahead of the rear axle, and `handle`, of the front
-axle ahead of the pin.
+`front_inertia` and `front_ahead` of the front one; `pivot`, of the pin ahead of the rear axle, and `handle`, of the
+front axle ahead of the pin.
 """
 
 from typing import Any

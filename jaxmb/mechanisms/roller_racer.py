@@ -34,8 +34,9 @@ def roller_racer(
     **Arguments:** `mass` [kg] and `inertia` [kg m²] of the rear platform, `front_inertia` [kg m²]; `pivot` [m], of the
     pin ahead of the rear axle; `handle` [m], of the front axle ahead of the pin; `angle` φ [rad], `speed` along the
     heading [m/s] and turning `rate` [rad/s] at the start; `form`: the velocities are speed and turning rate, in a frame
-    that satisfies the constraints; or the coordinates' rates, with the constraints; or those of θ and φ, with a connection
-    that is singular where the platforms are in line; `equations`: how they are written, default `Projected()`.
+    that satisfies the constraints; or the coordinates' rates, with the constraints; or those of θ and φ, with a
+    connection that is singular where the platforms are in line; `equations`: how they are written, default
+    `Projected()`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """

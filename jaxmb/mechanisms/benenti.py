@@ -1,0 +1,54 @@
+"""Benenti's two particles with parallel velocities."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..lagrangian import LagrangianSystem, Nonholonomic
+from ._base import Mechanism, References, build, mechanism, observe_coordinates
+
+
+@mechanism()
+def benenti(*, masses: tuple[float, float] = (1.0, 2.0), stiffness: float = 4.0, gravity: float = 9.81) -> Mechanism:
+    """Two particles in the vertical plane, with a spring between them, whose velocities are held parallel.
+
+    Coordinates: x1, y1, x2, y2 [m], y up. The constraint ẋ1 ẏ2 − ẋ2 ẏ1 = 0 is quadratic and homogeneous in velocities,
+    so energy is conserved.
+
+    Source: S. Benenti, Geometrical aspects of the dynamics of non-holonomic systems, Rend. Sem. Mat. Univ. Pol. Torino
+    54, 1996; data of this package. Reference values from DOP853 on the equations with a multiplier.
+
+    **Arguments:** `masses` [kg]; `stiffness` of the spring [N/m], without length; `gravity` [m/s²].
+
+    **Labels:** `x1`, `y1`, `x2`, `y2` [m], `u0` … `u3` [m/s].
+    """
+    system = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(jnp.repeat(p["masses"], 2), v * v),
+        potential=_potential,
+        constraints=[Nonholonomic("parallel", lambda t, q, v, p: v[0] * v[3] - v[2] * v[1])],
+        q=(0.0, 0.0, 1.0, 0.0),
+        u=(1.0, 2.0, 0.5, 1.0),
+        parameters={"masses": masses, "stiffness": stiffness, "gravity": gravity},
+        coordinates=("x1", "y1", "x2", "y2"),
+    )
+    return build(
+        "benenti",
+        system,
+        t1=2.0,
+        observe=observe_coordinates,
+        description="Two particles with parallel velocities; a constraint quadratic in them (Benenti).",
+        references=_REFERENCES,
+    )
+
+
+def _potential(t, q, p):
+    apart = q[:2] - q[2:]
+    return 0.5 * p["stiffness"] * jnp.dot(apart, apart) + p["gravity"] * jnp.dot(p["masses"], q[1::2])
+
+
+_REFERENCES = References(
+    times=np.array([2.0]),
+    labels=("x1", "y1", "x2", "y2"),
+    values=np.array([[2.990189703, -13.041993719, 3.041463848, -13.747922217]]),
+    source="DOP853 at 1e-12 on the equations with a multiplier",
+    tolerance=1e-9,
+)

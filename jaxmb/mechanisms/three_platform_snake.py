@@ -1,0 +1,111 @@
+"""The SE(2)-snake with three platforms on wheels."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
+from ._base import Mechanism, References, build, mechanism, observe_coordinates
+
+
+@mechanism(variants=("gait",))
+def three_platform_snake(
+    *,
+    mass: float = 1.0,
+    inertia: float = 0.02,
+    half: float = 0.2,
+    angles: tuple[float, float] = (0.9, 0.2),
+    rates: tuple[float, float] = (0.3, -0.2),
+    gait: Callable[[Array], Array] | None = None,
+    form: Literal["connection", "constraints"] = "connection",
+    equations: AbstractEquations | None = None,
+) -> Mechanism:
+    """Three platforms in a row, joined by pins, each with one axle in its middle whose wheels do not slip sideways.
+
+    Coordinates: x, y [m] of the middle platform, its heading θ, and φ1, φ2 [rad]: the rear platform's heading is θ
+    − φ1, the front one's θ + φ2. Three axles allow the shape's two velocities and no more: its changes move the
+    snake, by a connection, and a closed path of shapes by a geometric phase. Singular where the axles' lines meet
+    in one point or are parallel, as where φ1 = φ2.
+
+    Source: P. S. Krishnaprasad and D. P. Tsakiris, G-Snakes: nonholonomic kinematic chains on Lie groups, Proc. 33rd
+    IEEE CDC, 1994. Reference values from DOP853 on Voronets' equations, with a gait on the connection.
+
+    **Arguments:** `mass` [kg], `inertia` [kg m²] and `half` length [m] of a platform; `angles` φ [rad] and `rates`
+    [rad/s] at the start, of a free motion; `gait(t)`: the angles (2,) as a function of time that holds them instead;
+    `form`: the velocities are those of the shape, with the connection, or the coordinates' rates, with constraints (as
+    always with a gait); `equations`: how they are written, default `Projected()`.
+
+    **Labels:** `x`, `y` [m], `theta`, `phi1`, `phi2` [rad], and the velocities `u0`, `u1`, ….
+    """
+    if form not in ("connection", "constraints"):
+        raise ValueError(f"The forms are connection, constraints; got {form!r}.")
+    parameters = {"mass": mass, "inertia": inertia, "half": half}
+    numbers = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in parameters.items()}
+    shape, turning = jnp.asarray(angles, jnp.result_type(float)), jnp.asarray(rates, jnp.result_type(float))
+    constraints: list[Any] = [Pfaffian("wheels", _wheels)]
+    if gait is not None:
+        hold = gait
+        constraints.append(Holonomic("gait", lambda t, q, p: q[3:] - hold(t)))
+        shape, turning = jax.jvp(gait, (jnp.zeros(()),), (jnp.ones(()),))
+    q = jnp.concatenate([jnp.zeros(3), shape])
+    constrained = form == "constraints" or gait is not None
+    moved = jnp.concatenate([-_connection(0.0, q, numbers) @ turning, turning])
+    system = LagrangianSystem(
+        kinetic=_kinetic,
+        constraints=constraints if constrained else (),
+        kinematics=Rates() if constrained else Connection((3, 4), (0, 1, 2), _connection),
+        equations=equations,
+        q=q,
+        u=moved if constrained else turning,
+        parameters=parameters,
+        coordinates=("x", "y", "theta", "phi1", "phi2"),
+    )
+    return build(
+        "three_platform_snake",
+        system,
+        t1=1.0 if gait is None else 2 * np.pi,
+        observe=observe_coordinates,
+        description="SE(2)-snake of three platforms on wheels (Krishnaprasad and Tsakiris).",
+        references=_REFERENCES if gait is None else None,
+    )
+
+
+def _platforms(q, half):
+    """Positions (3, 2) and headings (3,), rear to front."""
+    headings = jnp.stack([q[2] - q[3], q[2], q[2] + q[4]])
+    along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=1)
+    steps = half * (along[:-1] + along[1:])
+    return jnp.stack([q[:2] - steps[0], q[:2], q[:2] + steps[1]]), headings
+
+
+def _kinetic(t, q, v, p):
+    _, (velocities, turning) = jax.jvp(lambda q: _platforms(q, p["half"]), (q,), (v,))
+    return 0.5 * (p["mass"] * jnp.sum(velocities**2) + p["inertia"] * jnp.sum(turning**2))
+
+
+def _wheels(t, q, p):
+    """Gradients of the sideways slip of the axles."""
+    slope = jax.jacfwd(lambda q: _platforms(q, p["half"])[0])(q)
+    headings = _platforms(q, p["half"])[1]
+    return jnp.einsum("ka,kaj->kj", jnp.stack([-jnp.sin(headings), jnp.cos(headings)], axis=1), slope)
+
+
+def _connection(t, q, p):
+    matrix = _wheels(t, q, p)
+    # Cramer's rule: three rows, so no elimination is needed.
+    a, b, c = matrix[:, :3]
+    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+    return cofactors @ matrix[:, 3:] / (a @ jnp.cross(b, c))
+
+
+_REFERENCES = References(
+    times=np.array([1.0]),
+    labels=("x", "y", "theta", "phi1", "phi2"),
+    values=np.array([[-0.0441318413, -0.0015964638, 0.0684829930, 1.1937250240, 0.0387634348]]),
+    source="DOP853 at 1e-12 on Voronets' equations",
+    tolerance=3e-8,
+)
