@@ -48,6 +48,15 @@ CASES = [
     ("rolling_disk", {}, 1e-8),
     pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.slow),
     pytest.param("bricard", {}, 1e-6, marks=pytest.mark.slow),
+    ("roller_racer", {}, 1e-7),
+    ("nonholonomic_cart", {}, 1e-7),
+    ("three_platform_snake", {}, 1e-6),
+    ("spherical_four_bar", {}, 1e-7),
+    ("constant_speed_particle", {}, 1e-9),
+    ("appell_hamel", {}, 1e-9),
+    ("benenti", {}, 1e-8),
+    ("rough_ring", {}, 1e-9),
+    ("tracking_chain", {}, 1e-7),
 ]
 
 
@@ -63,7 +72,19 @@ def test_motion_agrees_with_reference_values_on_the_constraints(name, parameters
     assert np.all(trajectory.constraint_violation.velocity <= 1e-10)
 
 
-CONSERVATIVE = ["pendulum", "four_bar", "slider_crank", "chaplygin_sleigh", "free_body", "heavy_top", "rolling_disk"]
+CONSERVATIVE = [
+    "pendulum",
+    "four_bar",
+    "slider_crank",
+    "chaplygin_sleigh",
+    "free_body",
+    "heavy_top",
+    "rolling_disk",
+    "roller_racer",
+    "nonholonomic_cart",
+    "three_platform_snake",
+    "benenti",
+]
 
 
 @pytest.mark.parametrize("name", CONSERVATIVE)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._names import unknown
 from ..assembly import nearest, residual_size, tolerance
 from ..elimination import full_pivot
 from ..system.rigid_bodies import Ranks
@@ -27,6 +28,11 @@ def check_functions(system: "LagrangianSystem") -> tuple[int, ...]:
     q, p = system.guess.q, system.parameters
     t = jnp.zeros((), q.dtype)
     v = _shaped("kinematics", (q.size,), lambda: system.rates(t, q, system.guess.u))
+    if not np.all(np.isfinite(v)):
+        raise ValueError(
+            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at q = {q.tolist()}: no "
+            "rates were found that belong to them."
+        )
     _shaped("lagrangian", (), lambda: system.lagrangian(t, q, v, p))
     if system.applied is not None:
         applied = system.applied
@@ -97,9 +103,26 @@ def find_ranks(system: "LagrangianSystem") -> tuple[Ranks, int]:
     jacobian = system.jacobian(t, q, u)
     if not np.all(np.isfinite(jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
+    _check_consistent(system, t, q, u, np.asarray(jacobian))
     coordinate = rank(system.coordinate_jacobian(t, q)) if system.position_rows else 0
     position, velocity = rank(jacobian[: system.position_rows]), rank(jacobian[: system.velocity_rows])
     return Ranks(position, coordinate, velocity), rank(jacobian)
+
+
+def _check_consistent(system, t, q, u, jacobian):
+    """Raise a `ValueError` naming the constraints whose rows no accelerations satisfy together."""
+    right = -np.asarray(system.acceleration_residual(t, q, u, jnp.zeros_like(u)))
+    left_over = right - jacobian @ np.linalg.lstsq(jacobian, right, rcond=None)[0]
+    size = 1e-8 * (1.0 + np.max(np.abs(right)))
+    # Rows that depend on velocities are left alone: the guess need not satisfy them.
+    bound = np.arange(right.size) >= system.velocity_rows
+    names = [name for name, _ in system.rows]
+    wrong = {name: None for name, x, own in zip(names, left_over, bound, strict=True) if own and abs(x) > size}
+    if wrong:
+        raise ValueError(
+            f"The constraints {', '.join(wrong)} contradict each other: no accelerations satisfy them together at the "
+            "guess."
+        )
 
 
 def check_nonideal(system: "LagrangianSystem") -> None:
@@ -112,6 +135,9 @@ def check_nonideal(system: "LagrangianSystem") -> None:
             raise ValueError(
                 f"{type(law).__name__} is of a constraint {law.constraint!r}, but there are {sorted(set(names))}."
             )
+        coefficient = getattr(law, "coefficient", None)
+        if coefficient is not None and coefficient not in system.parameters:
+            raise unknown("parameter", coefficient, system.parameters)
         others = np.array([name != law.constraint for name in names])
         rest = int(full_pivot(system.jacobian(t, q, u)[others]).rank)
         if rest + int(np.sum(~others)) > system.acceleration_rank:

@@ -1,0 +1,329 @@
+"""Constraints of systems from a Lagrangian: geometric phases, control, friction, the spherical four-bar, bad input."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import mechanisms
+from jaxmb.formulations import Multipliers, Partitioned, accelerations
+from jaxmb.lagrangian import (
+    AccelerationConstraint,
+    Connection,
+    Frame,
+    Friction,
+    Hamel,
+    Holonomic,
+    LagrangianSystem,
+    Nonholonomic,
+    NonIdeal,
+    Pfaffian,
+    QuasiVelocities,
+    Servo,
+    Viscous,
+    Voronets,
+)
+
+ZERO = jnp.zeros(())
+
+
+@functools.cache
+def library(name, **parameters):
+    return mechanisms.get(name, **parameters)
+
+
+def free(t, q, v, p):
+    return 0.5 * jnp.dot(v, v)
+
+
+# The snake's geometric phase
+
+
+def circle(t):
+    return jnp.stack([0.9 + 0.3 * jnp.cos(t), 0.2 + 0.3 * jnp.sin(t)])
+
+
+def test_a_closed_path_of_shapes_moves_the_snake():
+    mechanism = library("three_platform_snake", gait=circle)
+    system, state = mechanism.system, mechanism.state
+    assert system.velocity_rank == system.nu and system.linear and not system.homogeneous
+    run = lambda y, t0, t1: mb.simulate(system, y, t0=t0, t1=t1, rtol=1e-12, atol=1e-14)
+    last = lambda out: jax.tree.map(lambda y: y[-1], out.ys)
+    once = last(run(state, 0.0, 2 * np.pi))
+    np.testing.assert_allclose(once.q[:3], (0.341277854133, 0.002496318416, 0.482671126542), atol=1e-9)
+    # In SE(2) two periods are the square of one.
+    twice = last(run(once, 2 * np.pi, 4 * np.pi))
+    x, y, theta = np.asarray(once.q[:3])
+    moved = (x + x * np.cos(theta) - y * np.sin(theta), y + x * np.sin(theta) + y * np.cos(theta), 2 * theta)
+    np.testing.assert_allclose(twice.q[:3], moved, atol=1e-10)
+    back = last(run(once, 2 * np.pi, 0.0))
+    np.testing.assert_allclose(back.q[:3], 0.0, atol=1e-11)
+
+
+# Control
+
+
+def deviation(t, q):
+    return np.array([q[0] - 0.5 * np.sin(t), q[2] - q[0] - 0.2 * np.cos(2 * t)])
+
+
+def test_the_desired_motion_is_kept_and_found():
+    mechanism = library("tracking_chain")
+    run = mb.simulate(mechanism.system, mechanism.state, t1=20.0, rtol=1e-12, atol=1e-13)
+    assert np.max(np.abs(deviation(20.0, run.ys.q[-1]))) < 1e-12
+    np.testing.assert_allclose(run.ys.q[-1, 1], 0.3463702111, atol=1e-8)
+    np.testing.assert_allclose(run.constraint_forces["track"][-1], (7.88958994, 0.0, 0.27118949), atol=1e-6)
+    off = mechanisms.tracking_chain(offset=0.1, gains=(10.0, 25.0))
+    assert np.max(np.abs(deviation(0.0, off.state.q))) > 0.1
+    found = mb.simulate(off.system, off.state, t1=10.0, rtol=1e-11, atol=1e-13)
+    assert np.max(np.abs(deviation(10.0, found.ys.q[-1]))) < 1e-11
+
+
+def test_the_control_force_is_the_least_one():
+    """Any other force with the same effect on the deviations has a part that they do not feel."""
+    system = library("tracking_chain").system
+    q, u = system.guess.q, system.guess.u
+    _, multipliers = accelerations(system, Multipliers(), ZERO, q, u)
+    force = np.asarray(system.constraint_force(ZERO, q, u, multipliers))
+    inverse = np.diag(1 / np.asarray(system.parameters["masses"]))
+    unfelt = np.linalg.svd(np.asarray(system.jacobian(ZERO, q, u)) @ inverse)[2][-1]
+    assert np.linalg.norm(force) > 0.1
+    np.testing.assert_allclose(unfelt @ inverse @ force, 0.0, atol=1e-13 * np.linalg.norm(force))
+
+
+def test_a_servo_beside_constraints_that_are_kept():
+    """A pendulum in Cartesian coordinates whose height follows: one chart for the bar, its force and the control's."""
+    bar = Holonomic("bar", lambda t, q, p: jnp.dot(q, q) - 1.0)
+    follow = Servo("follow", lambda t, q, p: q[1] + 0.8 - 0.1 * jnp.sin(3 * t), damping=8.0, stiffness=16.0)
+    system = LagrangianSystem(
+        kinetic=free, potential=lambda t, q, p: 9.81 * q[1], constraints=[follow, bar], q=(0.6, -0.8), u=(0.0, 0.0)
+    )
+    assert (system.position_rows, system.velocity_rows, system.acceleration_rows, system.acceleration_rank) == (
+        1,
+        1,
+        2,
+        2,
+    )
+    run = mb.simulate(system, system.guess, t1=6.0, rtol=1e-10)
+    assert float(run.constraint_violation.position[-1]) < 1e-12
+    np.testing.assert_allclose(run.ys.q[-1, 1], -0.8 + 0.1 * np.sin(18.0), atol=1e-7)
+
+
+def test_acceleration_constraints_are_what_their_rows_say():
+    rows = AccelerationConstraint(
+        "rows", lambda t, q, v, p: jnp.array([[1.0, 2.0]]), lambda t, q, v, p: jnp.cos(t) - v[:1]
+    )
+    system = LagrangianSystem(kinetic=free, constraints=[rows], q=(0.0, 0.0), u=(1.0, 0.0))
+    udot, _ = accelerations(system, Partitioned(), jnp.asarray(0.3), *jax.tree.leaves(system.guess))
+    np.testing.assert_allclose(udot[0] + 2 * udot[1], np.cos(0.3) - 1.0, rtol=1e-14)
+    np.testing.assert_allclose(udot[1], 2 * udot[0], rtol=1e-14)
+
+
+# Constraints that are not ideal
+
+
+def ring(*laws, extra=(), **kwargs):
+    rows = Holonomic("ring", lambda t, q, p: 0.5 * (jnp.dot(q, q) - 1.0))
+    kwargs = {"q": (0.6, 0.8), "u": (-0.8, 0.6), "parameters": {"mu": 0.3, "c": 0.2}, **kwargs}
+    return LagrangianSystem(kinetic=free, constraints=[rows, *extra], nonideal=laws, **kwargs)
+
+
+@pytest.mark.parametrize("formulation", [Partitioned(), Multipliers()])
+def test_work_of_constraint_forces(formulation):
+    """`w · (M u̇ − F) = w · C` in every displacement w that is allowed, and the constraint holds whatever C is."""
+    along = jnp.array([-0.8, 0.6])
+    wild = NonIdeal("ring", lambda t, q, v, multipliers, p: jnp.array([0.7, -0.4]) * multipliers[0] ** 2)
+    system = ring(wild)
+    q, u = system.guess.q, system.guess.u
+    udot, _ = accelerations(system, formulation, ZERO, q, u)
+    np.testing.assert_allclose(along @ udot, along @ np.array([0.7, -0.4]), atol=1e-14)
+    np.testing.assert_allclose(system.acceleration_residual(ZERO, q, u, udot), 0.0, atol=1e-14)
+    # What is normal to the ring has no effect.
+    normal = ring(NonIdeal("ring", lambda t, q, v, multipliers, p: 5.0 * q))
+    ideal = accelerations(ring(), formulation, ZERO, q, u)[0]
+    np.testing.assert_allclose(accelerations(normal, formulation, ZERO, q, u)[0], ideal, atol=1e-14)
+
+
+def test_energy_goes_into_friction():
+    """Of both kinds, by their power."""
+    system = ring(Friction("ring", "mu"), Viscous("ring", "c"))
+    ts = np.linspace(0.0, 2.0, 400)
+    run = mb.simulate(system, system.guess, t1=2.0, rtol=1e-11, saveat=ts)
+    speed = np.linalg.norm(np.asarray(run.ys.u), axis=1)
+    # On a ring of radius one the normal force is the speed's square.
+    power = 0.3 * speed**3 + 0.2 * speed**2
+    lost = np.sum((ts[1] - ts[0]) * (power[1:] + power[:-1]) / 2)
+    np.testing.assert_allclose(run.energy[0] - run.energy[-1], lost, rtol=1e-5)
+
+
+# The spherical four-bar
+
+
+def test_the_spherical_four_bar():
+    mechanism = library("spherical_four_bar")
+    system, state = mechanism.system, mechanism.state
+    assert (system.coordinate_rank, system.velocity_rank, system.nu) == (5, 5, 6)
+    udot, _ = accelerations(system, Partitioned(), ZERO, state.q, state.u)
+    np.testing.assert_allclose(udot[:2], (-14.4937116428, 10.4421360647), atol=1e-9)
+    np.testing.assert_allclose(state.q[3] ** 2 + state.q[4] ** 2, 0.0669872981, atol=1e-10)
+    run = mb.simulate(system, state, t1=3.0, rtol=1e-12, saveat=np.linspace(0.0, 3.0, 7))
+    assert np.all(run.constraint_violation.position < 1e-11)
+    balance = run.energy - 0.1 * run["theta"]
+    np.testing.assert_allclose(balance, balance[0], atol=1e-10)
+
+
+def test_the_limit_of_small_arcs_is_the_planar_four_bar():
+    """By the square of their size."""
+    a, b, c, d = np.radians([30.0, 75.0, 60.0, 80.0])
+
+    # Both linkages have their ground along y: the spherical one's output axis stands at −y of its input axis.
+    x, y = a * np.sin(0.7), -a * np.cos(0.7) + d
+    diagonal = np.hypot(x, y)
+    inner = np.arccos((diagonal**2 + c**2 - b**2) / (2 * diagonal * c))
+    sides = np.arctan2(y, x) + np.pi / 2 + inner * np.array([1.0, -1.0])
+    errors = []
+    for size in (1e-2, 1e-3):
+        arcs = tuple(np.degrees(size * np.array([a, b, c, d])))
+        psi = float(mechanisms.spherical_four_bar(arcs=arcs, angle=0.7).state.q[1])
+        errors.append(np.min(np.abs((psi - sides + np.pi) % (2 * np.pi) - np.pi)))
+    np.testing.assert_allclose(errors[0] / errors[1], 100.0, atol=1.0)
+
+
+# Derivatives
+
+
+def chain(x, rtol, adjoint):
+    system = library("tracking_chain", offset=0.1, gains=(10.0, 25.0)).system
+    changed = mb.with_parameters(system, {"masses": jnp.array([1.0, 2.0, 1.5]) * jnp.exp(x[0]), "damping": 0.1 + x[1]})
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+
+
+def rough(x, rtol, adjoint):
+    system = library("rough_ring").system
+    changed = mb.with_parameters(system, {"friction": 0.3 + x[0], "gravity": 0.5 + x[1]})
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+
+
+def racer(x, rtol, adjoint):
+    system = library("roller_racer").system
+    changed = mb.with_parameters(system, {"pivot": 0.5 + x[0], "front_inertia": 0.05 + x[1]})
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+
+
+def quasi(x, rtol, adjoint):
+    mechanism = library("constant_speed_particle", form="quasi")
+    changed = mb.with_parameters(mechanism.system, {"speed": 3.0 + x[0], "gravity": 9.81 + x[1]})
+    return mb.simulate(changed, mechanism.state, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+
+
+ROADS = {
+    "servo": (chain, "tracking_chain", {"offset": 0.1, "gains": (10.0, 25.0)}),
+    "friction": (rough, "rough_ring", {}),
+    "frame": (racer, "roller_racer", {}),
+    "quasi-velocities": (quasi, "constant_speed_particle", {"form": "quasi"}),
+}
+
+
+@pytest.mark.parametrize("road", ROADS)
+def test_forward_reverse_and_central_differences(road):
+    run, name, parameters = ROADS[road]
+    library(name, **parameters)
+
+    def loss(x, rtol, adjoint):
+        seen = jnp.concatenate([y[-1] for y in jax.tree.leaves(run(x, rtol, adjoint).ys)])
+        return jnp.sum(seen / (1.0 + jnp.arange(seen.size, dtype=float)))
+
+    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
+    forward, _ = derivatives_and_value(np.zeros(2), 1e-10)
+    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-10, None)))(np.zeros(2))
+    assert np.all(np.abs(forward) > 1e-3)
+    scale = np.max(np.abs(forward))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
+    h = 1e-4
+    value = lambda k: np.array([derivatives_and_value(k * h * e, 1e-13)[1] for e in np.eye(2)])
+    central = (8 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / (12 * h)
+    np.testing.assert_allclose(forward, central, rtol=1e-5)
+
+
+# Bad input
+
+
+def system(**kwargs):
+    return LagrangianSystem(**{"kinetic": free, "q": (0.6, 0.8), **kwargs})
+
+
+ONE = Holonomic("ring", lambda t, q, p: jnp.dot(q, q) - 1.0)
+BAD = {
+    "both L and T": ({"lagrangian": free}, "either `lagrangian` or `kinetic`"),
+    "not differentiable twice": ({"kinetic": lambda t, q, v, p: jnp.sum(jnp.abs(v))}, "second derivatives"),
+    "force of another shape": ({"force": lambda t, q, v, p: jnp.zeros(3)}, "force must have shape"),
+    "one name twice": ({"constraints": [ONE, ONE]}, "'ring' is there twice"),
+    "no constraint": ({"constraints": [free]}, "constraints must hold"),
+    "names of coordinates": ({"coordinates": ("x", "x")}, "all different"),
+    "cannot be satisfied": ({"constraints": [Holonomic("far", lambda t, q, p: jnp.dot(q, q) + 1.0)]}, "far"),
+    "no gradient at rest": (
+        {"constraints": [Nonholonomic("cone", lambda t, q, v, p: jnp.sqrt(jnp.dot(v, v)))]},
+        "cone: its derivative",
+    ),
+    "frame of too many": ({"kinematics": Frame(lambda t, q, p: jnp.ones((2, 3)), 3)}, "at most as many"),
+    "frame that does not span": (
+        {"kinematics": Frame(lambda t, q, p: jnp.ones((2, 2)), 2), "equations": Hamel()},
+        "not independent",
+    ),
+    "no frame": ({"equations": Hamel()}, "kinematics=Frame"),
+    "no connection": ({"equations": Voronets()}, "kinematics=Connection"),
+    "base and fibre": ({"kinematics": Connection((0,), (0,), lambda t, q, p: jnp.ones((1, 1)))}, "each of them once"),
+    "not invertible": (
+        {"kinematics": QuasiVelocities(lambda t, q, v, p: v[0] * jnp.ones(2), (1.0, 1.0))},
+        "not invertible",
+    ),
+    "unknown constraint": ({"nonideal": [Friction("wire", "mu")]}, "'wire'"),
+    "redundant friction": (
+        {
+            "constraints": [ONE, Holonomic("same", lambda t, q, p: 2 * jnp.dot(q, q) - 2.0)],
+            "nonideal": [Friction("ring", "mu")],
+            "parameters": {"mu": 0.1},
+        },
+        "not determined",
+    ),
+    "unknown coefficient": ({"constraints": [ONE], "nonideal": [Friction("ring", "mu")]}, "'mu'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refused(case):
+    arguments, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        system(**arguments)
+
+
+def test_bad_transpositions():
+    with pytest.raises(ValueError, match="'holder', 'suslov'"):
+        Hamel("vakonomic")
+    frame = Frame(lambda t, q, p: jnp.eye(2), 2)
+    with pytest.raises(ValueError, match="must have shape"):
+        system(kinematics=frame, equations=Hamel(lambda t, q, v, dq, p: jnp.zeros(3)))
+
+
+def test_contradicting_rows_leave_a_residual():
+    """Rows of accelerations that cannot hold together are found in what is left of them."""
+    rows = lambda name, value: AccelerationConstraint(
+        name, lambda t, q, v, p: jnp.array([[1.0, 0.0]]), lambda t, q, v, p: jnp.array([value])
+    )
+    with pytest.raises(ValueError, match="one, two"):
+        system(constraints=[rows("one", 1.0), rows("two", 2.0)])
+
+
+def test_pfaffian_with_a_drift():
+    moving = Pfaffian("belt", lambda t, q, p: jnp.array([[0.0, 1.0]]), lambda t, q, p: -p["speed"])
+    belt = system(constraints=[moving], parameters={"speed": 0.3})
+    assert belt.linear and not belt.homogeneous
+    start = mb.assemble(belt, rates={"q0": 0.5})
+    np.testing.assert_allclose(start.u, (0.5, 0.3), atol=1e-15)
+    run = mb.simulate(belt, start, t1=1.0)
+    np.testing.assert_allclose(run.ys.q[-1], (1.1, 1.1), atol=1e-10)
