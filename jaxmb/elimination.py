@@ -77,6 +77,10 @@ class Factor(eqx.Module):
     basis: Float[Array, "n f"]
     rows: Int[Array, "r"] | None
 
+    def spread(self, kept: Float[Array, "r"]) -> Float[Array, "m"]:
+        """Values of all rows from those of the kept ones: zero for implied rows."""
+        return jnp.zeros(self.correction.shape[1], kept.dtype).at[self.rows].set(kept)
+
 
 def full_pivot(
     A: Float[Array, "m n"],
@@ -225,6 +229,30 @@ def gauss_jordan(B: Float[Array, "r n"], r: int) -> Float[Array, "r n"]:
 
 
 def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """Solve with a symmetric positive definite matrix, whose diagonal pivots need no search."""
+    """Solve with a symmetric positive definite matrix or a root of one: diagonal pivots need no search."""
     n = M.shape[0]
     return b / M[0, 0] if n == 1 else gauss_jordan(M, n) @ b
+
+
+@jax.custom_jvp
+def cholesky(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A root L of a symmetric positive definite matrix, `M = L Lᵀ`, lower triangular.
+
+    Any `L U` with orthogonal U is another, and derivatives are those of the root that follows M without being kept
+    triangular: right, to every order, in results that do not depend on the choice.
+    """
+    n = M.shape[0]
+    rows = jnp.arange(n)
+
+    def add_column(k, root):
+        column = M[k] - root @ root[k]
+        return root.at[:, k].set(jnp.where(rows < k, 0.0, column) / jnp.sqrt(column[k]))
+
+    return lax.fori_loop(0, n, add_column, jnp.zeros_like(M))
+
+
+@cholesky.defjvp
+def _cholesky_jvp(primals, tangents):
+    (M,), (dM,) = primals, tangents
+    root = cholesky(M)
+    return root, 0.5 * dM @ gauss_jordan(root, M.shape[0]).T

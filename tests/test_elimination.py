@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.elimination import factor, full_pivot, gauss_jordan, solve_positive
+from jaxmb.elimination import cholesky, factor, full_pivot, gauss_jordan, solve_positive
 
 RNG = np.random.default_rng(0)
 
@@ -107,3 +107,18 @@ def test_solve_positive(n):
     M = root @ root.T + jnp.eye(n)
     b = jnp.asarray(RNG.normal(size=n))
     np.testing.assert_allclose(M @ solve_positive(M, b), b, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_cholesky_and_its_derivatives(n):
+    start, along = RNG.normal(size=(2, n, n))
+    M = jnp.asarray(start @ start.T + np.eye(n))
+    dM = jnp.asarray(along + along.T)
+    np.testing.assert_allclose(cholesky(M), np.linalg.cholesky(M), atol=1e-13)
+    # Results that are the same for every root have derivatives; this one knows its own without a root.
+    force = jnp.asarray(RNG.normal(size=n))
+    distance = lambda s: jnp.sum(solve_positive(cholesky(M + s * dM), force) ** 2)
+    plain = lambda s: force @ jnp.linalg.solve(M + s * dM, force)
+    for order in range(3):
+        np.testing.assert_allclose(distance(0.0), plain(0.0), rtol=1e-10, err_msg=f"derivative {order}")
+        distance, plain = jax.grad(distance), jax.jacfwd(plain)

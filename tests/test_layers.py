@@ -11,7 +11,7 @@ ROOT = Path(jaxmb.__file__).parent
 
 # Lowest first; a layer may import from those before it, and from itself.
 LAYERS = [
-    ["_types", "_space", "_names", "_results", "rotations", "elimination"],
+    ["_types", "_space", "_names", "_results", "rotations", "elimination", "orthogonal"],
     ["_parts", "_resolve"],
     ["_forces", "_user", "planar", "spatial"],
     ["system"],

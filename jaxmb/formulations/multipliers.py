@@ -2,8 +2,6 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from ..elimination import solve_positive
 from ._base import AbstractFormulation
 
@@ -20,5 +18,4 @@ class Multipliers(AbstractFormulation):
         A = jacobian[factor.rows]
         free = inertia.solve(force)
         kept = solve_positive(A @ inertia.solve(A.T), gamma[factor.rows] - A @ free)
-        multipliers = jnp.zeros(jacobian.shape[0], force.dtype).at[factor.rows].set(kept)
-        return free + inertia.solve(A.T @ kept), multipliers
+        return free + inertia.solve(A.T @ kept), factor.spread(kept)

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..elimination import solve_positive
+from ..elimination import cholesky, solve_positive
 from ..rotations import cross
 
 
 class AbstractInertia(eqx.Module):
-    """A symmetric positive definite mass matrix M (n × n)."""
+    """A symmetric positive definite mass matrix M (n × n), or a root of one, in its structure."""
 
     @abc.abstractmethod
     def product(self, v: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -22,6 +22,14 @@ class AbstractInertia(eqx.Module):
     @abc.abstractmethod
     def solve(self, f: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
         """`M⁻¹ f`."""
+
+    @abc.abstractmethod
+    def root(self) -> "AbstractInertia":
+        """L with `M = L Lᵀ`: in the frame of the quasi-velocities `Lᵀ u` the mass matrix is the identity."""
+
+    @abc.abstractmethod
+    def transpose(self) -> "AbstractInertia":
+        """The transpose, which is another matrix only for a root."""
 
 
 class DiagonalInertia(AbstractInertia):
@@ -34,6 +42,12 @@ class DiagonalInertia(AbstractInertia):
 
     def solve(self, f):
         return f / (self.diagonal if f.ndim == 1 else self.diagonal[:, None])
+
+    def root(self):
+        return DiagonalInertia(jnp.sqrt(self.diagonal))
+
+    def transpose(self):
+        return self
 
 
 class BlockInertia(AbstractInertia):
@@ -56,6 +70,12 @@ class BlockInertia(AbstractInertia):
     def solve(self, f):
         return self._apply(lambda n: _block_product(_inverse_3x3(self.rotary), n), 1 / self.mass, f)
 
+    def root(self):
+        return BlockInertia(jnp.sqrt(self.mass), jax.vmap(cholesky)(self.rotary))
+
+    def transpose(self):
+        return BlockInertia(self.mass, self.rotary.swapaxes(1, 2))
+
 
 class DenseInertia(AbstractInertia):
     """A full matrix, shape (n, n)."""
@@ -67,6 +87,12 @@ class DenseInertia(AbstractInertia):
 
     def solve(self, f):
         return solve_positive(self.matrix, f)
+
+    def root(self):
+        return DenseInertia(cholesky(self.matrix))
+
+    def transpose(self):
+        return DenseInertia(self.matrix.T)
 
 
 def _block_product(J, w):

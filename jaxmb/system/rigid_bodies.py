@@ -272,7 +272,9 @@ class RigidBodySystem(AbstractSystem):
         if self.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.rotary)
         if self.spatial:
-            return _MixedInertia(self.mass, self.rotary, self.layout)
+            points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
+            rotary = jnp.where(points, jnp.eye(3, dtype=self.rotary.dtype), self.rotary)
+            return _MixedInertia(BlockInertia(self.mass, rotary), self.layout)
         bodies = jnp.concatenate([jnp.repeat(self.mass[:, None], 2, axis=1), self.rotary[:, None]], axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
@@ -357,19 +359,22 @@ class RigidBodySystem(AbstractSystem):
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies and point masses together."""
+    """Spatial bodies and point masses together. `blocks` has some for the rotations of point masses, too."""
 
-    mass: Float[Array, "b"]
-    rotary: Float[Array, "b 3 3"]
+    blocks: BlockInertia
     layout: Layout = eqx.field(static=True)
 
     def product(self, v):
-        return self._through(BlockInertia(self.mass, self.rotary).product, v)
+        return self._through(self.blocks.product, v)
 
     def solve(self, f):
-        points = jnp.array([not r for r in self.layout.rotates])[:, None, None]
-        rotary = jnp.where(points, jnp.eye(3, dtype=self.rotary.dtype), self.rotary)
-        return self._through(BlockInertia(self.mass, rotary).solve, f)
+        return self._through(self.blocks.solve, f)
+
+    def root(self):
+        return _MixedInertia(self.blocks.root(), self.layout)
+
+    def transpose(self):
+        return _MixedInertia(self.blocks.transpose(), self.layout)
 
     def _through(self, apply, v):
         index = self.layout.velocity_index[:-1].ravel()

@@ -1,0 +1,20 @@
+"""Gauss' principle of least constraint."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar
+from ..system import AbstractSystem
+
+
+def gauss_function(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+) -> Float[Array, ""]:
+    """Gauss' function `𝒢(u̇) = (u̇ − a)ᵀ M (u̇ − a)`, `a = M⁻¹F`, of any accelerations at a state [N²/kg].
+
+    Among the accelerations that ideal constraints allow, those with `system.acceleration_residual(t, q, u, u̇) = 0`, the
+    true ones have the least; others, farther by δ, have more by `δᵀ M δ`.
+    """
+    inertia = system.inertia(t, q, u)
+    deviation = udot - inertia.solve(system.force(t, q, u))
+    return jnp.vdot(deviation, inertia.product(deviation))

@@ -1,0 +1,35 @@
+"""Projection of the equations on the null space of the constraints."""
+
+from typing import ClassVar
+
+from ..elimination import solve_positive
+from ..orthogonal import frame
+from ._base import AbstractFormulation
+
+
+class NullSpace(AbstractFormulation):
+    """Maggi's equations in an orthonormal basis Z of the null space of A: `(ZᵀMZ) ẏ = Zᵀ(F − M c)`, `u̇ = Z ẏ + c`.
+
+    c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
+    preferred over others, so there is no chart to become bad, and no pivots to search where no row is redundant. The
+    mass matrix may be singular, as long as no velocity without mass is free.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{kim1986qr,
+          author = {Kim, S. S. and Vanderploeg, M. J.}, title = {{QR} Decomposition for State Space Representation of
+          Constrained Mechanical Dynamic Systems}, journal = {Journal of Mechanisms, Transmissions, and Automation in
+          Design}, volume = {108}, number = {2}, pages = {183--188}, year = {1986},
+        }
+        ```
+    """
+
+    partitions: ClassVar[bool] = False
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        split = frame(jacobian[factor.rows].T)
+        Z, solution = split.across, split.pseudoinverse
+        particular = solution.T @ gamma[factor.rows]
+        reduced = Z.T @ inertia.product(Z)
+        udot = particular + Z @ solve_positive(reduced, Z.T @ (force - inertia.product(particular)))
+        return udot, factor.spread(solution @ (inertia.product(udot) - force))

@@ -1,0 +1,38 @@
+"""Constrained Poincaré equations: quasi-accelerations in a frame where mass is the identity."""
+
+from typing import ClassVar
+
+from ..orthogonal import frame
+from ._base import AbstractFormulation
+
+
+class Poincare(AbstractFormulation):
+    r"""Gauss' principle in the quasi-accelerations `ṡ = Lᵀ u̇` of a mass-orthonormal frame, `M = L Lᵀ`.
+
+    There Gauss' function is a squared distance, `𝒢 = |ṡ − L⁻¹F|²`, and the constraints are `B ṡ = γ` with
+    `B = A L⁻ᵀ`. In a frame adapted to them, from an orthogonal factorisation of Bᵀ, the constraints give the components
+    of ṡ along their rows, and nothing changes those across: no equation is left to solve. The multipliers are those of
+    the ideal constraint force `S = Aᵀ λ = L (ṡ − L⁻¹F)`.
+
+    The condition of B counts once, where in `A M⁻¹ Aᵀ` it counts squared, and large forces that the constraints balance
+    are not subtracted from each other.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{udwadia2007explicit,
+          author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Poincar\'e Equations of Motion for
+          General Constrained Systems. {Part I}. Analytical Results}, journal = {Proceedings of the Royal Society A},
+          volume = {463}, number = {2082}, pages = {1421--1434}, year = {2007},
+        }
+        ```
+    """
+
+    partitions: ClassVar[bool] = False
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        root = inertia.root()
+        free = root.solve(force)
+        adapted = frame(root.solve(jacobian[factor.rows].T))
+        bound = adapted.inverse.T @ gamma[factor.rows]
+        sdot = adapted.along @ bound + adapted.across @ (adapted.across.T @ free)
+        return root.transpose().solve(sdot), factor.spread(adapted.inverse @ (bound - adapted.along.T @ free))

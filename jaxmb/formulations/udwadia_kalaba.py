@@ -1,0 +1,96 @@
+"""Explicit accelerations of Udwadia and Kalaba, in generalized inverses."""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..orthogonal import frame
+from ._base import AbstractFormulation
+
+Method = Literal["moore_penrose", "inverses", "singular_mass"]
+
+
+class UdwadiaKalaba(AbstractFormulation):
+    """Accelerations in closed form, without multipliers; these are found from them afterwards.
+
+    **Arguments:** `method`: which form, with `a = M⁻¹F` and a root L of the mass matrix, `M = L Lᵀ`, for its square
+    root:
+
+    - `"moore_penrose"`: `u̇ = a + L⁻ᵀ B⁺ (γ − A a)`, `B = A L⁻ᵀ`. The best known.
+    - `"inverses"`: `u̇ = A⁻γ + (I − A⁻A) G⁻ Lᵀ(a − A⁻γ)`, `G = Lᵀ(I − A⁻A)`, with any `A⁻` that solves consistent
+        equations (a {1}-inverse) and any `G⁻` that solves least squares (a {1,3}-inverse). The first is that of the
+        chart; for the second `(I − A⁻A) G⁻ = E (LᵀE)⁺` in the chart's basis E of the null space.
+    - `"singular_mass"`: `u̇ = [(I − A⁺A) M; A]⁺ [F; γ]`. Needs no inverse of M, which may be singular as long as no
+        velocity without mass is free, `rank [M; A] = n`.
+
+    Ranks are structural: pseudo-inverses are taken of independent rows, from factors of fixed rank, where derivatives
+    exist.
+
+    ??? cite "Reference"
+        ```bibtex
+        @article{udwadia1992new,
+          author = {Udwadia, Firdaus E. and Kalaba, Robert E.}, title = {A New Perspective on Constrained Motion},
+          journal = {Proceedings of the Royal Society A}, volume = {439}, number = {1906}, pages = {407--410}, year =
+          {1992},
+        }
+
+        @article{kalaba1993equations,
+          author = {Kalaba, R. E. and Udwadia, F. E.}, title = {Equations of Motion for Nonholonomic, Constrained
+          Dynamical Systems via {Gauss's} Principle}, journal = {Journal of Applied Mechanics}, volume = {60}, number =
+          {3}, pages = {662--668}, year = {1993},
+        }
+
+        @article{udwadia2006explicit,
+          author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Equations of Motion for
+          Constrained Mechanical Systems with Singular Mass Matrices and Applications to Multi-Body Dynamics}, journal =
+          {Proceedings of the Royal Society A}, volume = {462}, number = {2071}, pages = {2097--2117}, year = {2006},
+        }
+        ```
+    """
+
+    method: Method = eqx.field(static=True, default="moore_penrose")
+
+    def __check_init__(self):
+        if self.method not in get_args(Method):
+            raise ValueError(f"UdwadiaKalaba: method must be one of {get_args(Method)}, got {self.method!r}.")
+
+    @property
+    def partitions(self) -> bool:
+        return self.method == "inverses"
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        return _FORMS[self.method](inertia, force, jacobian, gamma, factor)
+
+
+def _moore_penrose(inertia, force, jacobian, gamma, factor):
+    A, root = jacobian[factor.rows], inertia.root()
+    back = root.transpose()
+    free = back.solve(root.solve(force))
+    pseudoinverse = frame(root.solve(A.T)).pseudoinverse.T
+    sdot = pseudoinverse @ (gamma[factor.rows] - A @ free)
+    return free + back.solve(sdot), factor.spread(pseudoinverse.T @ sdot)
+
+
+def _inverses(inertia, force, jacobian, gamma, factor):
+    del jacobian
+    root = inertia.root()
+    particular = factor.correction @ gamma
+    ahead = root.solve(force) - root.transpose().product(particular)
+    independent = frame(root.transpose().product(factor.basis)).pseudoinverse @ ahead
+    udot = particular + factor.basis @ independent
+    return udot, factor.correction.T @ (inertia.product(udot) - force)
+
+
+def _singular_mass(inertia, force, jacobian, gamma, factor):
+    A = jacobian[factor.rows]
+    rows = frame(A.T)
+    project = lambda x: x - rows.along @ (rows.along.T @ x)
+    mass = project(inertia.product(jnp.eye(A.shape[1], dtype=A.dtype)))
+    stacked = frame(jnp.concatenate([mass, A])).pseudoinverse
+    # The projection of F leaves nothing for least squares to balance, and so loses no digits to it.
+    udot = stacked @ jnp.concatenate([project(force), gamma[factor.rows]])
+    return udot, factor.spread(rows.pseudoinverse @ (inertia.product(udot) - force))
+
+
+_FORMS = {"moore_penrose": _moore_penrose, "inverses": _inverses, "singular_mass": _singular_mass}

@@ -1,0 +1,276 @@
+"""Every road to the same accelerations: on matrices against NumPy, on the library's mechanisms against each other."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb.elimination import factor, full_pivot
+from jaxmb.formulations import (
+    Multipliers,
+    NullSpace,
+    Partitioned,
+    Poincare,
+    UdwadiaKalaba,
+    gauss_function,
+    linearize,
+)
+from jaxmb.formulations._base import solve_constrained
+from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
+
+ROADS = {
+    "partitioned": Partitioned(),
+    "multipliers": Multipliers(),
+    "null_space": NullSpace(),
+    "poincare": Poincare(),
+    "moore_penrose": UdwadiaKalaba(),
+    "inverses": UdwadiaKalaba("inverses"),
+    "singular_mass": UdwadiaKalaba("singular_mass"),
+}
+WITHOUT_INVERSE_OF_MASS = {name: ROADS[name] for name in ("partitioned", "null_space", "singular_mass")}
+N, RANK = 7, 4
+
+
+def solve_by_all(inertia, force, jacobian, gamma, order, roads=ROADS):
+    """Accelerations and multipliers, an array each with an axis of roads."""
+    solved = factor(jacobian, order, RANK)
+    pairs = [road.solve(inertia, force, jacobian, gamma, solved) for road in roads.values()]
+    return tuple(jnp.stack(values) for values in zip(*pairs, strict=True))
+
+
+def random_equation(rng, *, redundant=True):
+    """M, F, A, γ of seven velocities and four independent rows, and a fifth that follows from two of them."""
+    root = rng.normal(size=(N, N))
+    A = rng.normal(size=(RANK, N))
+    if redundant:
+        A = np.vstack([A, A[0] + 2 * A[1]])
+    return tuple(map(jnp.asarray, (root @ root.T + N * np.eye(N), rng.normal(size=N), A, A @ rng.normal(size=N))))
+
+
+def by_numpy(M, F, A, gamma, rows):
+    """Accelerations and multipliers of the kept rows from the equations of both together."""
+    A, gamma = np.asarray(A)[rows], np.asarray(gamma)[rows]
+    m, n = A.shape
+    both = np.block([[np.asarray(M), -A.T], [A, np.zeros((m, m))]])
+    solution = np.linalg.solve(both, np.concatenate([F, gamma]))
+    return solution[:n], solution[n:]
+
+
+@pytest.fixture(scope="module")
+def dense():
+    return jax.jit(lambda M, F, A, gamma, order: solve_by_all(DenseInertia(M), F, A, gamma, order))
+
+
+def test_equal_to_numpy_whichever_rows_and_columns_are_chosen(dense):
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        M, F, A, gamma = random_equation(rng)
+        # Charts that prefer other columns have other {1}-inverses.
+        for scale in (None, jnp.asarray(10.0 ** rng.uniform(-2, 2, size=N))):
+            order = full_pivot(A, scale=scale).order
+            udot, multipliers = dense(M, F, A, gamma, order)
+            kept = np.asarray(order.rows[:RANK])
+            expected, some = by_numpy(M, F, A, gamma, kept)
+            all_rows = np.zeros(RANK + 1)
+            all_rows[kept] = some
+            for k, name in enumerate(ROADS):
+                np.testing.assert_allclose(udot[k], expected, atol=1e-11, err_msg=name)
+                np.testing.assert_allclose(
+                    multipliers[k], all_rows, atol=1e-11 * (1 + np.max(np.abs(some))), err_msg=name
+                )
+
+
+def test_vmap_equals_the_loop(dense):
+    rng = np.random.default_rng(1)
+    equations = [random_equation(rng) for _ in range(3)]
+    members = [(*equation, full_pivot(equation[2]).order) for equation in equations]
+    together = jax.jit(jax.vmap(dense))(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
+    for k, member in enumerate(members):
+        for batched, alone in zip(together, dense(*member), strict=True):
+            np.testing.assert_allclose(batched[k], alone, rtol=1e-12, atol=1e-12)
+
+
+def test_singular_mass():
+    """A velocity without mass, held by a constraint."""
+    rng = np.random.default_rng(2)
+    M, F, A, gamma = random_equation(rng, redundant=False)
+    M, F = M.at[-1].set(0.0).at[:, -1].set(0.0), F.at[-1].set(0.0)
+    A = A.at[0].set(0.3 * jnp.eye(N)[0] + jnp.eye(N)[-1])
+    order = full_pivot(A).order
+    roads = WITHOUT_INVERSE_OF_MASS
+    udot, multipliers = jax.jit(lambda *args: solve_by_all(DenseInertia(M), *args, roads))(F, A, gamma, order)
+    expected, _ = by_numpy(M, F, A, gamma, np.arange(RANK))
+    for k, name in enumerate(roads):
+        np.testing.assert_allclose(udot[k], expected, atol=1e-11, err_msg=name)
+        np.testing.assert_allclose(A @ udot[k], gamma, atol=1e-14 * (1 + np.max(np.abs(gamma))), err_msg=name)
+        force = M @ udot[k] - F
+        np.testing.assert_allclose(A.T @ multipliers[k], force, atol=1e-14 * (1 + np.max(np.abs(force))), err_msg=name)
+
+
+def test_forces_that_do_virtual_work():
+    """A rigid body's rotation with one constraint that is not ideal: what it does beyond d'Alembert's principle."""
+    moments, spin = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.5, 0.8])
+    force = jnp.asarray(np.array([0.1, 0.2, -0.3]) - np.cross(spin, moments * spin))
+    A, gamma = jnp.array([[1.0, 2.0, -1.0]]), jnp.array([0.4])
+    admissible = np.linalg.svd(A)[2][1:].T
+    solved = factor(A, full_pivot(A).order, 1)
+    inertia = DiagonalInertia(jnp.asarray(moments))
+    solve = jax.jit(lambda F: [road.solve(inertia, F, A, gamma, solved) for road in ROADS.values()])
+    rough = jnp.array([0.05, -0.02, 0.03])
+    # Only the part along motions that the constraint allows acts.
+    outcomes = zip(ROADS, solve(force), solve(force + rough), solve(force + 3.0 * A[0]), strict=True)
+    for name, (ideal, multipliers), (udot, _), (same, _) in outcomes:
+        np.testing.assert_allclose(A @ ideal, gamma, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(moments * ideal - force, A.T @ multipliers, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(admissible.T @ (moments * ideal - force), 0.0, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(A @ udot, gamma, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(admissible.T @ (moments * udot - force - rough), 0.0, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(same, ideal, atol=1e-14, err_msg=name)
+
+
+@pytest.mark.parametrize("redundant", [False, True])
+def test_derivatives(redundant):
+    """Of accelerations and constraint forces to all entries of M, F, A and γ, an implied row following the others."""
+    rng = np.random.default_rng(3)
+    M, F, A, gamma = random_equation(rng, redundant=False)
+    combine = jnp.asarray(np.vstack([np.eye(RANK), [[1.0, 2.0, 0.0, 0.0]]]) if redundant else np.eye(RANK))
+    order = full_pivot(combine @ A).order
+    start, unravel = jax.flatten_util.ravel_pytree((M, F, A, gamma))
+    direction = jnp.asarray(rng.normal(size=start.size))
+
+    def solutions(entries):
+        M, F, A, gamma = unravel(entries)
+        inertia = DenseInertia((M + M.T) / 2)
+        udot, multipliers = solve_by_all(inertia, F, combine @ A, combine @ gamma, order)
+        return jnp.concatenate([udot, multipliers @ combine @ A], axis=1)
+
+    @jax.jit
+    def derivatives(entries):
+        push = lambda of: jax.jvp(of, (entries,), (direction,)) if redundant else (of(entries), None)
+        return push(jax.jacfwd(solutions)), push(jax.jacrev(solutions))
+
+    (first, second), (first_reverse, second_reverse) = derivatives(start)
+    h = 1e-5
+    difference = lambda of: (of(start + h * direction) - of(start - h * direction)) / (2 * h)
+    size = np.max(np.abs(first))
+    np.testing.assert_allclose(first_reverse, first, atol=1e-12 * size)
+    np.testing.assert_allclose(first, jnp.broadcast_to(first[:1], first.shape), atol=1e-11 * size)
+    np.testing.assert_allclose(first @ direction, difference(jax.jit(solutions)), atol=1e-8 * size)
+    if redundant:
+        size = np.max(np.abs(second))
+        np.testing.assert_allclose(second_reverse, second, atol=1e-12 * size)
+        np.testing.assert_allclose(second, jnp.broadcast_to(second[:1], second.shape), atol=1e-11 * size)
+        np.testing.assert_allclose(second, difference(lambda entries: derivatives(entries)[0][0]), atol=1e-8 * size)
+
+
+def test_roots_of_mass_matrices():
+    """`L Lᵀ` by products and by solves, and derivatives of what no choice of root can change."""
+    rng = np.random.default_rng(4)
+    half = rng.normal(size=(2, 3, 3))
+    rotary = jnp.asarray(half @ half.swapaxes(1, 2) + 10 * np.eye(3))
+    point = mb.spatial.PointMass("p", mass=2.0)
+    body = mb.spatial.Body("b", mass=3.0, inertia=rotary[0], position=(1.0, 0.0, 0.0))
+    mixed = mb.Scene([point, body]).compile()
+    inertias = [
+        DiagonalInertia(jnp.array([1.0, 4.0, 0.3])),
+        BlockInertia(jnp.array([2.0, 3.0]), rotary),
+        mixed.inertia(0.0, *jax.tree.leaves(mb.assemble(mixed))),
+        DenseInertia(rotary[0]),
+    ]
+    forces = [jnp.asarray(rng.normal(size=(n, 2))) for n in (3, 12, 9, 3)]
+
+    def compare(inertias):
+        for inertia, f in zip(inertias, forces, strict=True):
+            root = inertia.root()
+            back = root.transpose()
+            for v in (f, f[:, 0]):
+                yield root.product(back.product(v)), inertia.product(v)
+                yield back.solve(root.solve(v)), inertia.solve(v)
+                yield root.solve(root.product(v)), v
+            framed = jax.grad(lambda inertia, f=f: jnp.sum(inertia.root().solve(f) ** 2))(inertia)
+            plain = jax.grad(lambda inertia, f=f: jnp.vdot(f, inertia.solve(f)))(inertia)
+            # A matrix that stays symmetric knows only the symmetric part of its gradient.
+            symmetric = lambda x: x if x.ndim < 2 else x + x.swapaxes(-1, -2)
+            yield from zip(*(map(symmetric, jax.tree.leaves(x)) for x in (framed, plain)), strict=True)
+
+    for found, expected in jax.jit(lambda inertias: list(compare(inertias)))(inertias):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+LIBRARY = {name: {"n": 5} if name == "rod_chain" else {} for name in mb.mechanisms.names()}
+# Euler parameters and their rates as they are, with a mass matrix that is singular along them.
+SINGULAR = {"spherical_four_bar"}
+
+
+@pytest.mark.parametrize("name", LIBRARY)
+def test_formulations_agree(name):
+    """Accelerations and multipliers from every road, at random states on the constraints, are those of least effort."""
+    mechanism = mb.mechanisms.get(name, **LIBRARY[name])
+    system, state = mechanism.system, mechanism.state
+    roads = WITHOUT_INVERSE_OF_MASS if name in SINGULAR else ROADS
+
+    @jax.jit
+    def solve(q, u, change):
+        y = mb.manifold.project(system, 0.0, mb.State(q, u))
+        jacobian, split = linearize(system, 0.0, y.q, y.u)
+        pairs = [solve_constrained(system, road, 0.0, y.q, y.u, jacobian, split) for road in roads.values()]
+        udot, multipliers = (jnp.stack(values) for values in zip(*pairs, strict=True))
+        left = jax.vmap(lambda udot: system.acceleration_residual(0.0, y.q, y.u, udot))(udot)
+        other = split.basis @ change
+        gauss = [gauss_function(system, 0.0, y.q, y.u, udot[0] + x) for x in (jnp.zeros_like(other), other)]
+        excess = other @ system.inertia(0.0, y.q, y.u).product(other)
+        terms = jacobian @ udot[0], jnp.abs(jacobian) @ jnp.abs(udot[0])
+        return udot, multipliers, left, terms, (jacobian.T @ multipliers[0]) @ y.u, gauss, excess
+
+    largest = lambda values: 1.0 + np.max(np.abs(values), initial=0.0)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        q = state.q + 0.01 * system.coordinate_scale() * jnp.asarray(rng.normal(size=system.nq))
+        u = state.u + jnp.asarray(rng.normal(size=system.nu))
+        change = jnp.asarray(rng.normal(size=system.nu - system.acceleration_rank))
+        udot, multipliers, left, (sums, sizes), power, (least, more), excess = solve(q, u, change)
+        for values in (udot, multipliers):
+            for k, road in enumerate(roads):
+                np.testing.assert_allclose(values[k], values[0], atol=1e-10 * largest(values[0]), err_msg=road)
+        np.testing.assert_allclose(left[0], 0.0, atol=1e-9 * largest(sums))
+        np.testing.assert_allclose(left, 0.0, atol=1e-10 * largest(sizes))
+        # The ideal force of constraints does no work on motions that they allow.
+        if system.homogeneous and system.acceleration_rows == system.velocity_rows:
+            np.testing.assert_allclose(power, 0.0, atol=1e-9 * (1.0 + np.linalg.norm(multipliers[0])))
+        if system.ideal and name not in SINGULAR:
+            np.testing.assert_allclose(more - least, excess, atol=1e-12 * more)
+
+
+MOTIONS = {
+    "parallelogram": {},  # has redundant rows
+    "pendulum": {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Projection()},
+}
+
+
+@pytest.fixture(scope="module")
+def motions():
+    """How to run one motion on either manifold, and where it ends."""
+
+    def by(name, **options):
+        mechanism = mb.mechanisms.get(name)
+        return lambda road: (
+            mb.simulate(mechanism.system, mechanism.state, t1=0.2, rtol=1e-9, formulation=road, **options).ys
+        )
+
+    ways = [by(name, **options) for name, options in MOTIONS.items()]
+    return [(way, way(Partitioned())) for way in ways]
+
+
+@pytest.mark.parametrize("road", [name for name in ROADS if name not in ("partitioned", "multipliers")])
+def test_motions_by_every_formulation(road, motions):
+    for way, expected in motions:
+        end = way(ROADS[road])
+        np.testing.assert_allclose(end.q, expected.q, atol=1e-9)
+        np.testing.assert_allclose(end.u, expected.u, atol=1e-8)
+
+
+def test_unknown_form_is_an_error():
+    with pytest.raises(ValueError, match="moore_penrose"):
+        UdwadiaKalaba("pinv")  # pyright: ignore[reportArgumentType]
