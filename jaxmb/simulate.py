@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State
 from .elimination import full_pivot
-from .formulations import AbstractFormulation, Multipliers, Partitioned
+from .formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned
 from .formulations._base import stages
 from .manifold import AbstractManifold, Free, Partition, Projection, project
 from .manifold.partition import Chart
@@ -68,7 +68,7 @@ def simulate(
         many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion found stiff is
         simulated again, with `Hermite` from `t0` on; not under `jit`, `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
-        `Multipliers()`, which needs no search for pivots.
+        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
         `Projection()` for others, and nothing of either for a system without constraints.
     - `dt0`: first step [s], default chosen from the motion.
@@ -105,7 +105,8 @@ def simulate(
         constrained = Partition() if isinstance(solver, AbstractMultistep) else Projection()
         manifold = Free() if system.acceleration_rows == 0 else constrained
     if formulation is None:
-        formulation = Partitioned() if isinstance(manifold, Partition) else Multipliers()
+        others = Multipliers() if system.regular else NullSpace()
+        formulation = Partitioned() if isinstance(manifold, Partition) else others
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=rtol, atol=atol)

@@ -25,11 +25,13 @@ else:
 class AbstractFormulation(eqx.Module):
     """A road from the matrices of the equation to accelerations and multipliers.
 
+    `inverts_mass` says whether it needs the inverse of the mass matrix, which is not there for every system;
     `partitions` says whether it needs the split in dependent and independent columns; without it only the independent
     rows are needed, and no search for pivots where there is no redundancy.
     """
 
     partitions: AbstractVar[bool]
+    inverts_mass: AbstractVar[bool]
 
     @abc.abstractmethod
     def solve(
@@ -71,7 +73,15 @@ def accelerations(
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ of a system at a state on its constraints."""
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints.
+
+    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
+    """
+    if formulation.inverts_mass and not system.regular:
+        raise ValueError(
+            f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these velocities; "
+            "use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."
+        )
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:

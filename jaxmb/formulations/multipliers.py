@@ -13,6 +13,7 @@ class Multipliers(AbstractFormulation):
     """
 
     partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         A = jacobian[factor.rows]

@@ -25,6 +25,7 @@ class NullSpace(AbstractFormulation):
     """
 
     partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = False
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         split = frame(jacobian[factor.rows].T)

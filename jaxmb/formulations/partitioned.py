@@ -23,6 +23,7 @@ class Partitioned(AbstractFormulation):
     """
 
     partitions: ClassVar[bool] = True
+    inverts_mass: ClassVar[bool] = False
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         particular = factor.correction @ gamma

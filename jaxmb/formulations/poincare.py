@@ -28,6 +28,7 @@ class Poincare(AbstractFormulation):
     """
 
     partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma, factor):
         root = inertia.root()

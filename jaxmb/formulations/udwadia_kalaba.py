@@ -59,6 +59,10 @@ class UdwadiaKalaba(AbstractFormulation):
     def partitions(self) -> bool:
         return self.method == "inverses"
 
+    @property
+    def inverts_mass(self) -> bool:
+        return self.method != "singular_mass"
+
     def solve(self, inertia, force, jacobian, gamma, factor):
         return _FORMS[self.method](inertia, force, jacobian, gamma, factor)
 

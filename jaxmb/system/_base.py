@@ -36,7 +36,7 @@ class AbstractSystem(eqx.Module):
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
     - `acceleration_rows`, `acceleration_rank`: rows of A and the number of independent ones.
-    - `ideal`: whether C is zero.
+    - `ideal`: whether C is zero; `regular`: whether M is positive definite, for motions against constraints as well.
     - `rates_are_velocities`: whether q̇ = u.
     - `linear`: whether ψ is linear in u up to a constant term; `homogeneous`: whether that term is zero.
     - `guess`: a state to begin an assembly with; `length` [m]: the size that residuals of positions are relative to.
@@ -54,6 +54,7 @@ class AbstractSystem(eqx.Module):
     acceleration_rows: AbstractVar[int]
     acceleration_rank: AbstractVar[int]
     ideal: AbstractVar[bool]
+    regular: AbstractVar[bool]
     rates_are_velocities: AbstractVar[bool]
     linear: AbstractVar[bool]
     homogeneous: AbstractVar[bool]

@@ -125,6 +125,10 @@ class RigidBodySystem(AbstractSystem):
         return True
 
     @property
+    def regular(self) -> bool:
+        return True
+
+    @property
     def rates_are_velocities(self) -> bool:
         return not self.spatial
 
