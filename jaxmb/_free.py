@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._names import unknown
 from ._types import VectorLike
-from .system import RigidBodySystem, parameters
+from .system import AbstractSystem, RigidBodySystem, parameters
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -110,15 +110,15 @@ class FreeParameters(eqx.Module):
 
 
 def free_parameters(
-    system: RigidBodySystem,
+    system: AbstractSystem,
     free: Mapping[str, VectorLike] | Sequence[str],
     bounds: Mapping[str, Bounds] | None,
 ) -> FreeParameters:
     """Free parameters with their starting values and ranges.
 
     **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
-    `(low, high)` by name, either of them None. Masses and moments of inertia stay positive, and inertia matrices
-    positive definite, without being told.
+    `(low, high)` by name, either of them None. Masses and moments of inertia of bodies stay positive, and inertia
+    matrices positive definite, without being told.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
     bounds.
@@ -136,24 +136,28 @@ def free_parameters(
     for name in bounds:
         if name not in starts:
             raise unknown("free parameter with bounds", name, starts)
-    ranges = [_range(name, value, known[name], bounds.get(name)) for name, value in starts.items()]
+    of_bodies = isinstance(system, RigidBodySystem)
+    ranges = [
+        _range(name, value, known[name], bounds.get(name), positive=of_bodies and name.endswith((".mass", ".inertia")))
+        for name, value in starts.items()
+    ]
     return FreeParameters(tuple(starts), tuple(ranges))
 
 
-def _range(name: str, start: Any, own: Array, bounds: Bounds | None) -> AbstractRange:
+def _range(name: str, start: Any, own: Array, bounds: Bounds | None, *, positive: bool) -> AbstractRange:
     value = jnp.asarray(start, own.dtype)
     if value.shape != own.shape:
         raise ValueError(f"Parameter {name!r} has shape {own.shape}, got a start of shape {value.shape}.")
     if not np.all(np.isfinite(value)):
         raise ValueError(f"The start of {name!r} must be finite, got {start}.")
-    if name.endswith(".inertia") and value.ndim == 2:
+    if positive and value.ndim == 2:
         if bounds is not None:
             raise ValueError(f"{name!r} is a matrix and stays positive definite; it takes no bounds.")
         if not np.allclose(value, value.T) or np.any(np.linalg.eigvalsh(value) <= 0):
             raise ValueError(f"The start of {name!r} must be a symmetric positive definite matrix.")
         return PositiveDefinite(value)
     if bounds is None:
-        bounds = (0.0, None) if name.endswith((".mass", ".inertia")) else (None, None)
+        bounds = (0.0, None) if positive else (None, None)
     low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
     if np.any(value <= low) or np.any(value >= high):
         raise ValueError(f"The start of {name!r} must lie strictly between {low} and {high}, got {np.asarray(value)}.")

@@ -269,7 +269,8 @@ def _cannot_assemble(system, t, q, fixed, names):
 def _cannot_move(system, t, q, u, fixed, names):
     held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
     residual = np.abs(np.asarray(system.velocity_residual(t, q, u)))
-    rows = sorted({name for (name, _), r in zip(system.rows, residual, strict=True) if r > 1e-9 or not np.isfinite(r)})
+    own = system.rows[: system.velocity_rows]
+    rows = sorted({name for (name, _), r in zip(own, residual, strict=True) if r > 1e-9 or not np.isfinite(r)})
     return (
         f"No velocities satisfy the constraints with the rates {', '.join(held) or '(none)'} fixed: "
         f"{', '.join(rows) or 'the rates are not independent of each other'}. Fix fewer rates, or others."

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from .mechanisms import Mechanism
     from .trajectory import Trajectory
 
-# What `run` does: saved times, tolerances of the table, and the fit of one parameter to the first part of the motion,
-# sampled at some times with noise, from a start that is off.
+# What `run` does: saved times, tolerances of the table, and the fit of one parameter to every other saved time of the
+# first part of the motion, with noise, from a start that is off.
 _TIMES = 401
 _TOLERANCES = (1e-5, 1e-7, 1e-9)
-_FIT_SHARE, _FIT_TIMES, _NOISE, _START = 0.2, 50, 1e-3, 1.1
+_FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,11 +87,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
     trajectory, seconds = _simulate(mechanism, arguments.rtol)
     stats = {name: int(trajectory.stats[name]) for name in ("num_steps", "num_rejected_steps", "num_evaluations")}
-    violation = max(float(trajectory.constraint_violation.position.max()), 0.0)
     print(
         f"Motion over {mechanism.t1:g} s at rtol {arguments.rtol:g}: {stats['num_steps']} steps "
         f"({stats['num_rejected_steps']} rejected), {stats['num_evaluations']} evaluations, "
-        f"{seconds:.1f} s with compiling; largest constraint residual {violation:.1e}."
+        f"{seconds:.1f} s with compiling; {_residuals(trajectory)}."
     )
     _compare(mechanism, trajectory)
 
@@ -100,7 +99,7 @@ def _run(arguments: argparse.Namespace) -> None:
     precision = work_precision(mechanism, chosen, _TOLERANCES)
     print(precision)
 
-    _fit(mechanism, arguments.rtol)
+    _fit(mechanism, trajectory)
 
     out = _folder(arguments)
     trajectory.save(out / "motion.npz")
@@ -155,6 +154,13 @@ def _simulate(mechanism: "Mechanism", rtol: float) -> "tuple[Trajectory, float]"
     return trajectory, time.perf_counter() - begin
 
 
+def _residuals(trajectory: "Trajectory") -> str:
+    if not trajectory.system.velocity_rows:
+        return "no constraints"
+    position, velocity = (float(values.max()) for values in trajectory.constraint_violation)
+    return f"largest constraint residuals {position:.1e} of positions, {velocity:.1e} 1/s of velocities"
+
+
 def _compare(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
     known = mechanism.references
     if known is None:
@@ -168,32 +174,34 @@ def _compare(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
         print(f"  {label:{width}}  {known.values[-1, k]:20.12g}  {error[-1]:.1e}")
 
 
-def _fit(mechanism: "Mechanism", rtol: float) -> None:
+def _fit(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
     """Estimate the parameter that the motion feels most from a noisy sample of it."""
     import numpy as np
 
+    from ._quantities import places, quantity
     from .identify import identify
-    from .simulate import simulate
-    from .system import parameters
+    from .system import RigidBodySystem, parameters
 
     system = mechanism.system
-    ts = np.linspace(0.0, _FIT_SHARE * mechanism.t1, _FIT_TIMES + 1)[1:]
+    saved = np.asarray(trajectory.ts)
+    own = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
+    ts = saved[own]
     name = _most_felt(mechanism, ts)
     if name is None:
         print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
         return
-    motion = simulate(system, mechanism.state, t1=ts[-1], saveat=ts, rtol=rtol)
     random = np.random.default_rng(0)
     measured, sigma = {}, {}
-    for body in system.body_names:
-        exact = np.asarray(motion[body].position)
+    for place in places(system):
+        exact = np.asarray(quantity(trajectory, place))[own]
         noise = _NOISE * np.ptp(exact)
         if noise > 0:
-            measured[f"{body}.position"] = exact + noise * random.standard_normal(exact.shape)
-            sigma[f"{body}.position"] = noise
+            measured[place] = exact + noise * random.standard_normal(exact.shape)
+            sigma[place] = noise
     true = float(parameters(system)[name])
+    what = "positions" if isinstance(system, RigidBodySystem) else "coordinates"
     print(
-        f"\nIdentifying {name} from positions at {ts.size} times up to {ts[-1]:g} s, "
+        f"\nIdentifying {name} from {what} at {ts.size} times up to {ts[-1]:g} s, "
         f"with noise of {_NOISE:.1%} of their range, from a start {_START - 1:.0%} off:"
     )
     start = {name: _START * true}
@@ -211,13 +219,14 @@ def _fit(mechanism: "Mechanism", rtol: float) -> None:
 
 
 def _most_felt(mechanism: "Mechanism", ts) -> str | None:
-    """The scalar parameter, in relative terms, that moves the positions most; None if none does."""
+    """The scalar parameter, in relative terms, that moves positions or coordinates most; None if none does."""
     import diffrax
     import equinox as eqx
     import jax
     import jax.numpy as jnp
     import numpy as np
 
+    from ._quantities import places, quantity
     from .assembly import assemble
     from .simulate import simulate
     from .system import parameters, with_parameters
@@ -234,7 +243,7 @@ def _most_felt(mechanism: "Mechanism", ts) -> str | None:
             start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
             adjoint = diffrax.ForwardMode()
             motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, adjoint=adjoint, throw=False)
-            return jnp.concatenate([motion[body].position.reshape(-1) for body in system.body_names])
+            return jnp.concatenate([quantity(motion, place).reshape(-1) for place in places(system)])
 
         return jax.jacfwd(positions)(jnp.ones(len(known)))
 
@@ -250,14 +259,18 @@ def _folder(arguments: argparse.Namespace) -> Path:
 
 
 def _write_figures(out: Path, precision, trajectory: "Trajectory | None") -> None:
+    from .system import RigidBodySystem
     from .viz import plot_mechanism, plot_motion
 
     try:
         precision.figure(out / "work_precision.png")
         written = [out / "work_precision.png"]
         if trajectory is not None:
-            for name, plot in (("motion.png", plot_motion), ("mechanism.png", plot_mechanism)):
-                plot(trajectory).savefig(out / name, dpi=150)
+            figures = {"motion.png": plot_motion(trajectory)}
+            if isinstance(trajectory.system, RigidBodySystem):
+                figures["mechanism.png"] = plot_mechanism(trajectory)
+            for name, figure in figures.items():
+                figure.savefig(out / name, dpi=150)
                 written.append(out / name)
     except ImportError as error:
         print(error)

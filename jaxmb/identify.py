@@ -15,12 +15,12 @@ from jaxtyping import Array, ArrayLike, Float
 from ._free import Bounds, FreeParameters, free_parameters
 from ._minimise import Minimum, descend, levenberg_marquardt
 from ._names import unknown
+from ._quantities import quantities, quantity
 from ._results import RESULTS
 from ._types import Scalar, State, VectorLike
 from .assembly import assemble
-from .reactions import joint_names
 from .simulate import simulate
-from .system import RigidBodySystem, with_parameters
+from .system import AbstractSystem, with_parameters
 from .trajectory import Trajectory
 
 # A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
@@ -61,7 +61,7 @@ class Identification:
     iterations: int
     success: bool
     message: str
-    system: RigidBodySystem
+    system: AbstractSystem
     state: State
 
     @property
@@ -80,7 +80,7 @@ class Identification:
 
 
 def identify(
-    system: RigidBodySystem,
+    system: AbstractSystem,
     measured: Mapping[str, VectorLike] | None = None,
     *,
     ts: ArrayLike,
@@ -101,11 +101,12 @@ def identify(
 
     **Arguments:**
 
-    - `system`: a compiled scene.
+    - `system`: a compiled scene, or another system.
     - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
         (times, 2)}`. Names are those of `Trajectory[body]` (`position`, `velocity`, `angle`, `orientation`,
-        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). NaN marks a sample that is missing. Angles
-        are compared without wrapping.
+        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`); of a `LagrangianSystem` those of its
+        coordinates and their rates q̇, `"theta"` and `"theta.rate"`, shape (times,). NaN marks a sample that is
+        missing. Angles are compared without wrapping.
     - `ts`: times [s], shape (times,), increasing, from `t0` on.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
         system's values.
@@ -118,8 +119,8 @@ def identify(
     - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
         it every quantity is weighted by its own range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Masses and moments of inertia
-        stay positive, and inertia matrices positive definite, without being told. Unbounded parameters are scaled by
-        their start.
+        of bodies stay positive, and inertia matrices positive definite, without being told; of a `LagrangianSystem` no
+        name means anything. Unbounded parameters are scaled by their start.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
         optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
@@ -171,7 +172,7 @@ class _Measured(eqx.Module):
     def __call__(self, trajectory: Trajectory) -> Float[Array, "residuals"]:
         out = []
         for name, value in self.values.items():
-            difference = (_quantity(trajectory, name) - value) * self.weights[name]
+            difference = (quantity(trajectory, name) - value) * self.weights[name]
             out.append(difference.reshape(-1)[self.present[name]])
         return jnp.concatenate(out)
 
@@ -195,7 +196,7 @@ class _Residual(eqx.Module):
 class _Problem(eqx.Module):
     """Everything that the residuals depend on besides the free parameters."""
 
-    system: RigidBodySystem
+    system: AbstractSystem
     free: FreeParameters
     state: State
     fix: dict[str, Array]
@@ -205,7 +206,7 @@ class _Problem(eqx.Module):
     fit: _Measured | _Residual
     options: dict[str, Any]
 
-    def initial(self, z: Float[Array, "n"]) -> tuple[RigidBodySystem, State]:
+    def initial(self, z: Float[Array, "n"]) -> tuple[AbstractSystem, State]:
         system = with_parameters(self.system, self.free(z))
         state = assemble(system, self.state, fix=self.fix, rates=self.rates, t=self.t0, throw=False)
         return system, state
@@ -227,27 +228,6 @@ class _Problem(eqx.Module):
         residuals = self.fit(trajectory)
         ok = (trajectory.result == RESULTS.successful) & jnp.all(jnp.isfinite(residuals))
         return jnp.where(ok, residuals, jnp.inf), trajectory.result
-
-
-def _quantity(trajectory: Trajectory, name: str) -> Array:
-    part, field = name.rsplit(".", 1)
-    source = trajectory[part] if part in trajectory.system.body_names else trajectory.reactions[part]
-    return getattr(source, field)
-
-
-def _quantities(system: RigidBodySystem, times: int) -> dict[str, tuple[int, ...]]:
-    """Names that can be measured, with their shapes."""
-    d = system.layout.space.dimension
-    spin = (times,) if d == 2 else (times, 3)
-    out = {}
-    for name, rotates in zip(system.body_names, system.layout.rotates, strict=True):
-        out |= {f"{name}.position": (times, d), f"{name}.velocity": (times, d)}
-        if rotates:
-            out |= {f"{name}.angle": (times,)} if d == 2 else {f"{name}.orientation": (times, 4)}
-            out |= {f"{name}.angular_velocity": spin}
-    for name in joint_names(system):
-        out |= {f"{name}.force": (times, d), f"{name}.moment": spin}
-    return out
 
 
 def _times(ts: ArrayLike, t0: Scalar) -> Float[Array, "times"]:
@@ -279,7 +259,7 @@ def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
         return _Residual(residual, jnp.ones((), ts.dtype))
     if not measured:
         raise ValueError("measured is empty: give at least one quantity by name.")
-    known = _quantities(system, ts.shape[0])
+    known = quantities(system, ts.shape[0])
     for name in (*measured, *(sigma or {})):
         if name not in known:
             raise unknown("quantity", name, known)

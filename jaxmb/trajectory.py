@@ -145,6 +145,12 @@ class Trajectory(eqx.Module):
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
 
     @property
+    @eqx.filter_jit
+    def rates(self) -> Float[Array, "times nq"]:
+        """q̇ of every coordinate."""
+        return jax.vmap(lambda t, y: self.system.rates(t, y.q, y.u))(self.ts, self.ys)
+
+    @property
     def accelerations(self) -> Float[Array, "times nu"]:
         """u̇ of every velocity."""
         return self._solved[0]

@@ -1,9 +1,11 @@
 """The command line, run in this process."""
 
+import importlib
 import json
 import subprocess
 import sys
 
+import diffrax
 import pytest
 
 import jaxmb as mb
@@ -28,6 +30,19 @@ def test_run(capsys, tmp_path, monkeypatch):
     assert motion["t"][-1] == 1.0 and motion["bob.position"].shape == (motion["t"].size, 2)
     for name in ("work_precision.png", "motion.png", "mechanism.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
+    """Coordinates take the place of positions, and of the picture of the mechanism."""
+    monkeypatch.setattr("jaxmb.cli._TOLERANCES", (1e-6,))
+    module = importlib.import_module("jaxmb.report.work_precision")
+    monkeypatch.setattr(module, "default_solvers", lambda: {"Dopri8": diffrax.Dopri8()})
+    assert main(["run", "roller_racer", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for text in ("Frame", "no constraints", "DOP853", "Identifying handle from coordinates", "true value 0.2"):
+        assert text in out
+    assert mb.load(tmp_path / "motion.npz")["theta"][-1] == pytest.approx(6.2350455697, abs=1e-6)
+    assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
 
 
 def test_report(capsys, tmp_path):

@@ -12,7 +12,8 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb._free import free_parameters
 from jaxmb._minimise import levenberg_marquardt
-from jaxmb.identify import _quantities, _quantity
+from jaxmb._quantities import quantities, quantity
+from jaxmb.lagrangian import LagrangianSystem
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
@@ -102,8 +103,58 @@ def test_lengths_with_the_state_assembled_anew(system):
 
 
 def test_everything_listed_can_be_measured(system, motion):
-    for name, shape in _quantities(system, TS.size).items():
-        assert eqx.filter_eval_shape(_quantity, motion, name).shape == shape
+    for name, shape in quantities(system, TS.size).items():
+        assert eqx.filter_eval_shape(quantity, motion, name).shape == shape
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """The rod's angle alone, as a Lagrangian system with damping."""
+    return LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * p["length"] ** 2 * (v @ v),
+        potential=lambda t, q, p: -9.81 * p["length"] * jnp.cos(q[0]),
+        force=lambda t, q, v, p: -p["damping"] * v,
+        q=[1.0],
+        coordinates=("theta",),
+        parameters={"length": 0.8, "damping": 0.3},
+    )
+
+
+def test_lagrangian_system(swing):
+    """A coordinate and its rate, measured from an angle and a rate that are given."""
+    held = {"fix": {"theta": 0.5}, "rates": {"theta": 1.0}}
+    motion = mb.simulate(swing, mb.assemble(swing, **held), t1=TS[-1], saveat=TS)
+    measured = {"theta": motion["theta"], "theta.rate": motion.ys.u[:, 0]}
+    fit = mb.identify(swing, measured, ts=TS, free={"length": 1.1, "damping": 0.1}, **held, solver=TSIT5)
+    assert fit.success and fit.components == ("length", "damping")
+    np.testing.assert_allclose(fit.parameters["length"], 0.8, rtol=1e-6)
+    np.testing.assert_allclose(fit.parameters["damping"], 0.3, rtol=1e-5)
+    np.testing.assert_allclose([fit.state.q[0], fit.state.u[0]], [0.5, 1.0])
+    for name, shape in quantities(swing, TS.size).items():
+        assert quantity(motion, name).shape == shape
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"free": ["lenght"]}, "did you mean 'length'"),
+        ({"measured": {"thet": np.zeros(30)}}, "did you mean 'theta'"),
+        ({"measured": {"theta": np.zeros((30, 1))}}, "must have shape"),
+        ({"measured": {"theta.position": np.zeros(30)}}, "Unknown quantity"),
+        ({"fix": {"thet": 0.1}}, "Unknown coordinate 'thet'; did you mean 'theta'"),
+        ({"rates": {"thet": 0.1}}, "Unknown rate 'thet'; did you mean 'theta'"),
+        ({"sigma": {"omega": 1.0}}, "Unknown quantity 'omega'"),
+    ],
+)
+def test_messages_of_a_lagrangian_system(swing, change, message):
+    with pytest.raises(ValueError, match=message):
+        mb.identify(swing, **({"measured": {"theta": np.zeros(30)}, "ts": TS, "free": ["length"]} | change))
+
+
+def test_names_of_a_lagrangian_system_mean_nothing():
+    """A parameter that is called like the mass of a body may be negative."""
+    named = LagrangianSystem(kinetic=lambda t, q, v, p: v @ v, q=[1.0], parameters={"added.mass": 1.0})
+    assert free_parameters(named, {"added.mass": -1.0}, None)(jnp.zeros(1))["added.mass"] == -1.0
 
 
 def test_optax_with_own_residuals_and_bounds(system, motion):

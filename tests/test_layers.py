@@ -23,7 +23,7 @@ LAYERS = [
     ["manifold"],
     ["reactions", "trajectory"],
     ["simulate"],
-    ["_free", "_minimise", "_figure", "mechanisms", "viz"],
+    ["_free", "_minimise", "_figure", "_quantities", "mechanisms", "viz"],
     ["identify", "report"],
     ["cli", "__main__"],
 ]

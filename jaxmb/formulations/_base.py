@@ -79,8 +79,8 @@ def accelerations(
     """
     if formulation.inverts_mass and not system.regular:
         raise ValueError(
-            f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these velocities; "
-            "use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."
+            f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these "
+            "velocities. Use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."
         )
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)

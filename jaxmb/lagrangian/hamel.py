@@ -46,8 +46,8 @@ class Hamel(AbstractEquations):
     def check(self, system):
         if not isinstance(system.kinematics, Frame):
             raise ValueError(f"Hamel's equations need kinematics=Frame(...), got {type(system.kinematics).__name__}.")
-        frame = complete(system.kinematics.columns_of(jnp.zeros(()), system.guess.q, system.parameters))
-        sizes = np.linalg.svd(np.asarray(frame), compute_uv=False)
+        frame = np.asarray(_frame_at(system.kinematics, system.guess.q, system.parameters))
+        sizes = np.linalg.svd(frame, compute_uv=False)
         if not sizes[-1] > 1e-12 * sizes[0]:
             raise ValueError("The frame's columns are not independent at the guess.")
         if callable(self.transposition):
@@ -84,6 +84,11 @@ class Hamel(AbstractEquations):
             return jax.vmap(along, in_axes=1, out_axes=1)(X)
         outside = (jnp.arange(q.size) >= sigma)[:, None]
         return -share * (complete(X) @ jnp.where(outside, structure, jnp.zeros_like(structure)))
+
+
+@eqx.filter_jit
+def _frame_at(frame: Frame, q: Float[Array, "n"], parameters: dict[str, Array]) -> Float[Array, "n n"]:
+    return complete(frame.columns_of(jnp.zeros((), q.dtype), q, parameters))
 
 
 def complete(columns: Float[Array, "n k"]) -> Float[Array, "n n"]:

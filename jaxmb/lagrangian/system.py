@@ -1,7 +1,8 @@
 """Systems given by a Lagrangian."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -11,11 +12,17 @@ from jaxtyping import Array, Float
 from .._types import Scalar, State, VectorLike
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.rigid_bodies import Ranks
-from ._structure import check_functions, check_nonideal, find_ranks, is_diagonal
+from ._structure import count_rows, find_structure
 from .constraints import AbstractConstraint, Holonomic, Pfaffian, check_names, is_linear, is_rheonomic
 from .equations import AbstractEquations, Projected
 from .kinematics import AbstractKinematics, Rates
 from .nonideal import AbstractNonIdeal
+
+if TYPE_CHECKING:
+    from ..system.describe import Description
+
+# What a saved motion holds besides the coordinates.
+_TAKEN = ("t", "q", "u", "energy")
 
 
 class LagrangianSystem(AbstractSystem):
@@ -44,7 +51,7 @@ class LagrangianSystem(AbstractSystem):
     - `equations`: how they are written; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
     - `q`, `u`: a state near the constraints, the guess for `assemble`; ranks are found there. Default u is zero.
     - `parameters`: numbers by name.
-    - `coordinates`: names of the coordinates; default `q0`, `q1`, ….
+    - `coordinates`: names of the coordinates, other than `t`, `q`, `u`, `energy`; default `q0`, `q1`, ….
     - `length`: the size that residuals of positions are relative to.
 
     **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
@@ -63,6 +70,7 @@ class LagrangianSystem(AbstractSystem):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     diagonal: bool = eqx.field(static=True)
+    regular: bool = eqx.field(static=True)
     linear: bool = eqx.field(static=True)
     homogeneous: bool = eqx.field(static=True)
     ranks: Ranks
@@ -107,18 +115,33 @@ class LagrangianSystem(AbstractSystem):
         self.coordinates = tuple(f"q{k}" for k in range(q.size)) if coordinates is None else tuple(coordinates)
         if len(self.coordinates) != q.size or len(set(self.coordinates)) != q.size:
             raise ValueError(f"{q.size} coordinates need as many names, all different; got {self.coordinates}.")
+        taken = [name for name in self.coordinates if name in _TAKEN]
+        if taken:
+            raise ValueError(f"In a saved motion {', '.join(map(repr, taken))} is something else; choose another name.")
 
-        self.sizes = check_functions(self)
-        at = (jnp.zeros((), q.dtype), q, self.rates(jnp.zeros((), q.dtype), q, self.guess.u), self.parameters)
+        self.sizes = count_rows(self)
+        at = (jnp.zeros((), q.dtype), q, q, self.parameters)
         own = [c for c in self.constraints if isinstance(c, AbstractConstraint)]
         self.linear = self.kinematics.linear and all(isinstance(c, Holonomic) or is_linear(c, at) for c in own)
         fixed = lambda c: not is_rheonomic(c, at) if isinstance(c, Holonomic) else _without_drift(c)
         self.homogeneous = self.linear and self.kinematics.homogeneous and all(fixed(c) for c in own)
-        self.diagonal = self.kinematics.identity and is_diagonal(self)
-        self.ranks, self.acceleration_rank = Ranks(0, 0, 0), 0
-        self.ranks, self.acceleration_rank = find_ranks(self)
-        check_nonideal(self)
+        self.diagonal = False
+        self.diagonal, self.regular, self.ranks, self.acceleration_rank = find_structure(self)
         self.equations.check(self)
+
+    def __str__(self) -> str:
+        return str(self.describe())
+
+    def _repr_html_(self) -> str:
+        return self.describe()._repr_html_()
+
+    def describe(self) -> "Description":
+        """Coordinates, velocities, rows of constraints, degrees of freedom, and what was left out; as text and as
+        HTML.
+        """
+        from .describe import describe
+
+        return describe(self)
 
     # Sizes
 
@@ -184,19 +207,6 @@ class LagrangianSystem(AbstractSystem):
 
     def parameter_places(self) -> dict[str, list[tuple[Callable[[Any], Array], int | None]]]:
         return {name: [(_parameter(name), None)] for name in self.parameters}
-
-    def __str__(self) -> str:
-        rows = ", ".join(f"{c.name} ({n})" for c, n in zip(self.constraints, self.sizes, strict=True))
-        lines = [
-            f"Lagrangian system with coordinates {', '.join(self.coordinates)}",
-            f"  velocities: {self.nu}, " + ("rates" if self.kinematics.identity else type(self.kinematics).__name__),
-            f"  constraints (rows): {rows or 'none'}",
-            f"  independent rows: {self.coordinate_rank} of {self.coordinate_rows} between positions, "
-            f"{self.velocity_rank} of {self.velocity_rows} between velocities, {self.acceleration_rank} of "
-            f"{self.acceleration_rows} in all",
-            f"  degrees of freedom: {self.nu - self.velocity_rank}",
-        ]
-        return "\n".join(lines)
 
     # Kinematics
 
@@ -341,10 +351,20 @@ def _without_drift(constraint: AbstractConstraint) -> bool:
 def _lagrangian(lagrangian, kinetic, potential):
     if (lagrangian is None) == (kinetic is None):
         raise ValueError("A LagrangianSystem takes either `lagrangian` or `kinetic`, and `potential` with the latter.")
-    if lagrangian is not None:
-        if potential is not None:
-            raise ValueError("`lagrangian` holds the potential energy already; pass `kinetic` to give it apart.")
-        return lambda t, q, v, p: jnp.reshape(lagrangian(t, q, v, p), ())
-    if potential is None:
-        return lambda t, q, v, p: jnp.reshape(kinetic(t, q, v, p), ())
-    return lambda t, q, v, p: jnp.reshape(kinetic(t, q, v, p) - potential(t, q, p), ())
+    if lagrangian is not None and potential is not None:
+        raise ValueError("`lagrangian` holds the potential energy already; pass `kinetic` to give it apart.")
+    return _Difference(kinetic if lagrangian is None else lagrangian, potential)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Difference:
+    """L = T − V, or L alone; equal for equal functions, so that another system of them is not compiled anew."""
+
+    kinetic: Callable[..., Array]
+    potential: Callable[..., Array] | None
+
+    def __call__(self, t, q, v, parameters):
+        value = self.kinetic(t, q, v, parameters)
+        if self.potential is not None:
+            value = value - self.potential(t, q, parameters)
+        return jnp.reshape(value, ())

@@ -15,6 +15,7 @@ Control, Springer, 2015.
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -24,7 +25,7 @@ Transposition = str | float | Callable[..., Array]
 
 def check_shape(transposition: Callable[..., Array], q: Array, parameters: dict[str, Array]) -> None:
     """Raise a `ValueError` unless a function returns a variation of all rates."""
-    shape = jnp.shape(transposition(jnp.zeros((), q.dtype), q, q, q, parameters))
+    shape = jax.eval_shape(lambda: jnp.asarray(transposition(jnp.zeros((), q.dtype), q, q, q, parameters))).shape
     if shape != q.shape:
         raise ValueError(f"The transposition W(t, q, v, dq, parameters) must have shape {q.shape}, got {shape}.")
 

@@ -23,11 +23,15 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
 
     **Returns:** a matplotlib `Figure`, axes in m.
 
-    **Raises:** `ValueError` for `frames < 1`; `ImportError` without matplotlib.
+    **Raises:** `ValueError` for `frames < 1`, and for a system that has no bodies; `ImportError` without matplotlib.
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}.")
     system = trajectory.system
+    if not isinstance(system, RigidBodySystem):
+        raise ValueError(
+            f"plot_mechanism draws bodies, and a {type(system).__name__} has none; plot_motion shows its coordinates."
+        )
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
     poses = jax.vmap(system.poses)(trajectory.ys.q)

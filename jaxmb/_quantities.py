@@ -1,0 +1,47 @@
+"""What is measured of a motion: quantities by name, with their shapes and values."""
+
+from jaxtyping import Array
+
+from .reactions import joint_names
+from .system import AbstractSystem, RigidBodySystem
+from .trajectory import Trajectory
+
+_RATE = ".rate"
+
+
+def quantities(system: AbstractSystem, times: int) -> dict[str, tuple[int, ...]]:
+    """Names that can be measured at so many times, with their shapes: `"rod.position"` of a body, `"A.force"` of a
+    joint, and of a system with coordinates of the user's `"theta"` and `"theta.rate"`.
+    """
+    if not isinstance(system, RigidBodySystem):
+        names = list(system.coordinate_names())
+        return dict.fromkeys((*names, *(name + _RATE for name in names)), (times,))
+    d = system.layout.space.dimension
+    spin = (times,) if d == 2 else (times, 3)
+    out = {}
+    for name, rotates in zip(system.body_names, system.layout.rotates, strict=True):
+        out |= {f"{name}.position": (times, d), f"{name}.velocity": (times, d)}
+        if rotates:
+            out |= {f"{name}.angle": (times,)} if d == 2 else {f"{name}.orientation": (times, 4)}
+            out |= {f"{name}.angular_velocity": spin}
+    for name in joint_names(system):
+        out |= {f"{name}.force": (times, d), f"{name}.moment": spin}
+    return out
+
+
+def quantity(trajectory: Trajectory, name: str) -> Array:
+    """One of the `quantities` along a motion; axis 0 is time."""
+    system = trajectory.system
+    if not isinstance(system, RigidBodySystem):
+        names = system.coordinate_names()
+        return trajectory[name] if name in names else trajectory.rates[:, names[name.removesuffix(_RATE)][0]]
+    part, field = name.rsplit(".", 1)
+    source = trajectory[part] if part in system.body_names else trajectory.reactions[part]
+    return getattr(source, field)
+
+
+def places(system: AbstractSystem) -> tuple[str, ...]:
+    """The quantities that tell where everything is: positions of the bodies, or all coordinates."""
+    if isinstance(system, RigidBodySystem):
+        return tuple(f"{name}.position" for name in system.body_names)
+    return tuple(system.coordinate_names())

@@ -1,0 +1,199 @@
+"""What is built around systems works for those from a Lagrangian: assembly, descriptions, saved motions, pictures."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import mechanisms
+from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Nonholonomic, Pfaffian, Servo, Viscous
+
+TS = jnp.linspace(0.0, 1.0, 5)
+
+
+def kinetic(t, q, v, p):
+    return 0.5 * p["m"] * (v @ v)
+
+
+def potential(t, q, p):
+    return 9.81 * p["m"] * q[1]
+
+
+def rod(t, q, p):
+    return q[:2] @ q[:2] - p["l"] ** 2
+
+
+def off(t, q, p):
+    return q[2] - 0.1 * jnp.sin(t)
+
+
+def built(**changes):
+    """A mass on a rod, and a third coordinate that follows a sine."""
+    arguments = {
+        "kinetic": kinetic,
+        "potential": potential,
+        "constraints": [Holonomic("rod", rod), Servo("hold", off, 1.0, 1.0)],
+        "nonideal": [Viscous("rod", "c")],
+        "q": [0.6, -0.8, 0.1],
+        "coordinates": ("x", "y", "z"),
+        "parameters": {"m": 1.0, "l": 1.0, "c": 0.1},
+    }
+    return LagrangianSystem(**(arguments | changes))
+
+
+def turning(t, q, p):
+    """Along the circle, and along z."""
+    zero = jnp.zeros_like(q[0])
+    return jnp.stack([jnp.stack([-q[1], q[0], zero]), jnp.stack([zero, zero, 1 + q[0]])], axis=1)
+
+
+@pytest.fixture(scope="module")
+def system():
+    return built()
+
+
+@pytest.fixture(scope="module")
+def framed():
+    """The same mass on its circle, by quasi-velocities."""
+    return built(constraints=[], nonideal=[], kinematics=Frame(turning, 2), u=[1.0, 0.5])
+
+
+@pytest.fixture(scope="module")
+def motion(framed):
+    return mb.simulate(framed, mb.assemble(framed), t1=1.0, saveat=TS, solver=diffrax.Tsit5(), rtol=1e-6)
+
+
+# Construction
+
+
+def test_equal_functions_make_equal_structures(system):
+    """Another system of the same functions runs in programs that are there already."""
+    assert jax.tree.structure(built(parameters={"m": 2.0, "l": 1.1, "c": 0.0})) == jax.tree.structure(system)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"coordinates": ("t", "y", "z")}, "'t' is something else"),
+        ({"coordinates": ("x", "y")}, "need as many names"),
+        ({"kinetic": lambda t, q, v, p: v}, r"lagrangian must have shape|does not fit"),
+        ({"kinetic": lambda t, q, v, p: v[0]}, "finite second derivatives"),
+        ({"force": lambda t, q, v, p: v[:1]}, r"force must have shape \(3,\), got \(1,\)"),
+        ({"constraints": [Pfaffian("rod", lambda t, q, p: jnp.ones((1, 2)))]}, "rod does not fit the system"),
+        ({"constraints": [Holonomic("rod", lambda t, q, p: q @ q + 1)]}, "constraints rod cannot be satisfied"),
+        ({"constraints": [Nonholonomic("rod", lambda t, q, v, p: jnp.sqrt(v[:1]))]}, "rod: its derivative"),
+        ({"constraints": []}, r"a constraint 'rod', but there are \[\]"),
+        (
+            {"constraints": [Holonomic("rod", rod), Holonomic("twin", rod)]},
+            "force of this constraint is not determined",
+        ),
+    ],
+)
+def test_messages_of_construction(changes, message):
+    with pytest.raises(ValueError, match=message):
+        built(**changes)
+
+
+# Assembly
+
+
+@pytest.mark.parametrize(
+    "prescribed, message",
+    [
+        ({"fix": {"xx": 0.3}}, "Unknown coordinate 'xx'; did you mean 'x'"),
+        ({"fix": {"x": [0.3, 0.4]}}, "has 1 components"),
+        ({"rates": {"w": 1.0}}, "there are 'x', 'y', 'z'"),
+        ({"fix": {"x": 1.3}}, r"with x fixed: residuals remain in rod"),
+        ({"fix": {"x": 0.6, "y": 0.8}}, "not independent of each other"),
+        ({"rates": {"x": 0.6, "y": 0.9}}, "rates x, y fixed: rod"),
+    ],
+)
+def test_messages_of_assembly(system, prescribed, message):
+    with pytest.raises(ValueError, match=message):
+        mb.assemble(system, **prescribed)
+
+
+def test_quasi_velocities_are_fixed_by_number(framed):
+    state = mb.assemble(framed, fix={"z": 0.4}, rates={"u1": 3.0})
+    np.testing.assert_allclose(state.q, [0.6, -0.8, 0.4])
+    np.testing.assert_allclose(state.u, [1.0, 3.0])
+    with pytest.raises(ValueError, match="Unknown rate 'z'; there are 'u0', 'u1'"):
+        mb.assemble(framed, rates={"z": 3.0})
+
+
+def test_derivatives_of_assembly(system):
+    """Of y and its rate, where the length and x are given: `y = −√(l² − x²)`."""
+
+    def assembled(length, x):
+        state = mb.assemble(mb.with_parameters(system, {"l": length}), fix={"x": x}, rates={"x": 1.0})
+        return jnp.stack([state.q[1], state.u[1]])
+
+    def known(length, x):
+        y = -jnp.sqrt(length**2 - x**2)
+        return jnp.stack([y, -x / y])
+
+    at = jnp.array(1.1), jnp.array(0.3)
+    expected = jax.jacfwd(known, (0, 1))(*at)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(assembled, (0, 1))(*at), expected, rtol=1e-10)
+
+
+# Words and pictures
+
+
+def test_description(system, framed):
+    text = str(system)
+    for words in (
+        "3 coordinates: x, y, z",
+        "2, of which 2 independent (1 between accelerations only)",
+        "degrees of freedom  2",
+        "Holonomic  rod   1 row",
+        "Servo      hold  1 row",
+        "Viscous  rod",
+        "diagonal mass matrix",
+    ):
+        assert words in text
+    assert "holonomic only" not in text
+    assert "<b>constraints</b>" in system._repr_html_()
+    assert "2, of a Frame" in str(framed) and "no constraints" in str(framed)
+
+
+def test_rates_are_those_of_the_coordinates(framed, motion):
+    expected = [turning(t, y, framed.parameters) @ u for t, y, u in zip(TS, motion.ys.q, motion.ys.u, strict=True)]
+    np.testing.assert_allclose(motion.rates, expected, rtol=1e-12)
+
+
+def test_saved_motion(motion, tmp_path):
+    motion.save(tmp_path / "motion.npz")
+    saved = mb.load(tmp_path / "motion.npz")
+    assert {"t", "q", "u", "x", "y", "z", "energy", "stats.num_steps"} <= set(saved)
+    np.testing.assert_array_equal(saved["y"], motion.ys.q[:, 1])
+
+
+def test_plots(motion):
+    figure = mb.viz.plot_motion(motion, ["z", "x"])
+    coordinate, rate, energy, residual = figure.axes
+    np.testing.assert_array_equal(coordinate.lines[0].get_ydata(), motion["z"])
+    np.testing.assert_array_equal(rate.lines[1].get_ydata(), motion.rates[:, 0])
+    assert [line.get_label() for line in coordinate.lines] == ["z", "x"]
+    assert len(energy.lines) == 3
+    assert not residual.lines and residual.texts[0].get_text() == "no constraints"
+    with pytest.raises(ValueError, match="Unknown coordinate 'w'"):
+        mb.viz.plot_motion(motion, ["w"])
+    with pytest.raises(ValueError, match=r"LagrangianSystem has none; plot_motion"):
+        mb.viz.plot_mechanism(motion)
+
+
+# Projection
+
+
+def test_projection_keeps_wheels_from_slipping():
+    """All coordinates of a cart, projected on its constraints, against its quasi-velocities without any."""
+    free, held = (mechanisms.nonholonomic_cart(form=form) for form in ("frame", "constraints"))
+    end = lambda m: mb.simulate(m.system, m.state, t1=1.0, rtol=1e-9, solver=diffrax.Dopri8())
+    expected, projected = end(free), end(held)
+    np.testing.assert_allclose(projected.ys.q, expected.ys.q, atol=1e-7)
+    np.testing.assert_allclose(projected.ys.u, expected.rates, atol=1e-7)
+    assert np.max(projected.constraint_violation.velocity) <= 1e-12
