@@ -6,7 +6,8 @@ import numpy as np
 
 from .assembly import nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
-from .system.rigid_bodies import Implied, Ranks, RigidBodySystem
+from .system._base import Ranks
+from .system.rigid_bodies import Implied, RigidBodySystem
 
 # Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and
 # between the two it would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
@@ -34,7 +35,7 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     position, velocity = int(found["position rank"]), int(found["everything"].rank)
     coordinate = position + system.coordinate_rows - system.position_rows
     implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
-    return Ranks(position, coordinate, velocity), implied
+    return Ranks(position, coordinate, velocity, velocity), implied
 
 
 @eqx.filter_jit

@@ -19,10 +19,10 @@ from .planar._space import PLANE
 from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
 from .spatial._space import SPACE
 from .system import RigidBodySystem
+from .system._base import Ranks
 from .system.describe import Description
 from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
 from .system.layout import Layout
-from .system.rigid_bodies import Ranks
 
 _BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
 
@@ -98,7 +98,7 @@ class Scene(eqx.Module):
             layout=layout,
             body_names=tuple(body.name for body in self.bodies),
             gravity_name="" if gravity is None else gravity.name,
-            ranks=Ranks(0, 0, 0),
+            ranks=Ranks(0, 0, 0, 0),
             implied=(),
         )
         ranks, implied = find_structure(system)

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from .._names import unknown
 from ..assembly import nearest, residual_size, tolerance
 from ..elimination import full_pivot
-from ..system.rigid_bodies import Ranks
+from ..system._base import Ranks
 from ._dataflow import depends
 from .constraints import AbstractConstraint, Holonomic
 
@@ -56,14 +56,12 @@ class Structure(NamedTuple):
     """What the numbers of a system tell.
 
     **Fields:** `diagonal`: whether the mass matrix is diagonal, and constant; `regular`: whether it is positive
-    definite, in the velocities and at the guess; `ranks`: numbers of independent rows,
-    near the guess on the constraints, and `acceleration_rank`, that of all rows of A.
+    definite, in the velocities and at the guess; `ranks`, near the guess on the constraints.
     """
 
     diagonal: bool
     regular: bool
     ranks: Ranks
-    acceleration_rank: int
 
 
 def find_structure(system: "LagrangianSystem") -> Structure:
@@ -104,7 +102,7 @@ def find_structure(system: "LagrangianSystem") -> Structure:
     diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
     sizes = np.linalg.eigvalsh(found.inertia)
     regular = bool(sizes[0] > np.finfo(q.dtype).eps ** 0.75 * sizes[-1])
-    return Structure(bool(diagonal), regular, Ranks(position, int(found.coordinate_rank), velocity), acceleration)
+    return Structure(bool(diagonal), regular, Ranks(position, int(found.coordinate_rank), velocity, acceleration))
 
 
 class _Numbers(NamedTuple):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, State, VectorLike
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
-from ..system.rigid_bodies import Ranks
+from ..system._base import Ranks
 from ._structure import count_rows, find_structure
 from .constraints import AbstractConstraint, Holonomic, Pfaffian, check_names, is_linear, is_rheonomic
 from .equations import AbstractEquations, Projected
@@ -54,8 +54,8 @@ class LagrangianSystem(AbstractSystem):
     - `coordinates`: names of the coordinates, other than `t`, `q`, `u`, `energy`; default `q0`, `q1`, ….
     - `length`: the size that residuals of positions are relative to.
 
-    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
-    that contradict each other, friction of a constraint that others imply, and names that are not unique.
+    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, positions that
+    cannot satisfy the constraints, constraints on accelerations that contradict others, friction of a constraint that others imply, and names that are not unique.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
@@ -74,7 +74,6 @@ class LagrangianSystem(AbstractSystem):
     linear: bool = eqx.field(static=True)
     homogeneous: bool = eqx.field(static=True)
     ranks: Ranks
-    acceleration_rank: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -126,7 +125,7 @@ class LagrangianSystem(AbstractSystem):
         fixed = lambda c: not is_rheonomic(c, at) if isinstance(c, Holonomic) else _without_drift(c)
         self.homogeneous = self.linear and self.kinematics.homogeneous and all(fixed(c) for c in own)
         self.diagonal = False
-        self.diagonal, self.regular, self.ranks, self.acceleration_rank = find_structure(self)
+        self.diagonal, self.regular, self.ranks = find_structure(self)
         self.equations.check(self)
 
     def __str__(self) -> str:
@@ -171,18 +170,6 @@ class LagrangianSystem(AbstractSystem):
 
     def _rows(self, level):
         return sum(n for c, n in zip(self.constraints, self.sizes, strict=True) if _level(c) <= level)
-
-    @property
-    def position_rank(self) -> int:
-        return self.ranks.position
-
-    @property
-    def coordinate_rank(self) -> int:
-        return self.ranks.coordinate
-
-    @property
-    def velocity_rank(self) -> int:
-        return self.ranks.velocity
 
     @property
     def ideal(self) -> bool:

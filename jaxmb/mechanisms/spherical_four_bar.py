@@ -46,7 +46,7 @@ def spherical_four_bar(
     system = LagrangianSystem(
         kinetic=_kinetic,
         potential=_potential,
-        force=lambda t, q, v, p: jnp.zeros_like(q).at[0].set(p["torque"]),
+        force=_force,
         constraints=[Holonomic("input", _input), Holonomic("output", _output), Holonomic("unit", _unit)],
         q=q,
         parameters={
@@ -138,6 +138,10 @@ def _potential(t, q, p):
         ]
     )
     return p["gravity"] * jnp.dot(p["masses"], heights)
+
+
+def _force(t, q, v, p):
+    return jnp.zeros_like(q).at[0].set(p["torque"])
 
 
 _REFERENCES = References(

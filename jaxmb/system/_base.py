@@ -26,6 +26,15 @@ else:
     from equinox import AbstractVar
 
 
+class Ranks(eqx.Module):
+    """Numbers of independent rows; static. Of Φ along velocities, of `coordinate_residual`, of ψ, and of A."""
+
+    position: int = eqx.field(static=True)
+    coordinate: int = eqx.field(static=True)
+    velocity: int = eqx.field(static=True)
+    acceleration: int = eqx.field(static=True)
+
+
 class AbstractSystem(eqx.Module):
     """A constrained mechanical system; a pytree with every number a leaf and every choice static.
 
@@ -46,13 +55,9 @@ class AbstractSystem(eqx.Module):
     nq: AbstractVar[int]
     nu: AbstractVar[int]
     position_rows: AbstractVar[int]
-    position_rank: AbstractVar[int]
     coordinate_rows: AbstractVar[int]
-    coordinate_rank: AbstractVar[int]
     velocity_rows: AbstractVar[int]
-    velocity_rank: AbstractVar[int]
     acceleration_rows: AbstractVar[int]
-    acceleration_rank: AbstractVar[int]
     ideal: AbstractVar[bool]
     regular: AbstractVar[bool]
     rates_are_velocities: AbstractVar[bool]
@@ -60,6 +65,7 @@ class AbstractSystem(eqx.Module):
     homogeneous: AbstractVar[bool]
     guess: AbstractVar[State]
     length: AbstractVar[Float[Array, ""]]
+    ranks: AbstractVar[Ranks]
     rows: AbstractVar[tuple[tuple[str, int], ...]]
 
     @abc.abstractmethod
@@ -147,6 +153,22 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def potential_energy(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, ""]:
         """Potential energy [J] of gravity and of every conservative force."""
+
+    @property
+    def position_rank(self) -> int:
+        return self.ranks.position
+
+    @property
+    def coordinate_rank(self) -> int:
+        return self.ranks.coordinate
+
+    @property
+    def velocity_rank(self) -> int:
+        return self.ranks.velocity
+
+    @property
+    def acceleration_rank(self) -> int:
+        return self.ranks.acceleration
 
     @property
     def plain(self) -> bool:

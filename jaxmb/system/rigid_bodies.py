@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..rotations import cross, rotate
-from ._base import AbstractSystem
+from ._base import AbstractSystem, Ranks
 from .coordinates import coordinate_names, rate_names
 from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
@@ -20,14 +20,6 @@ from .places import parameter_places
 
 if TYPE_CHECKING:
     from .describe import Description
-
-
-class Ranks(eqx.Module):
-    """Numbers of independent rows; static."""
-
-    position: int = eqx.field(static=True)
-    coordinate: int = eqx.field(static=True)
-    velocity: int = eqx.field(static=True)
 
 
 class Implied(NamedTuple):
@@ -101,24 +93,8 @@ class RigidBodySystem(AbstractSystem):
         return self.position_rows + sum(len(g.group.names) * g.rows for g in self.velocity_constraints)
 
     @property
-    def position_rank(self) -> int:
-        return self.ranks.position
-
-    @property
-    def coordinate_rank(self) -> int:
-        return self.ranks.coordinate
-
-    @property
-    def velocity_rank(self) -> int:
-        return self.ranks.velocity
-
-    @property
     def acceleration_rows(self) -> int:
         return self.velocity_rows
-
-    @property
-    def acceleration_rank(self) -> int:
-        return self.velocity_rank
 
     @property
     def ideal(self) -> bool:
