@@ -6,16 +6,15 @@ from .reactions import joint_names
 from .system import AbstractSystem, RigidBodySystem
 from .trajectory import Trajectory
 
-_RATE = ".rate"
-
 
 def quantities(system: AbstractSystem, times: int) -> dict[str, tuple[int, ...]]:
     """Names that can be measured at so many times, with their shapes: `"rod.position"` of a body, `"A.force"` of a
-    joint, and of a system with coordinates of the user's `"theta"` and `"theta.rate"`.
+    joint, and of a system with coordinates of the user's `"theta"`, `"theta.rate"`, and `"A.force"` of a constraint.
     """
     if not isinstance(system, RigidBodySystem):
         names = list(system.coordinate_names())
-        return dict.fromkeys((*names, *(name + _RATE for name in names)), (times,))
+        forces = {f"{name}.force": (times, system.nu) for name in joint_names(system)}
+        return dict.fromkeys((*names, *(f"{name}.rate" for name in names)), (times,)) | forces
     d = system.layout.space.dimension
     spin = (times,) if d == 2 else (times, 3)
     out = {}
@@ -32,10 +31,12 @@ def quantities(system: AbstractSystem, times: int) -> dict[str, tuple[int, ...]]
 def quantity(trajectory: Trajectory, name: str) -> Array:
     """One of the `quantities` along a motion; axis 0 is time."""
     system = trajectory.system
-    if not isinstance(system, RigidBodySystem):
-        names = system.coordinate_names()
-        return trajectory[name] if name in names else trajectory.rates[:, names[name.removesuffix(_RATE)][0]]
+    names = system.coordinate_names()
+    if not isinstance(system, RigidBodySystem) and name in names:
+        return trajectory[name]
     part, field = name.rsplit(".", 1)
+    if not isinstance(system, RigidBodySystem):
+        return trajectory.rates[:, names[part][0]] if field == "rate" else trajectory.constraint_forces[part]
     source = trajectory[part] if part in system.body_names else trajectory.reactions[part]
     return getattr(source, field)
 

@@ -104,9 +104,9 @@ def identify(
     - `system`: a compiled scene, or another system.
     - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
         (times, 2)}`. Names are those of `Trajectory[body]` (`position`, `velocity`, `angle`, `orientation`,
-        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`); of a `LagrangianSystem` those of its
-        coordinates and their rates q̇, `"theta"` and `"theta.rate"`, shape (times,). NaN marks a sample that is
-        missing. Angles are compared without wrapping.
+        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has coordinates and
+        their rates q̇, `"theta"` and `"theta.rate"`, shape (times,), and generalized forces of its constraints,
+        `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without wrapping.
     - `ts`: times [s], shape (times,), increasing, from `t0` on.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
         system's values.

@@ -1,6 +1,7 @@
 """What is built around systems works for those from a Lagrangian: assembly, descriptions, saved motions, pictures."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import mechanisms
+from jaxmb._quantities import quantities, quantity
 from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Nonholonomic, Pfaffian, Servo, Viscous
 
 TS = jnp.linspace(0.0, 1.0, 5)
@@ -197,3 +199,5 @@ def test_projection_keeps_wheels_from_slipping():
     np.testing.assert_allclose(projected.ys.q, expected.ys.q, atol=1e-7)
     np.testing.assert_allclose(projected.ys.u, expected.rates, atol=1e-7)
     assert np.max(projected.constraint_violation.velocity) <= 1e-12
+    for name, shape in quantities(held.system, 1).items():
+        assert eqx.filter_eval_shape(quantity, projected, name).shape == shape
