@@ -54,8 +54,9 @@ class LagrangianSystem(AbstractSystem):
     - `coordinates`: names of the coordinates, other than `t`, `q`, `u`, `energy`; default `q0`, `q1`, ….
     - `length`: the size that residuals of positions are relative to.
 
-    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, positions that
-    cannot satisfy the constraints, constraints on accelerations that contradict others, friction of a constraint that others imply, and names that are not unique.
+    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
+    that no positions satisfy near the guess, constraints on accelerations that contradict others, friction of a
+    constraint that others imply, and names that are not unique.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
