@@ -58,8 +58,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
     run.set_defaults(command=_run)
 
-    report = commands.add_parser("report", help="measure error against run time for several solvers")
-    report.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
+    report = commands.add_parser(
+        "report", help="measure error against run time for several solvers, or what each formulation costs"
+    )
+    report.add_argument(
+        "mechanism", nargs="+", help="a name from `jaxmb mechanisms`; after the word `formulations`, the cost of those"
+    )
     report.add_argument("--tolerances", type=float, nargs="+", metavar="RTOL", help="default 1e-4 1e-6 1e-8 1e-10")
     report.add_argument("--repeats", type=int, default=5, help="timed runs of each solver (default %(default)d)")
     report.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
@@ -108,8 +112,16 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    from .report import work_precision
+    from .report import formulation_costs, work_precision
 
+    *words, arguments.mechanism = arguments.mechanism
+    if words not in ([], ["formulations"]):
+        raise ValueError(
+            f"A report is of one mechanism, or of `formulations` and one; got {' '.join(words)!r} before it."
+        )
+    if words:
+        print(formulation_costs(_mechanism(arguments), repeats=arguments.repeats))
+        return
     mechanism = _mechanism(arguments)
     precision = work_precision(mechanism, tolerances=arguments.tolerances, repeats=arguments.repeats)
     print(precision)

@@ -60,6 +60,7 @@ def test_report(capsys, tmp_path):
         (["report", "pendulm"], "did you mean 'pendulum'"),
         (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
         (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
+        (["report", "costs", "pendulum"], "got 'costs' before it"),
     ],
 )
 def test_wrong_words(words, message, capsys, tmp_path):

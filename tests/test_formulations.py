@@ -1,5 +1,7 @@
 """Every road to the same accelerations: on matrices against NumPy, on the library's mechanisms against each other."""
 
+from typing import ClassVar
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 import jaxmb as mb
 from jaxmb.elimination import factor, full_pivot
 from jaxmb.formulations import (
+    AbstractFormulation,
     Multipliers,
     NullSpace,
     Partitioned,
@@ -200,8 +203,6 @@ def test_roots_of_mass_matrices():
 
 
 LIBRARY = {name: {"n": 5} if name == "rod_chain" else {} for name in mb.mechanisms.names()}
-# Euler parameters and their rates as they are, with a mass matrix that is singular along them.
-SINGULAR = {"spherical_four_bar"}
 
 
 @pytest.mark.parametrize("name", LIBRARY)
@@ -209,7 +210,7 @@ def test_formulations_agree(name):
     """Accelerations and multipliers from every road, at random states on the constraints, are those of least effort."""
     mechanism = mb.mechanisms.get(name, **LIBRARY[name])
     system, state = mechanism.system, mechanism.state
-    roads = WITHOUT_INVERSE_OF_MASS if name in SINGULAR else ROADS
+    roads = ROADS if system.regular else WITHOUT_INVERSE_OF_MASS
 
     @jax.jit
     def solve(q, u, change):
@@ -239,7 +240,7 @@ def test_formulations_agree(name):
         # The ideal force of constraints does no work on motions that they allow.
         if system.homogeneous and system.acceleration_rows == system.velocity_rows:
             np.testing.assert_allclose(power, 0.0, atol=1e-9 * (1.0 + np.linalg.norm(multipliers[0])))
-        if system.ideal and name not in SINGULAR:
+        if system.ideal and system.regular:
             np.testing.assert_allclose(more - least, excess, atol=1e-12 * more)
 
 
@@ -274,3 +275,33 @@ def test_motions_by_every_formulation(road, motions):
 def test_unknown_form_is_an_error():
     with pytest.raises(ValueError, match="moore_penrose"):
         UdwadiaKalaba("pinv")  # pyright: ignore[reportArgumentType]
+
+
+# One of your own
+
+
+class SaddlePoint(AbstractFormulation):
+    """Accelerations and multipliers at once, from the matrix of both."""
+
+    partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = False
+
+    def solve(self, inertia, force, jacobian, gamma, factor):
+        A = jacobian[factor.rows]
+        m, n = A.shape
+        mass = inertia.product(jnp.eye(n))
+        both = jnp.concatenate([jnp.concatenate([mass, -A.T], axis=1), jnp.concatenate([A, jnp.zeros((m, m))], axis=1)])
+        solution = jnp.linalg.solve(both, jnp.concatenate([force, gamma[factor.rows]]))
+        return solution[:n], factor.spread(solution[n:])
+
+
+def test_a_formulation_of_ones_own(motions):
+    for way, expected in motions:
+        np.testing.assert_allclose(way(SaddlePoint()).q, expected.q, atol=1e-9)
+
+
+def test_formulations_that_need_the_inverse_of_a_singular_mass_matrix_are_refused():
+    mechanism = mb.mechanisms.get("spherical_four_bar")
+    for road in (Multipliers(), Poincare(), UdwadiaKalaba()):
+        with pytest.raises(ValueError, match="NullSpace"):
+            mb.formulations.accelerations(mechanism.system, road, 0.0, mechanism.state.q, mechanism.state.u)

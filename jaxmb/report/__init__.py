@@ -1,4 +1,10 @@
-"""What accuracy costs: error against run time and evaluations."""
+"""What accuracy costs: error against run time and evaluations; and what each formulation does."""
 
+from .formulations import (
+    Cost as Cost,
+    FormulationCosts as FormulationCosts,
+    every_formulation as every_formulation,
+    formulation_costs as formulation_costs,
+)
 from .timing import interleaved as interleaved, timed_compile as timed_compile
 from .work_precision import Run as Run, WorkPrecision as WorkPrecision, work_precision as work_precision

@@ -1,0 +1,162 @@
+"""What the roads to accelerations cost, side by side on one mechanism."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .._types import State
+from ..elimination import Order, factor, full_pivot
+from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
+from ..formulations._base import every_row, solve_constrained, stages
+from ..mechanisms import Mechanism
+from ..system import AbstractSystem
+from .timing import interleaved
+
+# So many evaluations after each other are one timed run.
+_LENGTH = 200
+
+
+def every_formulation() -> dict[str, AbstractFormulation]:
+    """All of them, with their options, by name."""
+    return {
+        "Partitioned": Partitioned(),
+        "Multipliers": Multipliers(),
+        "NullSpace": NullSpace(),
+        "Poincare": Poincare(),
+        "UdwadiaKalaba": UdwadiaKalaba(),
+        "UdwadiaKalaba, inverses": UdwadiaKalaba("inverses"),
+        "UdwadiaKalaba, singular mass": UdwadiaKalaba("singular_mass"),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """One formulation.
+
+    **Fields:** times of one evaluation of all accelerations, with the Jacobian and its factor in a given order [s]:
+    `evaluation`, `forward` with its derivative along one direction, `reverse` with its gradient; `lines` of HLO of the
+    three, before XLA optimises; `deviation` of the accelerations from those of the first formulation, relative to the
+    largest.
+    """
+
+    formulation: str
+    evaluation: float
+    forward: float
+    reverse: float
+    lines: tuple[int, int, int]
+    deviation: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FormulationCosts:
+    """What `formulation_costs` returns; `print` shows a table."""
+
+    mechanism: str
+    costs: tuple[Cost, ...]
+
+    def __str__(self) -> str:
+        head = (
+            "formulation",
+            "evaluation [µs]",
+            "forward",
+            "reverse",
+            "lines of HLO",
+            "forward",
+            "reverse",
+            "deviation",
+        )
+        rows = [head, *map(_cells, self.costs)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+        return "\n".join([f"{self.mechanism}: accelerations at its start, by every formulation", *map(text, rows)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists, for JSON."""
+        return dataclasses.asdict(self)
+
+
+def _cells(cost: Cost) -> tuple[str, ...]:
+    times = (f"{1e6 * time:.2f}" for time in (cost.evaluation, cost.forward, cost.reverse))
+    return (cost.formulation, *times, *map(str, cost.lines), f"{cost.deviation:.0e}")
+
+
+def formulation_costs(
+    mechanism: Mechanism, formulations: Mapping[str, AbstractFormulation] | None = None, *, repeats: int = 5
+) -> FormulationCosts:
+    """Time accelerations by several formulations, and their derivatives with respect to the state.
+
+    Each evaluation depends on the one before, as in a motion, and eliminates in the order of one chart; those of all
+    formulations are timed in turns.
+
+    **Arguments:** `formulations` by name, default all that the mechanism's mass matrix allows; `repeats`: timed runs of
+    each, of which the shortest counts.
+
+    **Raises:** `ValueError` for a mechanism without constraints, where there is nothing to choose.
+    """
+    system, state = mechanism.system, mechanism.state
+    if system.acceleration_rows == 0:
+        raise ValueError(f"{mechanism.name!r} has no constraints: its accelerations are M⁻¹F by any formulation.")
+    every = every_formulation() if formulations is None else dict(formulations)
+    chosen = {name: road for name, road in every.items() if system.regular or not road.inverts_mass}
+    if not chosen:
+        raise ValueError(f"The mass matrix of {mechanism.name!r} is singular; no formulation was given that allows it.")
+    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), stage=stages(system))
+
+    modes = (_evaluated, _forward, _reverse)
+    lines: dict[str, tuple[int, int, int]] = {}
+    runs, accelerations = [], {}
+    for name, road in chosen.items():
+        solve = lambda y, road=road: _accelerations(system, road, y, pivots.order)
+        accelerations[name] = np.asarray(eqx.filter_jit(solve)(state))
+        programs = [mode(solve) for mode in modes]
+        value, forward, reverse = (len(jax.jit(p).lower(state).as_text().splitlines()) for p in programs)
+        lines[name] = value, forward, reverse
+        runs += [functools.partial(jax.jit(_repeated(p)), state) for p in programs]
+    times = [min(own) / _LENGTH for own in interleaved(runs, repeats)]
+    first = next(iter(accelerations.values()))
+    size = max(float(np.max(np.abs(first))), float(np.finfo(first.dtype).tiny))
+    costs = []
+    for k, name in enumerate(chosen):
+        deviation = float(np.max(np.abs(accelerations[name] - first))) / size
+        evaluation, forward, reverse = times[3 * k : 3 * k + 3]
+        costs.append(Cost(name, evaluation, forward, reverse, lines[name], deviation))
+    return FormulationCosts(mechanism.name, tuple(costs))
+
+
+def _accelerations(system: AbstractSystem, road: AbstractFormulation, y: State, order: Order):
+    t = jnp.zeros((), y.q.dtype)
+    jacobian = system.jacobian(t, y.q, y.u)
+    if road.partitions or system.acceleration_rank < system.acceleration_rows:
+        split = factor(jacobian, order, system.acceleration_rank)
+    else:
+        split = every_row(system.acceleration_rows, system.nu, y.q.dtype)
+    return solve_constrained(system, road, t, y.q, y.u, jacobian, split)[0]
+
+
+def _evaluated(solve: Callable[[State], Any]):
+    return solve
+
+
+def _forward(solve: Callable[[State], Any]):
+    return lambda y: jax.jvp(solve, (y,), (jax.tree.map(jnp.ones_like, y),))
+
+
+def _reverse(solve: Callable[[State], Any]):
+    return jax.grad(lambda y: jnp.sum(solve(y)))
+
+
+def _repeated(program: Callable[[State], Any]):
+    """So many times, each from a state that the result before has moved by less than rounding shows."""
+
+    def step(_, y):
+        moved = sum(jnp.sum(x) for x in jax.tree.leaves(program(y)))
+        return jax.tree.map(lambda x: x + jnp.finfo(x.dtype).tiny * moved, y)
+
+    return lambda y: lax.fori_loop(0, _LENGTH, step, y)
