@@ -43,7 +43,7 @@ def simulate(
     formulation: AbstractFormulation | None = None,
     manifold: AbstractManifold | None = None,
     rtol: Scalar = 1e-8,
-    atol: Scalar | None = None,
+    atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     event: diffrax.Event | None = None,
@@ -59,7 +59,10 @@ def simulate(
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
     - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
         `Trajectory.at(t)`.
-    - `rtol`, `atol`: tolerances of the error of one step; `atol` defaults to `rtol` times one hundredth.
+    - `rtol`, `atol`: tolerances of the error of one step; `atol` defaults to `rtol` times one hundredth. It may be a
+        vector of one for each coordinate and velocity, (nq + nu,): where stiff springs vibrate too little to matter in
+        positions, a coarser one for velocities saves most of the steps (`stiff_four_bar` to a position error of 1e-6:
+        93 steps of `Hermite` with 1e-3 m/s and rad/s instead of 1989).
 
     **Other arguments, rarely needed:**
 
