@@ -305,3 +305,5 @@ def test_formulations_that_need_the_inverse_of_a_singular_mass_matrix_are_refuse
     for road in (Multipliers(), Poincare(), UdwadiaKalaba()):
         with pytest.raises(ValueError, match="NullSpace"):
             mb.formulations.accelerations(mechanism.system, road, 0.0, mechanism.state.q, mechanism.state.u)
+        with pytest.raises(ValueError, match="NullSpace"):
+            mb.simulate(mechanism.system, mechanism.state, t1=1.0, formulation=road)

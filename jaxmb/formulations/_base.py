@@ -66,6 +66,15 @@ def stages(system: AbstractSystem) -> Array:
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
 
 
+def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None:
+    """Raise a `ValueError` for a formulation that needs the inverse of a mass matrix that is singular."""
+    if formulation.inverts_mass and not system.regular:
+        raise ValueError(
+            f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these "
+            "velocities. Use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."
+        )
+
+
 def accelerations(
     system: AbstractSystem,
     formulation: AbstractFormulation,
@@ -77,11 +86,7 @@ def accelerations(
 
     **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
     """
-    if formulation.inverts_mass and not system.regular:
-        raise ValueError(
-            f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these "
-            "velocities. Use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."
-        )
+    check_mass(system, formulation)
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:

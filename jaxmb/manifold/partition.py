@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import State
 from ..elimination import factor, full_pivot
 from ..formulations import AbstractFormulation
-from ..formulations._base import stages
+from ..formulations._base import check_mass, stages
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
@@ -76,6 +76,7 @@ class Partition(AbstractManifold):
                 f"Partition needs a solver that knows charts (Adams or Hermite), got {type(solver).__name__}; use "
                 "manifold=Projection() with it."
             )
+        check_mass(system, formulation)
         least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
         tol = jnp.clip(1e-3 * rtol, least, 1e-6) if self.newton_tol is None else jnp.asarray(self.newton_tol)
         return PartitionTerm(system, formulation, self.max_influence, tol), solver

@@ -117,6 +117,23 @@ def test_transpositional_relations_do_not_matter(name, form):
             np.testing.assert_allclose(again, expected, atol=1e-12 * size)
 
 
+def test_derivatives_of_equations_written_in_another_way():
+    """Forward and reverse, with respect to state and parameters, are those of the projected equations."""
+    forms = {"frame": Hamel("suslov"), "connection": Voronets("holder")}
+    for form, equations in forms.items():
+        found = []
+        for system in rewritten("roller_racer", form, equations):
+
+            def solve(numbers, system=system):
+                changed = mb.with_parameters(system, {"pivot": numbers[2]})
+                return accelerations(changed, Partitioned(), ZERO, numbers[0], numbers[1])[0]
+
+            numbers = STATE[0], STATE[1], system.parameters["pivot"]
+            found += [jax.jit(jax.jacfwd(solve))(numbers), jax.jit(jax.jacrev(solve))(numbers)]
+        for other in found[1:]:
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.max(np.abs(b))), other, found[0])
+
+
 def test_the_snake_in_a_frame_as_well():
     """Hamel-Voronets: the base's frame, moved along by the connection."""
     system = library("three_platform_snake").system
