@@ -13,8 +13,14 @@ from . import (
 )
 from ._forces import Gravity as Gravity
 from ._results import RESULTS as RESULTS
+from ._servo import Servo as Servo
 from ._types import State as State
-from ._user import Constraint as Constraint, Force as Force, VelocityConstraint as VelocityConstraint
+from ._user import (
+    Constraint as Constraint,
+    Force as Force,
+    NonIdeal as NonIdeal,
+    VelocityConstraint as VelocityConstraint,
+)
 from .assembly import assemble as assemble
 from .identify import Identification as Identification, identify as identify
 from .scene import Scene as Scene

@@ -9,6 +9,7 @@ import abc
 from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -113,3 +114,37 @@ class AbstractForce(AbstractLink):
         """Potential energy [J]; zero for a part without one."""
         del space, t
         return jnp.zeros((), poses.dtype)
+
+
+class AbstractNonIdeal(AbstractPart):
+    """What a joint does beyond d'Alembert's principle: forces that work in the motions it allows.
+
+    `joint` is its name. They may depend on the joint's own reactions, those that it would exert if all joints were
+    ideal; what of them the joint does not allow to move has no effect.
+    """
+
+    joint: AbstractVar[str]
+
+    def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
+        """The same part with every number filled in, from its joint and the poses of the joint's bodies."""
+        del space, joint, poses
+        return self
+
+    @abc.abstractmethod
+    def wrenches(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: Scalar
+    ) -> Wrenches:
+        """The wrench on each of the joint's bodies; `reactions`: what the ideal joint does to them."""
+
+
+def rows_of(part: AbstractConstraint | AbstractVelocityConstraint, space: AbstractSpace, poses: Poses) -> Array:
+    """Derivative of a constraint's rows with respect to the velocities of its bodies, (rows, k, velocity size)."""
+    velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
+    if isinstance(part, AbstractVelocityConstraint):
+        return jax.jacfwd(lambda v: part.residual(space, poses, v, jnp.zeros((), poses.dtype)))(velocities)
+
+    def rate(v):
+        rates = jax.vmap(space.rates)(poses, v)
+        return jax.jvp(lambda x: part.residual(space, x, jnp.zeros((), poses.dtype)), (poses,), (rates,))[1]
+
+    return jax.jacfwd(rate)(velocities)

@@ -35,7 +35,8 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     position, velocity = int(found["position rank"]), int(found["everything"].rank)
     coordinate = position + system.coordinate_rows - system.position_rows
     implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
-    return Ranks(position, coordinate, velocity, velocity), implied
+    _check_determined(system, implied)
+    return Ranks(position, coordinate, velocity, int(found["acceleration rank"])), implied
 
 
 @eqx.filter_jit
@@ -59,17 +60,26 @@ def _analyse(system):
         "velocities": (jnp.zeros(0), jnp.zeros(0)),
         "accelerations": (jnp.zeros(0), jnp.zeros(0)),
     }
-    if system.velocity_rows and system.linear and not system.homogeneous:
+    out["acceleration rank"] = out["everything"].rank
+    if system.servos:
+        out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
+    if system.linear and (system.servos or not system.homogeneous):
         # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is
         # contradiction.
-        inverse = scale[:, None] * jnp.linalg.pinv(jacobian * scale[None, :], rtol=1e-8)
-        solve = lambda b: -(inverse @ b)
-        asked = system.velocity_residual(t, q, jnp.zeros_like(u))
-        u = solve(asked)
-        out["velocities"] = jacobian @ u + asked, asked
+        if system.velocity_rows:
+            asked = system.velocity_residual(t, q, u)
+            change, left = _least_squares(jacobian, scale, asked)
+            out["velocities"] = left, asked
+            u = u + change
         asked = system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-        out["accelerations"] = jacobian @ solve(asked) + asked, asked
+        out["accelerations"] = _least_squares(system.jacobian(t, q, u), scale, asked)[1], asked
     return out
+
+
+def _least_squares(jacobian, scale, asked):
+    """The smallest solution x of `jacobian x + asked = 0`, and what it leaves over."""
+    x = -scale * (jnp.linalg.pinv(jacobian * scale[None, :], rtol=1e-8) @ asked)
+    return x, jacobian @ x + asked
 
 
 def _check_left_over(system, what, left, asked):
@@ -124,6 +134,18 @@ def _connected(system):
         if mine and not any(driven for _, driven in mine):
             out.append((bodies, [r for rows, _ in mine for r in rows]))
     return out
+
+
+def _check_determined(system, implied):
+    """Refuse laws of joints whose force is not determined."""
+    for g in system.nonideal:
+        for name, joint in zip(g.group.names, g.joints, strict=True):
+            others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
+            if others:
+                raise ValueError(
+                    f"{type(g.group.part).__name__} {name!r} needs the force of {joint!r}, which is not determined: "
+                    f"rows of {', '.join(sorted(others))} imply one another. Leave the redundant ones out."
+                )
 
 
 def _implied(system, jacobian, order, rank):

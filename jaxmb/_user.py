@@ -1,4 +1,6 @@
-"""Parts written by the user as a function: constraints between positions, between velocities, and forces."""
+"""Parts written by the user as a function: constraints between positions, between velocities, forces, and what joints
+do beyond d'Alembert's principle.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._parts import AbstractConstraint, AbstractForce, AbstractVelocityConstraint, number
+from ._parts import AbstractConstraint, AbstractForce, AbstractNonIdeal, AbstractVelocityConstraint, number
 
 
 def names(bodies: Any) -> tuple[str, ...]:
@@ -92,3 +94,29 @@ class Force(AbstractForce):
     def energy(self, space, poses, t):
         assert self.potential is not None
         return jnp.reshape(self.potential(poses[:, : space.pose_size], t, self.parameters), ())
+
+
+class NonIdeal(AbstractNonIdeal):
+    """What a joint does beyond d'Alembert's principle, from a function,
+    `function(poses, velocities, reactions, t, parameters) -> wrenches`.
+
+    **Arguments:**
+
+    - `joint`: the name of a joint whose force is determined: no other joint may imply any of its rows.
+    - `function`: takes and returns what that of a `Force` does, with a row for each of the joint's bodies, and
+        `reactions`: the wrenches that the joint would exert on them if all joints were ideal, in the same axes. What
+        its wrenches do in motions that the joints do not allow has no effect.
+    - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
+
+    Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",
+    Proc. R. Soc. A 463, 2007.
+    """
+
+    name: str = eqx.field(static=True)
+    joint: str = eqx.field(static=True)
+    function: Callable[..., Array] = eqx.field(static=True)
+    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+
+    def wrenches(self, space, poses, velocities, reactions, t):
+        value = self.function(poses[:, : space.pose_size], velocities, reactions, t, self.parameters)
+        return jnp.reshape(value, reactions.shape)

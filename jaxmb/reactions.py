@@ -41,7 +41,7 @@ def reaction(system: RigidBodySystem, name: str, t: Scalar, y: State, multiplier
     """Reaction of one joint at one state from the multipliers of all rows."""
     poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
     row, force, moment, own = 0, 0.0, 0.0, []
-    for group in (*system.constraints, *system.velocity_constraints):
+    for group in system.joints:
         if name in group.group.names:
             k = group.group.names.index(name)
             values = multipliers[row + k * group.rows : row + (k + 1) * group.rows]

@@ -4,14 +4,22 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ._forces import Gravity
 from ._names import unknown
-from ._parts import GROUND, AbstractConstraint, AbstractForce, AbstractLink, AbstractVelocityConstraint
+from ._parts import (
+    GROUND,
+    AbstractConstraint,
+    AbstractForce,
+    AbstractLink,
+    AbstractNonIdeal,
+    AbstractVelocityConstraint,
+    rows_of,
+)
 from ._resolve import label, vector
+from ._servo import Servo
 from ._structure import find_structure
 from ._types import State
 from .planar import Body as PlanarBody, PointMass as PlanarPointMass
@@ -21,7 +29,7 @@ from .spatial._space import SPACE
 from .system import RigidBodySystem
 from .system._base import Ranks
 from .system.describe import Description
-from .system.groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup, stack
+from .system.groups import ConstraintGroup, ForceGroup, NonIdealGroup, VelocityConstraintGroup, servo_group, stack
 from .system.layout import Layout
 
 _BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
@@ -34,8 +42,8 @@ class Scene(eqx.Module):
     velocities, in any order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    among them drivers and rolling; `forces`: force elements and at most one `Gravity`. `"ground"` names the fixed
-    world.
+    among them drivers, rolling, and programs of a `Servo`; `forces`: force elements, the friction of joints, and at
+    most one `Gravity`. `"ground"` names the fixed world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
@@ -72,26 +80,34 @@ class Scene(eqx.Module):
         )
         given = jnp.concatenate([guess.q, jnp.asarray(space.ground, guess.q.dtype)])[layout.pose_index]
 
-        gravity, parts = None, []
+        gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):
             if isinstance(part, Gravity):
                 gravity = part
                 vector(part, "acceleration", part.acceleration, space.dimension)
                 continue
-            own = tuple(index[name] for name in part.bodies)
             _check_finite(part)
+            if isinstance(part, AbstractNonIdeal):
+                joint, own = joints[part.joint]
+                laws.append((part.resolve(space, joint, given[np.array(own)]), own))
+                continue
+            own = tuple(index[name] for name in part.bodies)
             poses = given[np.array(own)]
             resolved = part.resolve(space, poses)
             _check_rotation(resolved, own, layout, poses)
+            joints[part.name] = resolved, own
             parts += [(component, own) for component in resolved.components()]
 
         kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
+        of_joint = {law.name: law.joint for law, _ in laws}
         system = RigidBodySystem(
             mass=jnp.stack([body.mass for body in self.bodies]),
             rotary=jnp.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies]),
             gravity=None if gravity is None else gravity.acceleration,
             constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
             velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
+            servos=tuple(map(servo_group, kind(Servo))),
+            nonideal=tuple(NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout)),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
             guess=guess,
             length=_length([part for part, _ in parts], guess, layout),
@@ -121,8 +137,8 @@ def _check_kinds(scene: Scene):
         if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
             raise ValueError(f"joints must hold constraints, got {part!r}.")
     for part in scene.forces:
-        if not isinstance(part, AbstractForce | Gravity):
-            raise ValueError(f"forces must hold force elements or Gravity, got {part!r}.")
+        if not isinstance(part, AbstractForce | AbstractNonIdeal | Gravity):
+            raise ValueError(f"forces must hold force elements, friction of joints, or Gravity, got {part!r}.")
     if sum(isinstance(part, Gravity) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     dimension = scene.bodies[0].dimension
@@ -135,7 +151,7 @@ def _check_kinds(scene: Scene):
 
 def _dimension(part):
     """2 or 3 for parts of one space, None for those of both."""
-    module = type(part).__module__
+    module = type(part.program if isinstance(part, Servo) else part).__module__
     return 2 if ".planar" in module else 3 if ".spatial" in module else None
 
 
@@ -151,7 +167,12 @@ def _check_names(scene: Scene):
             raise ValueError(f"{label(part)}: a name must not be empty or contain a dot.")
         seen.add(part.name)
     known = [body.name for body in scene.bodies] + [GROUND]
+    joints = [part.name for part in scene.joints]
     for part in (*scene.joints, *scene.forces):
+        if isinstance(part, AbstractNonIdeal):
+            if part.joint not in joints:
+                raise ValueError(f"{label(part)}: {unknown('joint', part.joint, joints)}")
+            continue
         if isinstance(part, Gravity):
             continue
         for name in part.bodies:
@@ -168,18 +189,13 @@ def _check_rotation(part, own, layout, poses):
     if not points:
         return
     space = layout.space
-    velocities = jnp.ones((len(own), space.velocity_size))
     for component in part.components():
         if isinstance(component, AbstractForce):
+            velocities = jnp.ones((len(own), space.velocity_size))
             felt = component.wrenches(space, poses, velocities, 0.0)
-        elif isinstance(component, AbstractConstraint):
-            rate = lambda v, c=component: jax.jvp(
-                lambda x: c.residual(space, x, 0.0), (poses,), (jax.vmap(space.rates)(poses, v),)
-            )[1]
-            felt = jnp.sum(jnp.abs(jax.jacfwd(rate)(velocities)), axis=0)
         else:
-            residual = lambda v, c=component: c.residual(space, poses, v, 0.0)
-            felt = jnp.sum(jnp.abs(jax.jacfwd(residual)(velocities)), axis=0)
+            rows = rows_of(component.program if isinstance(component, Servo) else component, space, poses)
+            felt = jnp.sum(jnp.abs(rows), axis=0)
         if np.any(np.abs(felt[np.array(points), space.dimension :]) > 0):
             raise ValueError(
                 f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, "
@@ -190,6 +206,8 @@ def _check_rotation(part, own, layout, poses):
 def _check_finite(part):
     for field in part.__dataclass_fields__:
         value = getattr(part, field)
+        if isinstance(value, AbstractLink):
+            _check_finite(value)
         for item in value.values() if isinstance(value, dict) else [value]:
             if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
                 raise ValueError(f"{label(part)}: {field} must be finite, got {np.asarray(item)}.")

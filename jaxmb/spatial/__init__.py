@@ -1,6 +1,7 @@
 """Parts of spatial scenes."""
 
 from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from .._friction import Friction as Friction
 from .bodies import (
     Body as Body,
     PointMass as PointMass,

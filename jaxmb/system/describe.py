@@ -104,10 +104,15 @@ def describe(system: RigidBodySystem) -> Description:
     bodies = [("Body" if r else "PointMass", name, "") for name, r in _shorten_bodies(system)]
     joints = [
         (type(g.group.part).__name__, shorten(g.group.names), f"{g.rows} rows each" + note)
-        for groups, note in ((system.constraints, ""), (system.velocity_constraints, ", between velocities"))
+        for groups, note in (
+            (system.constraints, ""),
+            (system.velocity_constraints, ", between velocities"),
+            (system.servos, ", a program of a Servo"),
+        )
         for g in groups
     ]
-    forces = [(type(g.group.part).__name__, shorten(g.group.names), "") for g in system.forces]
+    forces = [(type(g.group.part).__name__, shorten(g.group.names), f"of {shorten(g.joints)}") for g in system.nonideal]
+    forces += [(type(g.group.part).__name__, shorten(g.group.names), "") for g in system.forces]
     if system.gravity is not None:
         forces.insert(0, ("Gravity", system.gravity_name, ""))
     implied = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
@@ -122,7 +127,7 @@ def _left_out(system: RigidBodySystem) -> list[str]:
     out = constraints_left_out(system)
     if not system.spatial:
         out.append("planar: no Euler parameters, no gyroscopic moment")
-    if not system.forces:
+    if not system.forces and not system.nonideal:
         out.append("no force elements" + ("" if system.gravity is None else " besides gravity"))
     return out
 

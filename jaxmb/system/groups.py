@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._parts import AbstractLink
+from .._parts import AbstractPart
 from .._types import Scalar
 from .layout import Layout, pick
 
@@ -38,7 +38,7 @@ class Group(eqx.Module):
         return pick(of_bodies, self.body_index)
 
 
-def stack(parts: Sequence[tuple[AbstractLink, tuple[int, ...]]], layout: Layout) -> tuple[Group, ...]:
+def stack(parts: Sequence[tuple[AbstractPart, tuple[int, ...]]], layout: Layout) -> tuple[Group, ...]:
     """Group parts that share type, static fields and shapes; order of first appearance."""
     groups: dict[Any, list] = {}
     for part, bodies in parts:
@@ -53,15 +53,17 @@ def stack(parts: Sequence[tuple[AbstractLink, tuple[int, ...]]], layout: Layout)
     return tuple(out)
 
 
-def _anonymous(part: AbstractLink) -> AbstractLink:
+def _anonymous(part: AbstractPart) -> AbstractPart:
     """The part without the names that tell it from its siblings."""
     out = object.__new__(type(part))
     for field in part.__dataclass_fields__:
         value = getattr(part, field)
-        if field == "name" or field in ("body", "body_a", "body_b", "reaction", "carrier"):
+        if field in ("name", "body", "body_a", "body_b", "reaction", "carrier", "joint"):
             value = ""
         elif field == "bodies":
             value = ("",) * len(value)
+        elif isinstance(value, AbstractPart):
+            value = _anonymous(value)
         object.__setattr__(out, field, value)
     return out
 
@@ -216,3 +218,53 @@ class ForceGroup(eqx.Module):
             return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
         return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))
+
+
+class ServoGroup(AbstractConstraintGroup):
+    """Kernels of stacked programs that act on accelerations; `group` is of the programs, the gains are one for each."""
+
+    damping: Float[Array, "parts"]
+    stiffness: Float[Array, "parts"]
+
+    @property
+    def program(self) -> ConstraintGroup:
+        return ConstraintGroup(self.group)
+
+    def velocity(self, t, poses, velocities):
+        return self.program.velocity(t, poses, velocities)
+
+    def jacobian(self, t, poses, velocities):
+        return self.program.jacobian(t, poses, velocities)
+
+    def wrenches(self, t, poses, velocities, multipliers):
+        return self.program.wrenches(t, poses, velocities, multipliers)
+
+    def acceleration(self, t, poses, velocities, accelerations):
+        second = self.program.acceleration(t, poses, velocities, accelerations)
+        rate, value = self.program.velocity(t, poses, velocities), self.program.residual(t, poses)
+        return second + self.damping[:, None] * rate + self.stiffness[:, None] * value
+
+
+def servo_group(group: Group) -> ServoGroup:
+    """From stacked servos."""
+    part = group.part
+    own = Group(part.program, group.names, group.bodies, group.layout)
+    return ServoGroup(own, part.damping, part.stiffness)
+
+
+class NonIdealGroup(eqx.Module):
+    """Kernels of stacked laws of joints that are not ideal; `joints`: the name of the joint of each."""
+
+    group: Group
+    joints: tuple[str, ...] = eqx.field(static=True)
+
+    def wrenches(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        reactions: Float[Array, "parts k v"],
+    ) -> Float[Array, "parts k v"]:
+        """What the laws do to the bodies of their joints; `reactions`: what the ideal joints do."""
+        single = lambda part, x, v, own: part.wrenches(self.group.layout.space, x, v, own, t)
+        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities), reactions)

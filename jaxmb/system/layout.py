@@ -102,3 +102,22 @@ class Layout:
         return np.array([np.pad(c, (0, width - len(c)), constant_values=len(flat)) for c in contributions]).reshape(
             self.nu, width
         )
+
+    def reaction_source(
+        self, joints: list[tuple[tuple[str, ...], tuple[tuple[int, ...], ...]]], names: tuple[str, ...]
+    ) -> np.ndarray:
+        """Which wrench entries add up to the reactions of some joints: shape (names, largest count, k, velocity size).
+
+        **Arguments:** `joints`: for each group of constraints the names of its parts and their bodies (parts, k);
+        `names`: of the joints asked for, all between as many bodies. Indices are as in `force_source`.
+        """
+        size, start = self.space.velocity_size, 0
+        found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        for parts, bodies in joints:
+            for name, own in zip(parts, bodies, strict=True):
+                if name in found:
+                    found[name].append(start + np.arange(len(own) * size).reshape(len(own), size))
+                start += len(own) * size
+        width = max(map(len, found.values()))
+        fill = lambda blocks: [*blocks, *[np.full_like(blocks[0], start)] * (width - len(blocks))]
+        return np.array([fill(found[name]) for name in names])

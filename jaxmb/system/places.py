@@ -17,7 +17,7 @@ def parameter_places(system: "RigidBodySystem") -> dict[str, list[tuple[Any, int
             places[f"{name}.inertia"] = [(lambda s: s.rotary, k)]
     if system.gravity is not None:
         places[f"{system.gravity_name}.acceleration"] = [(lambda s: s.gravity, None)]
-    for kind in ("constraints", "velocity_constraints", "forces"):
+    for kind in ("constraints", "velocity_constraints", "servos", "forces", "nonideal"):
         for g, group in enumerate(getattr(system, kind)):
             part = group.group.part
             for field in part.__dataclass_fields__:
@@ -27,6 +27,10 @@ def parameter_places(system: "RigidBodySystem") -> dict[str, list[tuple[Any, int
                     where = _accessor(kind, g, field, key)
                     for k, name in enumerate(group.group.names):
                         places.setdefault(f"{name}.{field if key is None else key}", []).append((where, k))
+    for g, group in enumerate(system.servos):
+        for k, name in enumerate(group.group.names):
+            places.setdefault(f"{name}.damping", []).append((lambda s, g=g: s.servos[g].damping, k))
+            places.setdefault(f"{name}.stiffness", []).append((lambda s, g=g: s.servos[g].stiffness, k))
     return places
 
 

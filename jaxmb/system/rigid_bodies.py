@@ -13,7 +13,14 @@ from .._types import State
 from ..rotations import cross, rotate
 from ._base import AbstractSystem, Ranks
 from .coordinates import coordinate_names, rate_names
-from .groups import ConstraintGroup, ForceGroup, VelocityConstraintGroup
+from .groups import (
+    AbstractConstraintGroup,
+    ConstraintGroup,
+    ForceGroup,
+    NonIdealGroup,
+    ServoGroup,
+    VelocityConstraintGroup,
+)
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
 from .places import parameter_places
@@ -43,6 +50,8 @@ class RigidBodySystem(AbstractSystem):
     gravity: Float[Array, "d"] | None
     constraints: tuple[ConstraintGroup, ...]
     velocity_constraints: tuple[VelocityConstraintGroup, ...]
+    servos: tuple[ServoGroup, ...]
+    nonideal: tuple[NonIdealGroup, ...]
     forces: tuple[ForceGroup, ...]
     guess: State
     length: Float[Array, ""]
@@ -94,11 +103,16 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def acceleration_rows(self) -> int:
-        return self.velocity_rows
+        return self.velocity_rows + sum(len(g.group.names) * g.rows for g in self.servos)
+
+    @property
+    def joints(self) -> tuple[AbstractConstraintGroup, ...]:
+        """All groups of constraints, in the order of the rows of A."""
+        return (*self.constraints, *self.velocity_constraints, *self.servos)
 
     @property
     def ideal(self) -> bool:
-        return True
+        return not self.nonideal
 
     @property
     def regular(self) -> bool:
@@ -120,13 +134,8 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def rows(self) -> tuple[tuple[str, int], ...]:
-        """Name and number within its part of every row of ψ."""
-        return tuple(
-            (name, k)
-            for g in (*self.constraints, *self.velocity_constraints)
-            for name in g.group.names
-            for k in range(g.rows)
-        )
+        """Name and number within its part of every row of A."""
+        return tuple((name, k) for g in self.joints for name in g.group.names for k in range(g.rows))
 
     def coordinate_names(self):
         return coordinate_names(self.layout, self.body_names)
@@ -214,7 +223,7 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def jacobian(self, t, q, u):
-        return self._jacobian(t, q, u, (*self.constraints, *self.velocity_constraints))
+        return self._jacobian(t, q, u, self.joints)
 
     def _jacobian(self, t, q, u, groups):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
@@ -223,24 +232,35 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):
-        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        wrenches, bodies, row = [], [], 0
-        for g in (*self.constraints, *self.velocity_constraints):
-            own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-            wrenches.append(g.wrenches(t, poses, velocities, own))
-            bodies.append(g.group.body_index)
-            row += own.size
-        return self._add_up(wrenches, bodies, u.dtype)
+        wrenches = self._reactions(t, self.prepared_poses(q), self.all_velocities(u), multipliers)
+        return self._add_up(wrenches, [g.group.body_index for g in self.joints], u.dtype)
 
+    def _reactions(self, t, poses, velocities, multipliers):
+        """Wrenches of the constraints on their bodies, group by group (parts, k, velocity size)."""
+        out, row = [], 0
+        for g in self.joints:
+            own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
+            out.append(g.wrenches(t, poses, velocities, own))
+            row += own.size
+        return out
+
+    @eqx.filter_jit
     def nonideal_force(self, t, q, u, multipliers):
-        return jnp.zeros_like(u)
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        reactions = _join([*self._reactions(t, poses, velocities, multipliers), jnp.zeros(1, u.dtype)], u.dtype)
+        joints = [(g.group.names, g.group.bodies) for g in self.joints]
+        wrenches = []
+        for g in self.nonideal:
+            # A joint may be made of several constraints, all between the same bodies.
+            own = pick(reactions, self.layout.reaction_source(joints, g.joints))
+            wrenches.append(g.wrenches(t, poses, velocities, jnp.sum(own, axis=1)))
+        return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
 
     @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
         poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
-        groups = (*self.constraints, *self.velocity_constraints)
-        return _join([g.acceleration(t, poses, velocities, accelerations) for g in groups], q.dtype)
+        return _join([g.acceleration(t, poses, velocities, accelerations) for g in self.joints], q.dtype)
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)

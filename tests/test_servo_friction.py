@@ -1,0 +1,272 @@
+"""Scenes whose joints are not all ideal, and programs that a control force is to satisfy."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import formulations, planar, spatial
+from jaxmb.formulations._base import accelerations
+
+GRAVITY = mb.Gravity((0.0, -9.81))
+
+
+def sine(t, p):
+    return p["amplitude"] * jnp.sin(t)
+
+
+@functools.cache
+def sledge():
+    """A block on an inclined rail that rubs, starting uphill."""
+    slope = (np.cos(0.3), np.sin(0.3))
+    block = planar.Body("block", mass=2.0, inertia=1.0, position=(0.0, 0.0), velocity=(3 * slope[0], 3 * slope[1]))
+    rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=slope)
+    rub = planar.Friction("rub", "rail", coefficient=0.2)
+    return mb.Scene([block], joints=[rail], forces=[GRAVITY, rub]).compile()
+
+
+@functools.cache
+def pendulum():
+    """A pendulum whose pin rubs."""
+    arm = planar.Body("arm", mass=1.5, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0))
+    rub = planar.Friction("rub", "pin", coefficient=0.3, radius=0.05)
+    return mb.Scene([arm], joints=[pin], forces=[GRAVITY, rub]).compile()
+
+
+@functools.cache
+def manipulator():
+    """A double pendulum whose tip is to move along a line, with joints that rub."""
+    bodies = [
+        planar.Body("upper", mass=2.0, inertia=0.2, position=(0.4, 0.3), angle=0.6),
+        planar.Body("lower", mass=1.0, inertia=0.1, position=(1.1, 0.3), angle=-0.7),
+    ]
+    joints = [
+        planar.Revolute("shoulder", "ground", "upper", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+        planar.Revolute("elbow", "upper", "lower", point_a=(0.5, 0.0), point_b=(-0.4, 0.0)),
+        mb.Servo(
+            planar.Driver("tip", "ground", "lower", quantity="y", motion=sine, parameters={"amplitude": 0.2}),
+            damping=6.0,
+            stiffness=9.0,
+        ),
+    ]
+    rub = planar.Friction("rub", "elbow", coefficient=0.2, radius=0.1)
+    return mb.Scene(bodies, joints=joints, forces=[GRAVITY, rub]).compile()
+
+
+@functools.cache
+def carriage():
+    """A body in space on a rail that rubs, carrying an arm that is to swing by a program."""
+    bodies = [
+        spatial.Body("carriage", mass=3.0, inertia=(0.3, 0.2, 0.4), position=(0.1, 0.0, 0.0)),
+        spatial.Body("arm", mass=1.0, inertia=(0.02, 0.2, 0.2), position=(0.5, 0.0, 0.0)),
+    ]
+    joints = [
+        spatial.Prismatic("rail", "ground", "carriage", point=(0.1, 0.0, 0.0), axis=(1.0, 0.0, 0.0)),
+        spatial.Revolute("hinge", "carriage", "arm", point=(0.1, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
+        mb.Servo(
+            mb.Constraint(
+                "swing",
+                "arm",
+                lambda p, t, own: p[0, 3:4] * 2 * p[0, 5] - own["target"],
+                parameters={"target": 0.1},
+                rheonomic=False,
+            ),
+            damping=2.0,
+            stiffness=1.0,
+        ),
+    ]
+    forces = [
+        mb.Gravity((0.0, 0.0, -9.81)),
+        spatial.Friction("rub", "rail", coefficient=0.1),
+        spatial.Friction("pin", "hinge", coefficient=0.2, radius=0.03),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+SCENES = {"sledge": sledge, "pendulum": pendulum, "manipulator": manipulator, "carriage": carriage}
+
+
+def random_state(system, seed):
+    rng = np.random.default_rng(seed)
+    guess = system.guess.q + 0.2 * rng.normal(size=system.nq)
+    state = mb.assemble(system, guess=mb.State(guess, jnp.asarray(rng.normal(size=system.nu))))
+    return state.q, state.u
+
+
+def test_sliding_block():
+    """Uphill it is slowed by weight and friction; N is that of the slope."""
+    system = sledge()
+    start = mb.assemble(system)
+    motion = mb.simulate(system, start, t1=0.3, rtol=1e-10)
+    speed = 3 - 9.81 * (np.sin(0.3) + 0.2 * np.cos(0.3)) * 0.3
+    # The friction is smoothed at 1e-4 of some m/s.
+    np.testing.assert_allclose(np.linalg.norm(motion["block"].velocity[-1]), speed, rtol=1e-8)
+    force = motion.reactions["rail"].force[-1]
+    np.testing.assert_allclose(np.linalg.norm(force), 2 * 9.81 * np.cos(0.3), rtol=1e-9)
+
+
+def test_friction_takes_the_energy():
+    """The energy that a swing loses is the work against the pin's friction, μ N r |ω|."""
+    system = pendulum()
+    start = mb.assemble(system)
+    times = np.linspace(0.0, 0.6, 61)
+    motion = mb.simulate(system, start, t1=0.6, rtol=1e-11, saveat=jnp.asarray(times))
+    ideal = jax.vmap(lambda t, y: accelerations(without_friction(system), formulations.Multipliers(), t, y.q, y.u)[1])
+    bearing = np.linalg.norm(ideal(motion.ts, motion.ys), axis=-1)
+    rate = np.asarray(motion["arm"].angular_velocity)
+    slip = 0.05 * rate
+    power = 0.3 * bearing * slip**2 / np.sqrt(slip**2 + 1e-8)
+    # Simpson's rule, away from the start, where the slip grows through the smoothing.
+    h, p = times[1] - times[0], power[20:]
+    work = h / 3 * (p[0] + 4 * np.sum(p[1:-1:2]) + 2 * np.sum(p[2:-1:2]) + p[-1])
+    energy = np.asarray(motion.energy)
+    np.testing.assert_allclose(energy[20] - energy[-1], work, rtol=1e-7)
+    assert energy[20] - energy[-1] > 0.01
+
+
+def without_friction(system):
+    return eqx.tree_at(lambda s: s.nonideal, system, ())
+
+
+def test_program_is_reached_as_its_gains_say():
+    """Started off the program, the deviation decays as φ̈ + 6 φ̇ + 9 φ = 0: (φ0 + (φ̇0 + 3 φ0) t) e^(−3t)."""
+    system = manipulator()
+    start = mb.assemble(system)
+    times = np.linspace(0.0, 1.5, 7)
+    motion = mb.simulate(system, start, t1=1.5, rtol=1e-10, saveat=jnp.asarray(times))
+    lower = motion["lower"]
+    phi = np.asarray(lower.position[:, 1]) - 0.2 * np.sin(times)
+    rate = float(lower.velocity[0, 1]) - 0.2
+    expected = (phi[0] + (rate + 3 * phi[0]) * times) * np.exp(-3 * times)
+    assert abs(phi[0]) > 0.1
+    np.testing.assert_allclose(phi, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_formulation(name):
+    """The same accelerations and reactions on every road; friction works against the slip, and as a force of the
+    user's function.
+    """
+    system = SCENES[name]()
+    roads = [
+        formulations.Partitioned(),
+        formulations.Multipliers(),
+        formulations.NullSpace(),
+        formulations.Poincare(),
+        *map(formulations.UdwadiaKalaba, ("moore_penrose", "inverses", "singular_mass")),
+    ]
+
+    @jax.jit
+    def every(q, u):
+        return [accelerations(system, road, jnp.array(0.3), q, u) for road in roads]
+
+    for seed in range(3):
+        q, u = random_state(system, seed)
+        (first, multipliers), *others = every(q, u)
+        residual = system.acceleration_residual(0.3, q, u, first)
+        np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.max(np.abs(first)))
+        power = u @ system.nonideal_force(0.3, q, u, multipliers)
+        assert power < 0
+        for udot, own in others:
+            np.testing.assert_allclose(udot, first, rtol=1e-10, atol=1e-10 * np.max(np.abs(first)))
+            np.testing.assert_allclose(own, multipliers, rtol=1e-9, atol=1e-9 * np.max(np.abs(multipliers)))
+
+
+def test_control_is_the_least():
+    """Any other force on the velocities that keeps joints and program is larger in the metric of M⁻¹."""
+    system = without_friction(manipulator())
+    q, u = random_state(system, 5)
+    t = jnp.array(0.3)
+    udot, multipliers = accelerations(system, formulations.Multipliers(), t, q, u)
+    control = system.constraint_force(t, q, u, multipliers)
+    A = system.jacobian(t, q, u)
+    inverse = lambda f: system.inertia(t, q, u).solve(f)
+    other = np.random.default_rng(0).normal(size=system.nu)
+    along = A @ inverse(jnp.asarray(other))
+    other = other - A.T @ jnp.linalg.solve(A @ jax.vmap(inverse)(A).T, along)
+    np.testing.assert_allclose(A @ inverse(other), 0.0, atol=1e-12)
+    larger = control + other
+    np.testing.assert_allclose(larger @ inverse(larger), control @ inverse(control) + other @ inverse(other))
+
+
+def test_function_of_the_reactions():
+    """`NonIdeal` with the law of `Friction`, and with forces along the joint's own, which have no effect."""
+    rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=(1.0, 0.0))
+    block = planar.Body("block", mass=2.0, inertia=1.0, position=(0.0, 0.0))
+
+    def rub(poses, velocities, reactions, t, p):
+        normal, slip = jnp.abs(reactions[-1, 1]), velocities[-1, 0]
+        along = -p["coefficient"] * normal * slip / jnp.sqrt(slip**2 + 1e-8) + 0.0 * t
+        wrench = jnp.stack([along, 1e3 * normal, 1e2 * normal])
+        return jnp.stack([-wrench, wrench])
+
+    laws = [
+        planar.Friction("rub", "rail", coefficient=0.3),
+        mb.NonIdeal("rub", "rail", rub, parameters={"coefficient": 0.3}),
+    ]
+    systems = [mb.Scene([block], joints=[rail], forces=[GRAVITY, law]).compile() for law in laws]
+    q, u = jnp.array([0.4, 0.0, 0.0]), jnp.array([-0.7, 0.0, 0.0])
+    results = [accelerations(s, formulations.Multipliers(), jnp.array(0.0), q, u)[0] for s in systems]
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(results[0][0], 0.3 * 9.81, rtol=1e-7)
+    assert mb.parameters(systems[1])["rub.coefficient"] == 0.3
+
+
+def test_gradients():
+    """Of a motion with a program and with friction: forward, reverse and central differences, compiled and in a
+    batch.
+    """
+    system = manipulator()
+    names = ["rub.coefficient", "rub.radius", "tip.amplitude", "tip.damping", "tip.stiffness", "lower.mass"]
+    start = jnp.array([float(mb.parameters(system)[name]) for name in names])
+
+    def loss(x, rtol, adjoint):
+        changed = mb.with_parameters(system, dict(zip(names, x, strict=True)))
+        state = mb.assemble(changed, rates={"lower.angle": 2.0, "upper.angle": -1.0}, throw=False)
+        motion = mb.simulate(changed, state, t1=0.3, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+        return jnp.sum(jnp.cos(jnp.arange(float(system.nq))) * motion.ys.q[-1])
+
+    batch = lambda f: jax.jit(jax.vmap(f, in_axes=(0, None)))
+    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    forward_and_value = batch(jax.jacfwd(twice, has_aux=True))
+    forward = forward_and_value(start[None], 1e-9)[0][0]
+    reverse = batch(jax.grad(lambda x, rtol: loss(x, rtol, None)))(start[None], 1e-9)[0]
+    scale = np.max(np.abs(forward))
+    assert np.all(np.abs(forward) > 1e-6 * scale)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
+    h = 1e-3 * np.abs(start)
+    value = lambda k: np.array([forward_and_value((start + k * step)[None], 1e-12)[1][0] for step in np.diag(h)])
+    central = (8 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / (12 * h)
+    np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-7 * scale)
+
+
+def scene(*, joints=(), forces=()):
+    body = planar.Body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0))
+    return mb.Scene([body], joints=[pin, *joints], forces=forces).compile()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="'pim'.*pin"):
+        scene(forces=[planar.Friction("rub", "pim", coefficient=0.1, radius=0.1)])
+    with pytest.raises(ValueError, match="radius"):
+        scene(forces=[planar.Friction("rub", "pin", coefficient=0.1)])
+    with pytest.raises(ValueError, match="coefficient must be non-negative"):
+        scene(forces=[planar.Friction("rub", "pin", coefficient=-0.1, radius=0.1)])
+    with pytest.raises(ValueError, match="not determined.*pin, twin"):
+        twin = planar.Revolute("twin", "ground", "arm", point=(0.0, 0.0))
+        scene(joints=[twin], forces=[planar.Friction("rub", "pin", coefficient=0.1, radius=0.1)])
+    with pytest.raises(ValueError, match="constraint between positions"):
+        mb.Servo(planar.KnifeEdge("blade", "arm"))
+    angle = functools.partial(planar.Driver, body_a="ground", body_b="arm", quantity="angle", parameters={})
+    with pytest.raises(ValueError, match="stiffness must be non-negative"):
+        scene(joints=[mb.Servo(angle("turn", motion=lambda t, p: t), stiffness=-1.0)])
+    with pytest.raises(ValueError, match="accelerations asked for by.*turn.*contradict"):
+        both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
+        scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])
