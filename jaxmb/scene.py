@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -206,9 +207,7 @@ def _check_rotation(part, own, layout, poses):
 def _check_finite(part):
     for field in part.__dataclass_fields__:
         value = getattr(part, field)
-        if isinstance(value, AbstractLink):
-            _check_finite(value)
-        for item in value.values() if isinstance(value, dict) else [value]:
+        for item in jax.tree.leaves(value):
             if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
                 raise ValueError(f"{label(part)}: {field} must be finite, got {np.asarray(item)}.")
 

@@ -13,7 +13,7 @@ ROOT = Path(jaxmb.__file__).parent
 LAYERS = [
     ["_types", "_space", "_names", "_results", "rotations", "elimination", "orthogonal"],
     ["_parts", "_resolve"],
-    ["_forces", "_user", "planar", "spatial"],
+    ["_forces", "_friction", "_servo", "_user", "planar", "spatial"],
     ["system"],
     ["assembly"],
     ["_structure"],

@@ -183,7 +183,7 @@ def test_control_is_the_least():
     system = without_friction(manipulator())
     q, u = random_state(system, 5)
     t = jnp.array(0.3)
-    udot, multipliers = accelerations(system, formulations.Multipliers(), t, q, u)
+    _, multipliers = accelerations(system, formulations.Multipliers(), t, q, u)
     control = system.constraint_force(t, q, u, multipliers)
     A = system.jacobian(t, q, u)
     inverse = lambda f: system.inertia(t, q, u).solve(f)
@@ -253,13 +253,13 @@ def scene(*, joints=(), forces=()):
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="'pim'.*pin"):
+    with pytest.raises(ValueError, match=r"'pim'.*pin"):
         scene(forces=[planar.Friction("rub", "pim", coefficient=0.1, radius=0.1)])
     with pytest.raises(ValueError, match="radius"):
         scene(forces=[planar.Friction("rub", "pin", coefficient=0.1)])
     with pytest.raises(ValueError, match="coefficient must be non-negative"):
         scene(forces=[planar.Friction("rub", "pin", coefficient=-0.1, radius=0.1)])
-    with pytest.raises(ValueError, match="not determined.*pin, twin"):
+    with pytest.raises(ValueError, match=r"not determined.*pin, twin"):
         twin = planar.Revolute("twin", "ground", "arm", point=(0.0, 0.0))
         scene(joints=[twin], forces=[planar.Friction("rub", "pin", coefficient=0.1, radius=0.1)])
     with pytest.raises(ValueError, match="constraint between positions"):
@@ -267,6 +267,6 @@ def test_bad_input():
     angle = functools.partial(planar.Driver, body_a="ground", body_b="arm", quantity="angle", parameters={})
     with pytest.raises(ValueError, match="stiffness must be non-negative"):
         scene(joints=[mb.Servo(angle("turn", motion=lambda t, p: t), stiffness=-1.0)])
-    with pytest.raises(ValueError, match="accelerations asked for by.*turn.*contradict"):
+    with pytest.raises(ValueError, match=r"accelerations asked for by.*turn.*contradict"):
         both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
         scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])

@@ -97,7 +97,12 @@ def find_structure(system: "LagrangianSystem") -> Structure:
     if not np.all(np.isfinite(found.jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
     position, velocity, acceleration, *others = map(int, found.row_ranks)
-    _check_consistent(system, found.jacobian, found.right)
+    if system.linear:
+        rows = slice(0, system.velocity_rows)
+        _check_consistent(system, "velocities", found.jacobian[rows], -found.unmet, rows)
+    # What binds velocities is left alone here: the guess need not satisfy it.
+    rows = slice(system.velocity_rows, system.acceleration_rows)
+    _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
     _check_nonideal(system, acceleration, others)
     diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
     sizes = np.linalg.eigvalsh(found.inertia)
@@ -107,8 +112,8 @@ def find_structure(system: "LagrangianSystem") -> Structure:
 
 class _Numbers(NamedTuple):
     """Rates, second derivatives of L and mass matrix at the guess, second derivatives with other parameters; slopes of
-    the constraints between velocities; the residual that remains of the constraints between positions; A and γ, and the
-    ranks of some rows of A.
+    the constraints between velocities; the residual that remains of the constraints between positions; A, γ, ψ, and
+    the ranks of some rows of A.
     """
 
     rates: Any
@@ -120,6 +125,7 @@ class _Numbers(NamedTuple):
     coordinate_rank: Any
     jacobian: Any
     right: Any
+    unmet: Any
     row_ranks: Any
 
 
@@ -151,6 +157,7 @@ def _evaluate(system: "LagrangianSystem", constant: bool) -> _Numbers:
         coordinate_rank=coordinate_rank,
         jacobian=jacobian,
         right=-system.acceleration_residual(t, q, u, jnp.zeros_like(u)),
+        unmet=system.velocity_residual(t, q, u),
         row_ranks=jax.vmap(rank)(_row_sets(system)),
     )
 
@@ -174,18 +181,18 @@ def _between_velocities(system: "LagrangianSystem") -> list[AbstractConstraint]:
     return [c for c in system.constraints if isinstance(c, AbstractConstraint) and not isinstance(c, Holonomic)]
 
 
-def _check_consistent(system: "LagrangianSystem", jacobian: np.ndarray, right: np.ndarray) -> None:
-    """Raise a `ValueError` naming the constraints between accelerations that contradict others at the guess."""
+def _check_consistent(
+    system: "LagrangianSystem", what: str, jacobian: np.ndarray, right: np.ndarray, rows: slice
+) -> None:
+    """Raise a `ValueError` naming the constraints among some rows that contradict others at the guess."""
     if right.size == 0:
         return
     left_over = np.abs(right - jacobian @ np.linalg.lstsq(jacobian, right, rcond=None)[0])
-    # What binds velocities is left alone: the guess need not satisfy it.
-    bound = (np.arange(right.size) >= system.velocity_rows) & (left_over > 1e-8 * (1.0 + np.max(np.abs(right))))
-    wrong = dict.fromkeys(name for (name, _), own in zip(system.rows, bound, strict=True) if own)
+    bound = left_over[rows] > 1e-8 * (1.0 + np.max(np.abs(right)))
+    wrong = dict.fromkeys(name for (name, _), own in zip(system.rows[rows], bound, strict=True) if own)
     if wrong:
         raise ValueError(
-            f"The constraints {', '.join(wrong)} contradict each other: no accelerations satisfy them together at the "
-            "guess."
+            f"The constraints {', '.join(wrong)} contradict each other: no {what} satisfy them together at the guess."
         )
 
 

@@ -55,8 +55,8 @@ class LagrangianSystem(AbstractSystem):
     - `length`: the size that residuals of positions are relative to.
 
     **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
-    that no positions satisfy near the guess, constraints on accelerations that contradict others, friction of a
-    constraint that others imply, and names that are not unique.
+    that no positions satisfy near the guess, constraints on velocities or accelerations that contradict others,
+    friction of a constraint that others imply, and names that are not unique.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)

@@ -317,6 +317,9 @@ def test_contradicting_rows_leave_a_residual():
     )
     with pytest.raises(ValueError, match="one, two"):
         system(constraints=[rows("one", 1.0), rows("two", 2.0)])
+    belt = lambda name, speed: Pfaffian(name, lambda t, q, p: jnp.array([[1.0, 0.0]]), lambda t, q, p: -speed * q[:1])
+    with pytest.raises(ValueError, match=r"slow, fast.*no velocities"):
+        system(constraints=[belt("slow", 1.0), belt("fast", 2.0)])
 
 
 def test_pfaffian_with_a_drift():
