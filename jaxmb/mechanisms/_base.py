@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory
 
 Observation = dict[str, Array]
+
+# How a machine that has a Lagrangian on paper is built.
+Model = Literal["lagrangian", "rigid_bodies"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,6 +177,21 @@ def build(
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates)
     return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates)
+
+
+def of_bodies(model: Model, **defaults: bool) -> bool:
+    """Whether a mechanism is to be a scene of rigid bodies, and not a system from its Lagrangian.
+
+    **Arguments:** `defaults`: by name, whether a parameter that says how the Lagrangian is written has its default.
+
+    **Raises:** `ValueError` for an unknown model, and for a way to write the Lagrangian of rigid bodies.
+    """
+    if model not in get_args(Model):
+        raise ValueError(f"The models are {', '.join(get_args(Model))}; got {model!r}.")
+    chosen = [name for name, default in defaults.items() if not default]
+    if model == "rigid_bodies" and chosen:
+        raise ValueError(f"model='rigid_bodies' has no Lagrangian to write: leave out {', '.join(chosen)}.")
+    return model == "rigid_bodies"
 
 
 def observe_coordinates(trajectory: Trajectory) -> Observation:

@@ -1,4 +1,5 @@
-"""Two platforms with a pin between them, each on an axle whose wheels roll without slipping sideways.
+"""Two platforms with a pin between them, each on an axle whose wheels roll without slipping sideways; from their
+Lagrangian, or as rigid bodies.
 
 Coordinates: x, y of the middle of the rear axle, its heading θ, and the angle φ of the front platform against it.
 Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre ahead of its axle; `front_mass`,
@@ -8,9 +9,15 @@ front axle ahead of the pin.
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
+from .. import planar
 from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
+from ..scene import Scene
+from ..system import parameters as parameters_of
+from ..trajectory import Trajectory
+from ._base import Observation, point_motion
 
 COORDINATES = ("x", "y", "theta", "phi")
 FORMS = ("frame", "constraints", "connection")
@@ -31,11 +38,7 @@ def wheeled(
     """
     if form not in FORMS:
         raise ValueError(f"The forms are {', '.join(FORMS)}; got {form!r}.")
-    number = lambda x: jnp.asarray(x, jnp.result_type(float))
-    parameters = {name: number(value) for name, value in parameters.items()}
-    q = jnp.stack([number(0.0), number(0.0), number(0.0), number(angle)])
-    u = jnp.stack([number(speed), number(rate)])
-    v = frame(0.0, q, parameters) @ u
+    parameters, q, u, v = _start(parameters, angle, speed, rate)
     kinematics, start, constraints = {
         "frame": (Frame(frame, 2), u, ()),
         "constraints": (Rates(), v, (Pfaffian("wheels", wheels),)),
@@ -51,6 +54,67 @@ def wheeled(
         parameters=parameters,
         coordinates=COORDINATES,
     )
+
+
+def wheeled_bodies(parameters: dict[str, Any], *, angle: float, speed: float, rate: float) -> Scene:
+    """The same platforms as rigid bodies `rear` and `front`, from speed and turning rate at the start."""
+    parameters, q, _, v = _start(parameters, angle, speed, rate)
+    places, rates = jax.jvp(lambda q: _places(q, parameters), (q,), (v,))
+    names, masses = ("rear", "front"), (parameters["mass"], parameters["front_mass"])
+    inertias, ahead = zip(*((parameters[k + "inertia"], parameters[k + "ahead"]) for k in ("", "front_")), strict=True)
+    bodies = [
+        planar.Body(
+            name,
+            mass=masses[k],
+            inertia=inertias[k],
+            position=places[k, :2],
+            angle=places[k, 2],
+            velocity=rates[k, :2],
+            angular_velocity=rates[k, 2],
+        )
+        for k, name in enumerate(names)
+    ]
+    along = lambda x: jnp.stack([x, jnp.zeros_like(x)])
+    pin = planar.Revolute(
+        "pin",
+        *names,
+        point_a=along(parameters["pivot"] - ahead[0]),
+        point_b=along(-parameters["handle"] - ahead[1]),
+    )
+    wheels = [planar.KnifeEdge(f"{name}_wheels", name, point=along(-a)) for name, a in zip(names, ahead, strict=True)]
+    return Scene(bodies, joints=[pin, *wheels])
+
+
+def observe_bodies(trajectory: Trajectory) -> Observation:
+    """The coordinates of the platforms as rigid bodies, and as velocities speed and turning rate."""
+    rear, front = trajectory["rear"], trajectory["front"]
+    axle, velocity = point_motion(trajectory, "rear", parameters_of(trajectory.system)["rear_wheels.point"])
+    return {
+        "x": axle[:, 0],
+        "y": axle[:, 1],
+        "theta": rear.angle,
+        "phi": front.angle - rear.angle,
+        "u0": velocity[:, 0] * jnp.cos(rear.angle) + velocity[:, 1] * jnp.sin(rear.angle),
+        "u1": rear.angular_velocity,
+    }
+
+
+def _start(parameters, angle, speed, rate):
+    """Numbers, coordinates, speed and turning rate, and rates of the coordinates."""
+    number = lambda x: jnp.asarray(x, jnp.result_type(float))
+    parameters = {name: number(value) for name, value in parameters.items()}
+    q = jnp.stack([number(0.0), number(0.0), number(0.0), number(angle)])
+    u = jnp.stack([number(speed), number(rate)])
+    return parameters, q, u, frame(0.0, q, parameters) @ u
+
+
+def _places(q, p):
+    """Positions of the mass centres and headings, rear and front, shape (2, 3)."""
+    front = q[2] + q[3]
+    along = lambda angle: jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    rear_centre = q[:2] + p["ahead"] * along(q[2])
+    front_centre = q[:2] + p["pivot"] * along(q[2]) + (p["handle"] + p["front_ahead"]) * along(front)
+    return jnp.stack([jnp.append(rear_centre, q[2]), jnp.append(front_centre, front)])
 
 
 def kinetic(t, q, v, p):

@@ -3,13 +3,23 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .. import spatial
+from .._forces import Gravity
+from .._user import VelocityConstraint
 from ..lagrangian import LagrangianSystem, Nonholonomic
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def appell_hamel(
-    *, slope: float = 0.7, speed: float = 3.0, heading: float = 0.4, gravity: float = 9.81, mass: float = 1.0
+    *,
+    slope: float = 0.7,
+    speed: float = 3.0,
+    heading: float = 0.4,
+    gravity: float = 9.81,
+    mass: float = 1.0,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """A particle whose vertical velocity is held in proportion to its horizontal speed: ż = a √(ẋ² + ẏ²).
 
@@ -19,29 +29,49 @@ def appell_hamel(
     Source: P. Appell, Exemple de mouvement d'un point assujetti à une liaison exprimée par une relation non linéaire
     entre les composantes de la vitesse, Rend. Circ. Mat. Palermo 32, 1911. Reference values in closed form.
 
-    **Arguments:** `slope` a; horizontal `speed` [m/s] and `heading` [rad] at the start; `gravity` [m/s²]; `mass` [kg].
+    **Arguments:** `slope` a; horizontal `speed` [m/s] and `heading` [rad] at the start; `gravity` [m/s²]; `mass` [kg];
+    `model`: from its Lagrangian, or as a point mass `particle`.
 
     **Labels:** `x`, `y`, `z` [m]; `u0`, `u1`, `u2` [m/s].
     """
     number = lambda x: jnp.asarray(x, jnp.result_type(float))
     along = number(speed) * jnp.stack([jnp.cos(number(heading)), jnp.sin(number(heading)), number(slope)])
-    system = LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
-        potential=lambda t, q, p: p["mass"] * p["gravity"] * q[2],
-        constraints=[Nonholonomic("cone", lambda t, q, v, p: v[2] - p["slope"] * jnp.sqrt(jnp.dot(v[:2], v[:2])))],
-        q=(0.0, 0.0, 0.0),
-        u=along,
-        parameters={"slope": slope, "gravity": gravity, "mass": mass},
-        coordinates=("x", "y", "z"),
-    )
+    rigid = of_bodies(model)
+    if rigid:
+        cone = lambda poses, velocities, t, p: _excess(velocities[0], p["slope"])
+        system = Scene(
+            [spatial.PointMass("particle", mass=mass, velocity=along)],
+            joints=[VelocityConstraint("cone", "particle", cone, parameters={"slope": slope}, homogeneous=True)],
+            forces=[Gravity((0.0, 0.0, -gravity))],
+        )
+    else:
+        system = LagrangianSystem(
+            kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
+            potential=lambda t, q, p: p["mass"] * p["gravity"] * q[2],
+            constraints=[Nonholonomic("cone", lambda t, q, v, p: _excess(v, p["slope"]))],
+            q=(0.0, 0.0, 0.0),
+            u=along,
+            parameters={"slope": slope, "gravity": gravity, "mass": mass},
+            coordinates=("x", "y", "z"),
+        )
     return build(
         "appell_hamel",
         system,
         t1=0.5,
-        observe=observe_coordinates,
+        observe=_observe_particle if rigid else observe_coordinates,
         description="Particle with its climb held in proportion to its speed (Appell, Hamel).",
         references=_references(),
     )
+
+
+def _excess(v, slope):
+    return v[2] - slope * jnp.sqrt(jnp.dot(v[:2], v[:2]))
+
+
+def _observe_particle(trajectory):
+    particle = trajectory["particle"]
+    place = {name: particle.position[:, k] for k, name in enumerate("xyz")}
+    return place | {f"u{k}": particle.velocity[:, k] for k in range(3)}
 
 
 def _references():

@@ -5,11 +5,15 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
+from .. import planar
+from .._forces import Gravity
+from .._user import VelocityConstraint
 from ..lagrangian import LagrangianSystem, Nonholonomic, QuasiVelocities, Rates
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def constant_speed_particle(
     *,
     speed: float = 3.0,
@@ -17,6 +21,7 @@ def constant_speed_particle(
     gravity: float = 9.81,
     mass: float = 1.0,
     form: Literal["constraint", "quasi"] = "constraint",
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """A particle in the vertical plane that gravity turns, while a constraint nonlinear in velocity holds its speed.
 
@@ -27,7 +32,8 @@ def constant_speed_particle(
     values in closed form, with Gudermann's function: φ = gd(C − g t / c).
 
     **Arguments:** `speed` c [m/s]; `steepness` C, with φ = gd(C) at the start; `gravity` [m/s²]; `mass` [kg]; `form`:
-    the velocities are rates with the constraint, or the heading, of nonlinear quasi-velocities |q̇| − c and φ.
+    the velocities are rates with the constraint, or the heading, of nonlinear quasi-velocities |q̇| − c and φ;
+    `model`: from its Lagrangian, or as a point mass `particle`.
 
     **Labels:** `x`, `y` [m], and the velocities `u0`, …: [m/s], or the heading [rad].
     """
@@ -35,30 +41,52 @@ def constant_speed_particle(
         raise ValueError(f"The forms are constraint, quasi; got {form!r}.")
     heading = 2.0 * jnp.arctan(jnp.tanh(jnp.asarray(steepness, jnp.result_type(float)) / 2))
     ahead = speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    rigid = of_bodies(model, form=form == "constraint")
+    if rigid:
+        system = _particle(mass, speed, gravity, ahead)
+    else:
+        system = _on_paper(form, {"speed": speed, "gravity": gravity, "mass": mass}, ahead, heading)
+    return build(
+        "constant_speed_particle",
+        system,
+        t1=1.0,
+        observe=_observe_particle if rigid else observe_coordinates,
+        description="Particle with its speed held, turned by gravity; a constraint nonlinear in velocity.",
+        references=_references(),
+    )
+
+
+def _on_paper(form, parameters, ahead, heading) -> LagrangianSystem:
     held = lambda t, q, v, p: _length(v) - p["speed"]
     quasi = QuasiVelocities(
         lambda t, q, v, p: jnp.stack([_length(v) - p["speed"], jnp.arctan2(v[1], v[0])]),
         near=lambda t, q, omega, p: p["speed"] * jnp.stack([jnp.cos(omega[1]), jnp.sin(omega[1])]),
         dependent=(0,),
     )
-    system = LagrangianSystem(
+    return LagrangianSystem(
         kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
         potential=lambda t, q, p: p["mass"] * p["gravity"] * q[1],
         constraints=[Nonholonomic("speed", held)] if form == "constraint" else (),
         kinematics=Rates() if form == "constraint" else quasi,
         q=(0.0, 0.0),
         u=ahead if form == "constraint" else heading[None],
-        parameters={"speed": speed, "gravity": gravity, "mass": mass},
+        parameters=parameters,
         coordinates=("x", "y"),
     )
-    return build(
-        "constant_speed_particle",
-        system,
-        t1=1.0,
-        observe=observe_coordinates,
-        description="Particle with its speed held, turned by gravity; a constraint nonlinear in velocity.",
-        references=_references(),
+
+
+def _particle(mass, speed, gravity, velocity) -> Scene:
+    held = lambda poses, velocities, t, p: _length(velocities[0, :2]) - p["speed"]
+    return Scene(
+        [planar.PointMass("particle", mass=mass, velocity=velocity)],
+        joints=[VelocityConstraint("held", "particle", held, parameters={"speed": speed})],
+        forces=[Gravity((0.0, -gravity))],
     )
+
+
+def _observe_particle(trajectory):
+    (x, y), (u0, u1) = trajectory["particle"].position.T, trajectory["particle"].velocity.T
+    return {"x": x, "y": y, "u0": u0, "u1": u1}
 
 
 def _length(v):

@@ -5,11 +5,11 @@ from typing import Literal
 import numpy as np
 
 from ..lagrangian import AbstractEquations
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
-from ._wheeled import wheeled
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from ._wheeled import observe_bodies, wheeled, wheeled_bodies
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def nonholonomic_cart(
     *,
     mass: float = 2.0,
@@ -25,6 +25,7 @@ def nonholonomic_cart(
     rate: float = 0.0,
     form: Literal["frame", "constraints", "connection"] = "frame",
     equations: AbstractEquations | None = None,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """A cart of two platforms with a pin between them, each on an axle whose wheels do not slip sideways, coasting.
 
@@ -36,7 +37,7 @@ def nonholonomic_cart(
     **Arguments:** `mass` [kg], `inertia` [kg m²] and `ahead` [m], the mass centre ahead of the axle, of the rear
     platform, and the same of the front one; `pivot` [m], of the pin ahead of the rear axle; `handle` [m], of the front
     axle ahead of the pin; `angle` φ [rad], `speed` along the heading [m/s] and turning `rate` [rad/s] at the start;
-    `form` and `equations` as in `roller_racer`.
+    `form` and `equations` as in `roller_racer`; `model`: from its Lagrangian, or as rigid bodies `rear` and `front`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """
@@ -50,11 +51,13 @@ def nonholonomic_cart(
         "pivot": pivot,
         "handle": handle,
     }
+    rigid = of_bodies(model, form=form == "frame", equations=equations is None)
+    start = {"angle": angle, "speed": speed, "rate": rate}
     return build(
         "nonholonomic_cart",
-        wheeled(form, equations, parameters, angle=angle, speed=speed, rate=rate),
+        wheeled_bodies(parameters, **start) if rigid else wheeled(form, equations, parameters, **start),
         t1=5.0,
-        observe=observe_coordinates,
+        observe=observe_bodies if rigid else observe_coordinates,
         description="Cart of two wheeled platforms with a pin, coasting.",
         references=_REFERENCES,
     )

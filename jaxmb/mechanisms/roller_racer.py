@@ -5,11 +5,11 @@ from typing import Literal
 import numpy as np
 
 from ..lagrangian import AbstractEquations
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
-from ._wheeled import wheeled
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from ._wheeled import observe_bodies, wheeled, wheeled_bodies
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def roller_racer(
     *,
     mass: float = 2.0,
@@ -22,6 +22,7 @@ def roller_racer(
     rate: float = 0.0,
     form: Literal["frame", "constraints", "connection"] = "frame",
     equations: AbstractEquations | None = None,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """A racer of two platforms with a pin between them, each on an axle whose wheels do not slip sideways, coasting.
 
@@ -36,7 +37,8 @@ def roller_racer(
     heading [m/s] and turning `rate` [rad/s] at the start; `form`: the velocities are speed and turning rate, in a frame
     that satisfies the constraints; or the coordinates' rates, with the constraints; or those of θ and φ, with a
     connection that is singular where the platforms are in line; `equations`: how they are written, default
-    `Projected()`.
+    `Projected()`; `model`: from its Lagrangian, or as rigid bodies `rear` and `front`, the latter with some of the
+    mass, in the pin, where it adds to the rear one's as if it were fixed to it.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """
@@ -50,14 +52,34 @@ def roller_racer(
         "pivot": pivot,
         "handle": handle,
     }
+    rigid = of_bodies(model, form=form == "frame", equations=equations is None)
+    start = {"angle": angle, "speed": speed, "rate": rate}
     return build(
         "roller_racer",
-        wheeled(form, equations, parameters, angle=angle, speed=speed, rate=rate),
+        wheeled_bodies(_with_mass_in_front(parameters), **start)
+        if rigid
+        else wheeled(form, equations, parameters, **start),
         t1=5.0,
-        observe=observe_coordinates,
+        observe=observe_bodies if rigid else observe_coordinates,
         description="Roller racer: two wheeled platforms with a pin, coasting (Krishnaprasad and Tsakiris).",
         references=_REFERENCES,
     )
+
+
+def _with_mass_in_front(p):
+    """The same machine with a share of the mass in the pin: it moves with the rear platform, whose own mass centre
+    goes as far behind its axle as the common one needs to stay there.
+    """
+    arm = p["mass"] * p["pivot"] ** 2
+    ratio = p["inertia"] / (p["inertia"] + 2 * arm)
+    rear = p["mass"] / (1 + ratio)
+    return p | {
+        "mass": rear,
+        "front_mass": ratio * rear,
+        "ahead": -ratio * p["pivot"],
+        "front_ahead": -p["handle"],
+        "inertia": p["inertia"] - ratio * arm,
+    }
 
 
 _REFERENCES = References(

@@ -1,17 +1,21 @@
 """The spherical four-bar linkage."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import rotations
+from .. import rotations, spatial
+from .._user import Force
 from ..lagrangian import Holonomic, LagrangianSystem
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ..system import parameters as parameters_of
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 _COUPLER = ((0.06, -0.004, 0.0), (-0.004, 0.05, 0.0), (0.0, 0.0, 0.03))
 _CENTRES = ((0.02, -0.05, 0.1), (0.05, -0.12, 0.15), (0.0, -0.08, 0.12))
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def spherical_four_bar(
     *,
     arcs: tuple[float, float, float, float] = (30.0, 75.0, 60.0, 80.0),
@@ -24,6 +28,7 @@ def spherical_four_bar(
     speed: float = 2.0,
     branch: int = 1,
     gravity: float = 9.81,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """Four links turn about axes through the centre of a sphere; a constant torque drives the input.
 
@@ -38,38 +43,112 @@ def spherical_four_bar(
     **Arguments:** `arcs` [degree] of input, coupler, output and ground; `inertias` [kg m²] of input and output
     about their axes; `coupler_inertia` [kg m²] about the sphere's centre, in its frame; `masses` [kg] and mass
     `centres` [m] of input, coupler and output in their frames; `torque` [N m] on the input; `angle` θ [rad] and
-    `speed` θ̇ [rad/s] at the start; `branch` of the assembly, 1 or −1; `gravity` [m/s²] along −y.
+    `speed` θ̇ [rad/s] at the start; `branch` of the assembly, 1 or −1; `gravity` [m/s²] along −y;
+    `model`: from its Lagrangian, or as rigid bodies `input`, `coupler` and `output` on four hinges through the centre,
+    three of whose twenty rows others imply.
 
-    **Labels:** `theta`, `psi` [rad], `e0` … `e3`, and the rates `u0`, `u1` [rad/s], ….
+    **Labels:** `theta`, `psi` [rad], of rigid bodies in (−π, π] and [0, 2π); `e0` … `e3`, and the rates `u0`, `u1`
+    [rad/s], ….
     """
-    q = _closed(np.radians(np.asarray(arcs, float)), angle, branch)
-    system = LagrangianSystem(
+    parameters = {
+        "arcs": np.radians(np.asarray(arcs, float)),
+        "inertias": inertias,
+        "coupler_inertia": coupler_inertia,
+        "masses": masses,
+        "centres": centres,
+        "torque": torque,
+        "gravity": gravity,
+    }
+    q = _closed(parameters["arcs"], angle, branch)
+    rigid = of_bodies(model)
+    return build(
+        "spherical_four_bar",
+        _bodies(parameters, q) if rigid else _on_paper(parameters, q),
+        t1=3.0,
+        observe=_observe_bodies if rigid else observe_coordinates,
+        description="Spherical four-bar linkage, in angles and the coupler's Euler parameters (Dooley and McCarthy).",
+        references=_REFERENCES,
+        fix={} if rigid else {"theta": angle},
+        rates={"input.wz" if rigid else "theta": speed},
+    )
+
+
+def _on_paper(parameters, q) -> LagrangianSystem:
+    return LagrangianSystem(
         kinetic=_kinetic,
         potential=_potential,
         force=_force,
         constraints=[Holonomic("input", _input), Holonomic("output", _output), Holonomic("unit", _unit)],
         q=q,
-        parameters={
-            "arcs": np.radians(np.asarray(arcs, float)),
-            "inertias": inertias,
-            "coupler_inertia": coupler_inertia,
-            "masses": masses,
-            "centres": centres,
-            "torque": torque,
-            "gravity": gravity,
-        },
+        parameters=parameters,
         coordinates=("theta", "psi", "e0", "e1", "e2", "e3"),
     )
-    return build(
-        "spherical_four_bar",
-        system,
-        t1=3.0,
-        observe=observe_coordinates,
-        description="Spherical four-bar linkage, in angles and the coupler's Euler parameters (Dooley and McCarthy).",
-        references=_REFERENCES,
-        fix={"theta": angle},
-        rates={"theta": speed},
+
+
+def _bodies(p, q) -> Scene:
+    """The links with their frames, and their inertia, at the sphere's centre, where hinges hold them; so weights have
+    points of their own.
+    """
+    alpha, eta, beta, gamma = p["arcs"]
+    z = np.array([0.0, 0.0, 1.0])
+    tilted = lambda a: np.array([0.0, -np.sin(a), np.cos(a)])
+    inertias = (p["inertias"][0] * np.eye(3), p["coupler_inertia"], p["inertias"][1] * np.eye(3))
+    ground = rotations.from_axis_angle((1.0, 0.0, 0.0), gamma)
+    attitudes = (
+        rotations.from_axis_angle(z, q[0]),
+        jnp.asarray(q[2:]),
+        rotations.multiply(ground, rotations.from_axis_angle(z, q[1])),
     )
+    names = ("input", "coupler", "output")
+    bodies = [
+        spatial.Body(name, mass=p["masses"][k], inertia=inertias[k], orientation=attitudes[k])
+        for k, name in enumerate(names)
+    ]
+    weights = [
+        Force(
+            f"{name}_weight",
+            name,
+            _weight,
+            parameters={"weight": p["masses"][k] * p["gravity"], "centre": p["centres"][k]},
+            potential=lambda poses, t, p: p["weight"] * rotations.rotate(poses[0, 3:], p["centre"])[1],
+        )
+        for k, name in enumerate(names)
+    ]
+    axes = {
+        "input_axle": ("ground", "input", z, z),
+        "input_hinge": ("input", "coupler", tilted(alpha), z),
+        "output_hinge": ("coupler", "output", tilted(eta), tilted(beta)),
+        "output_axle": ("ground", "output", tilted(gamma), z),
+    }
+    centre = np.zeros(3)
+    hinges = [
+        spatial.Revolute(name, a, b, point_a=centre, point_b=centre, axis_a=axis_a, axis_b=axis_b)
+        for name, (a, b, axis_a, axis_b) in axes.items()
+    ]
+    return Scene(bodies, joints=hinges, forces=[spatial.Torque("drive", "input", torque=p["torque"] * z), *weights])
+
+
+def _weight(poses, velocities, t, p):
+    force = jnp.zeros(3).at[1].set(-p["weight"])
+    return jnp.concatenate([force, rotations.cross(p["centre"], rotations.unrotate(poses[0, 3:], force))])[None]
+
+
+def _observe_bodies(trajectory):
+    first, coupler, last = (trajectory[name] for name in ("input", "coupler", "output"))
+    # The output's axle is tilted by the ground arc: its Euler parameters are those of a turn about z after that.
+    axle = parameters_of(trajectory.system)["output_axle.axis_a"]
+    tilt = rotations.from_axis_angle((1.0, 0.0, 0.0), jnp.arctan2(-axle[1], axle[2]))
+    turned = jax.vmap(lambda p: rotations.multiply(rotations.conjugate(tilt), p))(last.orientation)
+    angle = lambda p: 2 * jnp.arctan2(p[:, 3], p[:, 0])
+    rates = jax.vmap(rotations.rates)(coupler.orientation, coupler.angular_velocity)
+    observed = {
+        "theta": (angle(first.orientation) + jnp.pi) % (2 * jnp.pi) - jnp.pi,
+        "psi": angle(turned) % (2 * jnp.pi),
+        "u0": first.angular_velocity[:, 2],
+        "u1": last.angular_velocity[:, 2],
+    }
+    observed |= {f"e{k}": coupler.orientation[:, k] for k in range(4)}
+    return observed | {f"u{k + 2}": rates[:, k] for k in range(4)}
 
 
 def _closed(arcs, theta, branch):

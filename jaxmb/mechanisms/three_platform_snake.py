@@ -1,5 +1,6 @@
 """The SE(2)-snake with three platforms on wheels."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -8,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .. import planar
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
-@mechanism(variants=("gait",))
+@mechanism(variants=("gait", "model"))
 def three_platform_snake(
     *,
     mass: float = 1.0,
@@ -23,6 +26,7 @@ def three_platform_snake(
     gait: Callable[[Array], Array] | None = None,
     form: Literal["connection", "constraints"] = "connection",
     equations: AbstractEquations | None = None,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """Three platforms in a row, joined by pins, each with one axle in its middle whose wheels do not slip sideways.
 
@@ -37,41 +41,91 @@ def three_platform_snake(
     **Arguments:** `mass` [kg], `inertia` [kg m²] and `half` length [m] of a platform; `angles` φ [rad] and `rates`
     [rad/s] at the start, of a free motion; `gait(t)`: the angles (2,) as a function of time that holds them instead;
     `form`: the velocities are those of the shape, with the connection, or the coordinates' rates, with constraints (as
-    always with a gait); `equations`: how they are written, default `Projected()`.
+    always with a gait); `equations`: how they are written, default `Projected()`; `model`: from its Lagrangian, or as
+    rigid bodies `rear`, `middle` and `front`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi1`, `phi2` [rad], and the velocities `u0`, `u1`, ….
     """
     if form not in ("connection", "constraints"):
         raise ValueError(f"The forms are connection, constraints; got {form!r}.")
+    rigid = of_bodies(model, form=form == "connection", equations=equations is None)
     parameters = {"mass": mass, "inertia": inertia, "half": half}
     numbers = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in parameters.items()}
     shape, turning = jnp.asarray(angles, jnp.result_type(float)), jnp.asarray(rates, jnp.result_type(float))
-    constraints: list[Any] = [Pfaffian("wheels", _wheels)]
     if gait is not None:
-        hold = gait
-        constraints.append(Holonomic("gait", lambda t, q, p: q[3:] - hold(t)))
         shape, turning = jax.jvp(gait, (jnp.zeros(()),), (jnp.ones(()),))
     q = jnp.concatenate([jnp.zeros(3), shape])
-    constrained = form == "constraints" or gait is not None
-    moved = jnp.concatenate([-_connection(0.0, q, numbers) @ turning, turning])
-    system = LagrangianSystem(
-        kinetic=_kinetic,
-        constraints=constraints if constrained else (),
-        kinematics=Rates() if constrained else Connection((3, 4), (0, 1, 2), _connection),
-        equations=equations,
-        q=q,
-        u=moved if constrained else turning,
-        parameters=parameters,
-        coordinates=("x", "y", "theta", "phi1", "phi2"),
-    )
+    v = jnp.concatenate([-_connection(0.0, q, numbers) @ turning, turning])
+    if rigid:
+        system = _bodies(numbers, q, v, gait)
+    else:
+        held = form == "constraints" or gait is not None
+        system = LagrangianSystem(
+            kinetic=_kinetic,
+            constraints=_constraints(gait) if held else (),
+            kinematics=Rates() if held else Connection((3, 4), (0, 1, 2), _connection),
+            equations=equations,
+            q=q,
+            u=v if held else turning,
+            parameters=parameters,
+            coordinates=("x", "y", "theta", "phi1", "phi2"),
+        )
     return build(
         "three_platform_snake",
         system,
         t1=1.0 if gait is None else 2 * np.pi,
-        observe=observe_coordinates,
+        observe=_observe_bodies if rigid else observe_coordinates,
         description="SE(2)-snake of three platforms on wheels (Krishnaprasad and Tsakiris).",
         references=_REFERENCES if gait is None else None,
     )
+
+
+def _constraints(gait) -> list[Any]:
+    wheels = Pfaffian("wheels", _wheels)
+    return [wheels] if gait is None else [wheels, Holonomic("gait", lambda t, q, p: q[3:] - gait(t))]
+
+
+def _bodies(p, q, v, gait) -> Scene:
+    """The platforms as rigid bodies `rear`, `middle` and `front`."""
+    names = ("rear", "middle", "front")
+    (places, headings), (velocities, turning) = jax.jvp(lambda q: _platforms(q, p["half"]), (q,), (v,))
+    bodies = [
+        planar.Body(
+            name,
+            mass=p["mass"],
+            inertia=p["inertia"],
+            position=places[k],
+            angle=headings[k],
+            velocity=velocities[k],
+            angular_velocity=turning[k],
+        )
+        for k, name in enumerate(names)
+    ]
+    end = jnp.stack([p["half"], jnp.zeros_like(p["half"])])
+    pairs = list(itertools.pairwise(names))
+    joints: list[Any] = [
+        planar.Revolute(f"pin{k + 1}", *pair, point_a=end, point_b=-end) for k, pair in enumerate(pairs)
+    ]
+    joints += [planar.KnifeEdge(f"{name}_wheels", name) for name in names]
+    if gait is not None:
+        joints += [
+            planar.Driver(f"phi{k + 1}", *pair, quantity="angle", motion=lambda t, p, k=k: gait(t)[k])
+            for k, pair in enumerate(pairs)
+        ]
+    return Scene(bodies, joints=joints)
+
+
+def _observe_bodies(trajectory):
+    rear, middle, front = (trajectory[name] for name in ("rear", "middle", "front"))
+    return {
+        "x": middle.position[:, 0],
+        "y": middle.position[:, 1],
+        "theta": middle.angle,
+        "phi1": middle.angle - rear.angle,
+        "phi2": front.angle - middle.angle,
+        "u0": middle.angular_velocity - rear.angular_velocity,
+        "u1": front.angular_velocity - middle.angular_velocity,
+    }
 
 
 def _platforms(q, half):
