@@ -69,6 +69,8 @@ TWINS = {
     "constant_speed_particle": (lambda q, p: q, 1e-9),
     "appell_hamel": (lambda q, p: q, 1e-9),
     "spherical_four_bar": (links_on_sphere, 1e-7),
+    "rough_ring": (lambda q, p: q, 1e-9),
+    "tracking_chain": (lambda q, p: jnp.stack([q, jnp.zeros_like(q)], axis=1).ravel(), 1e-7),
 }
 
 

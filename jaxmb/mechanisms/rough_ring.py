@@ -3,13 +3,22 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .. import planar
+from .._forces import Gravity
 from ..lagrangian import Friction, Holonomic, LagrangianSystem
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def rough_ring(
-    *, radius: float = 1.0, friction: float = 0.3, speed: float = 2.0, mass: float = 1.0, gravity: float = 0.0
+    *,
+    radius: float = 1.0,
+    friction: float = 0.3,
+    speed: float = 2.0,
+    mass: float = 1.0,
+    gravity: float = 0.0,
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """A bead slides on a ring with Coulomb friction in proportion to the ring's own force on it.
 
@@ -19,28 +28,49 @@ def rough_ring(
     Source: F. E. Udwadia and R. E. Kalaba, Analytical Dynamics, Cambridge, 1996, on constraints that are not ideal.
     Reference values in closed form.
 
-    **Arguments:** `radius` R [m]; `friction` μ; `speed` v0 [m/s]; `mass` [kg]; `gravity` [m/s²] along −y.
+    **Arguments:** `radius` R [m]; `friction` μ; `speed` v0 [m/s]; `mass` [kg]; `gravity` [m/s²] along −y;
+    `model`: from its Lagrangian, or as a point mass `bead` on a rod of length R.
 
     **Labels:** `x`, `y` [m], `u0`, `u1` [m/s].
     """
-    system = LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
-        potential=lambda t, q, p: p["mass"] * p["gravity"] * q[1],
-        constraints=[Holonomic("ring", lambda t, q, p: 0.5 * (jnp.dot(q, q) / p["radius"] - p["radius"]))],
-        nonideal=[Friction("ring", "friction")],
-        q=(radius, 0.0),
-        u=(0.0, speed),
-        parameters={"radius": radius, "friction": friction, "mass": mass, "gravity": gravity},
-        coordinates=("x", "y"),
-    )
+    rigid = of_bodies(model)
+    if rigid:
+        system = _bead(radius, friction, speed, mass, gravity)
+    else:
+        system = LagrangianSystem(
+            kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
+            potential=lambda t, q, p: p["mass"] * p["gravity"] * q[1],
+            constraints=[Holonomic("ring", lambda t, q, p: 0.5 * (jnp.dot(q, q) / p["radius"] - p["radius"]))],
+            nonideal=[Friction("ring", "friction")],
+            q=(radius, 0.0),
+            u=(0.0, speed),
+            parameters={"radius": radius, "friction": friction, "mass": mass, "gravity": gravity},
+            coordinates=("x", "y"),
+        )
     return build(
         "rough_ring",
         system,
         t1=3.0,
-        observe=observe_coordinates,
+        observe=_observe_bead if rigid else observe_coordinates,
         description="Bead on a ring with Coulomb friction; a constraint that is not ideal.",
         references=_references(),
     )
+
+
+def _bead(radius, friction, speed, mass, gravity) -> Scene:
+    return Scene(
+        [planar.PointMass("bead", mass=mass, position=(radius, 0.0), velocity=(0.0, speed))],
+        joints=[planar.Distance("ring", "ground", "bead", length=radius)],
+        forces=[
+            planar.Friction("roughness", "ring", coefficient=friction, smoothing=1e-6),
+            Gravity((0.0, -gravity)),
+        ],
+    )
+
+
+def _observe_bead(trajectory):
+    (x, y), (u0, u1) = trajectory["bead"].position.T, trajectory["bead"].velocity.T
+    return {"x": x, "y": y, "u0": u0, "u1": u1}
 
 
 def _references():

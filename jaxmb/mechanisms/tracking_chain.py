@@ -1,13 +1,20 @@
 """Three masses that follow a desired motion."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import planar
+from .._servo import Servo as ServoOfJoint
+from .._user import Constraint, Force
 from ..lagrangian import LagrangianSystem, Servo
-from ._base import Mechanism, References, build, mechanism, observe_coordinates
+from ..scene import Scene
+from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+
+_MASSES = ("one", "two", "three")
 
 
-@mechanism()
+@mechanism(variants=("model",))
 def tracking_chain(
     *,
     masses: tuple[float, float, float] = (1.0, 2.0, 1.5),
@@ -17,6 +24,7 @@ def tracking_chain(
     drive: float = 3.0,
     offset: float = 0.0,
     gains: tuple[float, float] = (0.0, 0.0),
+    model: Model = "lagrangian",
 ) -> Mechanism:
     """Three masses in a row on nonlinear springs, driven at the end, that are to move as two given functions of time.
 
@@ -30,31 +38,32 @@ def tracking_chain(
 
     **Arguments:** `masses` [kg]; `stiffness` k [N/m] and `cubic` κ [N/m³]; `damping` [N s/m] of every mass; `drive`
     [rad/s], of the force sin on the last mass; `offset` [m], of the start: q1 too far ahead by it, q3 − q1 behind
-    by twice as much; `gains` [1/s, 1/s²] with which deviations are brought to zero.
+    by twice as much; `gains` [1/s, 1/s²] with which deviations are brought to zero;
+    `model`: from its Lagrangian, or as point masses `one`, `two` and `three` on a rail along x.
 
     **Labels:** `q1`, `q2`, `q3` [m], `u0`, `u1`, `u2` [m/s].
     """
-    system = LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(p["masses"], v * v),
-        potential=_potential,
-        force=lambda t, q, v, p: (-p["damping"] * v).at[2].add(jnp.sin(p["drive"] * t)),
-        constraints=[Servo("track", _deviation, damping=gains[0], stiffness=gains[1])],
-        q=(offset, 0.0, 0.2 - offset),
-        u=(0.5, 0.0, 0.5),
-        parameters={
-            "masses": masses,
-            "stiffness": stiffness,
-            "cubic": cubic,
-            "damping": damping,
-            "drive": drive,
-        },
-        coordinates=("q1", "q2", "q3"),
-    )
+    q, u = (offset, 0.0, 0.2 - offset), (0.5, 0.0, 0.5)
+    numbers = {"stiffness": stiffness, "cubic": cubic, "damping": damping, "drive": drive}
+    rigid = of_bodies(model)
+    if rigid:
+        system = _points(masses, numbers, gains, q, u)
+    else:
+        system = LagrangianSystem(
+            kinetic=lambda t, q, v, p: 0.5 * jnp.dot(p["masses"], v * v),
+            potential=_potential,
+            force=_applied,
+            constraints=[Servo("track", _deviation, damping=gains[0], stiffness=gains[1])],
+            q=q,
+            u=u,
+            parameters={"masses": masses, **numbers},
+            coordinates=("q1", "q2", "q3"),
+        )
     return build(
         "tracking_chain",
         system,
         t1=20.0,
-        observe=_observe,
+        observe=_observe_points if rigid else _observe,
         description="Three masses held to a desired motion by the least control force (Kalaba and Udwadia).",
         references=_REFERENCES,
     )
@@ -65,13 +74,48 @@ def _potential(t, q, p):
     return jnp.dot(p["stiffness"], d**2) / 2 + jnp.dot(p["cubic"], d**4) / 4
 
 
+def _applied(t, q, v, p):
+    return (-p["damping"] * v).at[2].add(jnp.sin(p["drive"] * t))
+
+
 def _deviation(t, q, p):
     return jnp.stack([q[0] - 0.5 * jnp.sin(t), q[2] - q[0] - 0.2 * jnp.cos(2 * t)])
+
+
+def _points(masses, numbers, gains, q, u) -> Scene:
+    bodies = [
+        planar.PointMass(name, mass=m, position=(x, 0.0), velocity=(v, 0.0))
+        for name, m, x, v in zip(_MASSES, masses, q, u, strict=True)
+    ]
+    origin = (0.0, 0.0)
+    rails = [
+        planar.PointOnLine(f"rail_{name}", "ground", name, point_a=origin, point_b=origin, axis_a=(1.0, 0.0))
+        for name in _MASSES
+    ]
+    track = Constraint("track", _MASSES, lambda poses, t, p: _deviation(t, poses[:, 0], p), rows=2)
+    springs = Force(
+        "springs", _MASSES, _wrenches, parameters=numbers, potential=lambda x, t, p: _potential(t, x[:, 0], p)
+    )
+    return Scene(bodies, joints=[*rails, ServoOfJoint(track, damping=gains[0], stiffness=gains[1])], forces=[springs])
+
+
+def _wrenches(poses, velocities, t, p):
+    q, v = poses[:, 0], velocities[:, 0]
+    along = _applied(t, q, v, p) - jax.grad(_potential, 1)(t, q, p)
+    return jnp.pad(along[:, None], ((0, 0), (0, 2)))
 
 
 def _observe(trajectory):
     force = trajectory.constraint_forces["track"]
     return observe_coordinates(trajectory) | {"force1": force[:, 0], "force3": force[:, 2]}
+
+
+def _observe_points(trajectory):
+    places = {f"q{k + 1}": trajectory[name].position[:, 0] for k, name in enumerate(_MASSES)}
+    rates = {f"u{k}": trajectory[name].velocity[:, 0] for k, name in enumerate(_MASSES)}
+    # The program's rows are of q1 and of q3 − q1.
+    first, second = trajectory.reactions["track"].multipliers.T
+    return places | rates | {"force1": first - second, "force3": second}
 
 
 _REFERENCES = References(
