@@ -35,7 +35,8 @@ def generalized_force(space, coordinates, poses, velocities, law):
     return jax.vmap(space.pull_back)(poses, gradient)
 
 
-def _points(part, space):
+def fill_points(part, space):
+    """The part with its points, the mass centres where none are given, checked."""
     zero = jnp.zeros(space.dimension)
     for field in ("point_a", "point_b"):
         part = fill(part, field, zero)
@@ -43,16 +44,19 @@ def _points(part, space):
     return part
 
 
-def _separation(space, part, poses, velocities):
-    """World vector from point A to point B and its rate."""
-    d = space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
-    rate = space.point_velocity(poses[1], velocities[1], part.point_b) - space.point_velocity(
+def separation(space, part, poses):
+    """World vector from point A to point B."""
+    return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
+
+
+def separation_rate(space, part, poses, velocities):
+    """Its rate."""
+    return space.point_velocity(poses[1], velocities[1], part.point_b) - space.point_velocity(
         poses[0], velocities[0], part.point_a
     )
-    return d, rate
 
 
-def _pair(space, part, poses, force_W):
+def between_points(space, part, poses, force_W):
     """Wrenches of `force_W` on B at point B and of its reaction on A at point A."""
     return jnp.stack(
         [
@@ -87,24 +91,24 @@ class SpringDamper(AbstractForce):
         return (self.body_a, self.body_b)
 
     def resolve(self, space, poses):
-        part = _points(self, space)
-        d, _ = _separation(space, part, poses, jnp.zeros((2, space.velocity_size)))
-        part = fill(part, "free_length", norm(d))
+        part = fill_points(self, space)
+        if part.free_length is None:
+            part = fill(part, "free_length", norm(separation(space, part, poses)))
         for field in ("stiffness", "damping", "free_length"):
             positive(part, field, getattr(part, field), zero=True)
         return part
 
     def wrenches(self, space, poses, velocities, t):
-        d, rate = _separation(space, self, poses, velocities)
+        d, rate = separation(space, self, poses), separation_rate(space, self, poses, velocities)
         square = jnp.dot(d, d)
         apart = square > 0
         length = jnp.sqrt(jnp.where(apart, square, 1.0))
         pretension = jnp.where(apart, self.stiffness * self.free_length / length, 0.0)
         damping = jnp.where(apart, self.damping * jnp.dot(d, rate) / length**2, 0.0)
-        return _pair(space, self, poses, -(self.stiffness - pretension + damping) * d)
+        return between_points(space, self, poses, -(self.stiffness - pretension + damping) * d)
 
     def energy(self, space, poses, t):
-        d = space.point(poses[1], self.point_b) - space.point(poses[0], self.point_a)
+        d = separation(space, self, poses)
         # ½ k (l − l0)², written so that its derivative at l = 0 is finite.
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
 
@@ -131,11 +135,11 @@ class Damper(AbstractForce):
 
     def resolve(self, space, poses):
         positive(self, "damping", self.damping, zero=True)
-        return _points(self, space)
+        return fill_points(self, space)
 
     def wrenches(self, space, poses, velocities, t):
-        _, rate = _separation(space, self, poses, velocities)
-        return _pair(space, self, poses, -self.damping * rate)
+        rate = separation_rate(space, self, poses, velocities)
+        return between_points(space, self, poses, -self.damping * rate)
 
 
 class PointForce(AbstractForce):

@@ -76,10 +76,10 @@ class Scene(eqx.Module):
         layout = Layout(space, tuple(body.rotates for body in self.bodies))
         index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
         guess = State(
-            jnp.concatenate([body.pose() for body in self.bodies]),
-            jnp.concatenate([body.velocities() for body in self.bodies]),
+            jnp.asarray(np.concatenate([body.pose() for body in self.bodies])),
+            jnp.asarray(np.concatenate([body.velocities() for body in self.bodies])),
         )
-        given = jnp.concatenate([guess.q, jnp.asarray(space.ground, guess.q.dtype)])[layout.pose_index]
+        given = np.append(guess.q, np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):
@@ -90,10 +90,10 @@ class Scene(eqx.Module):
             _check_finite(part)
             if isinstance(part, AbstractNonIdeal):
                 joint, own = joints[part.joint]
-                laws.append((part.resolve(space, joint, given[np.array(own)]), own))
+                laws.append((part.resolve(space, joint, given[list(own)]), own))
                 continue
             own = tuple(index[name] for name in part.bodies)
-            poses = given[np.array(own)]
+            poses = given[list(own)]
             resolved = part.resolve(space, poses)
             _check_rotation(resolved, own, layout, poses)
             joints[part.name] = resolved, own
@@ -102,8 +102,10 @@ class Scene(eqx.Module):
         kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
         of_joint = {law.name: law.joint for law, _ in laws}
         system = RigidBodySystem(
-            mass=jnp.stack([body.mass for body in self.bodies]),
-            rotary=jnp.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies]),
+            mass=jnp.asarray(np.stack([body.mass for body in self.bodies])),
+            rotary=jnp.asarray(
+                np.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies])
+            ),
             gravity=None if gravity is None else gravity.acceleration,
             constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
             velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
@@ -123,7 +125,7 @@ class Scene(eqx.Module):
 
 
 def _no_inertia(space):
-    return jnp.zeros((3, 3)) if space.dimension == 3 else jnp.zeros(())
+    return np.zeros((3, 3) if space.dimension == 3 else (), jnp.result_type(float))
 
 
 def _check_kinds(scene: Scene):
@@ -167,8 +169,8 @@ def _check_names(scene: Scene):
         if not part.name or "." in part.name:
             raise ValueError(f"{label(part)}: a name must not be empty or contain a dot.")
         seen.add(part.name)
-    known = [body.name for body in scene.bodies] + [GROUND]
-    joints = [part.name for part in scene.joints]
+    known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
+    joints = dict.fromkeys(part.name for part in scene.joints)
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractNonIdeal):
             if part.joint not in joints:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import linkages
+from oracles import linkages, trains
 from scipy.optimize import curve_fit
 
 import jaxmb as mb
@@ -37,6 +37,7 @@ CASES = [
     ("rod_chain", {"n": 5}, 1e-6),
     ("rod_chain", {"n": 10}, 1e-6),
     pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.slow),
+    ("train", {}, 1e-5),
     ("four_bar", {}, 1e-7),
     ("slider_crank", {}, 1e-7),
     ("andrews", {}, 1e-8),
@@ -108,6 +109,13 @@ def test_free_body_keeps_its_angular_momentum():
     mechanism, trajectory = run("free_body")
     start = mechanism.system.angular_momentum(mechanism.state.q, mechanism.state.u)
     np.testing.assert_allclose(trajectory.angular_momentum, np.tile(start, (3, 1)), rtol=0, atol=1e-8)
+
+
+def test_values_of_the_train_are_those_of_an_independent_model():
+    references = library("train").references
+    q, u, forces = trains.Train(4).motion(references.times)
+    found = np.concatenate([q[:, :, 0], u[:, :, 0], forces], axis=1)
+    np.testing.assert_allclose(found / references.scales, references.values / references.scales, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["four_bar", "slider_crank"])

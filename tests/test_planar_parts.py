@@ -303,6 +303,22 @@ def springs(damping):
         "Bushing": planar.Bushing(
             "F", "a", "b", stiffness=(1.0, 2.0, 3.0), damping=damping * np.array([0.6, 0.5, 0.4]), **points
         ),
+        "DraftGear": planar.DraftGear(
+            "F",
+            "a",
+            "b",
+            stiffness=30.0,
+            unloading=1.0 - 0.6 * damping,
+            preload=2.0,
+            slack=0.05,
+            travel=0.2,
+            stop_stiffness=50.0,
+            damping=0.5 * damping,
+            transition=2.0,
+            smoothing=0.3,
+            free_length=0.4,
+            **points,
+        ),
     }
 
 

@@ -30,12 +30,14 @@ from .spherical_four_bar import spherical_four_bar as spherical_four_bar
 from .stiff_four_bar import stiff_four_bar as stiff_four_bar
 from .three_platform_snake import three_platform_snake as three_platform_snake
 from .tracking_chain import tracking_chain as tracking_chain
+from .train import train as train
 
 _LIBRARY = {
     function.__name__: function
     for function in (
         pendulum,
         rod_chain,
+        train,
         four_bar,
         stiff_four_bar,
         slider_crank,

@@ -3,6 +3,7 @@
 from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
 from .._friction import Friction as Friction
 from .bodies import Body as Body, PointMass as PointMass, box as box, disc as disc, rod as rod
+from .couplers import DraftGear as DraftGear
 from .drivers import Driver as Driver
 from .forces import Bushing as Bushing, Torque as Torque, TorsionalSpringDamper as TorsionalSpringDamper
 from .joints import (

@@ -47,7 +47,9 @@ def stack(parts: Sequence[tuple[AbstractPart, tuple[int, ...]]], layout: Layout)
         groups.setdefault(key, []).append((leaves, part.name, bodies))
     out = []
     for (structure, _, _), members in groups.items():
-        leaves = [jnp.stack(column) for column in zip(*(member[0] for member in members), strict=True)]
+        # By NumPy: thousands of operands make a program of their own for XLA.
+        columns = zip(*(member[0] for member in members), strict=True)
+        leaves = [jnp.asarray(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
         out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout))
     return tuple(out)

@@ -97,11 +97,13 @@ class Layout:
         zero.
         """
         flat = np.concatenate([self.velocity_index[bodies].ravel() for bodies in groups])
-        contributions = [np.flatnonzero(flat == column) for column in range(self.nu)]
-        width = max((len(c) for c in contributions), default=0)
-        return np.array([np.pad(c, (0, width - len(c)), constant_values=len(flat)) for c in contributions]).reshape(
-            self.nu, width
-        )
+        entries = np.argsort(flat, kind="stable")
+        column = flat[entries]
+        first = np.searchsorted(column, np.arange(self.nu + 1))
+        source = np.full((self.nu, np.max(np.diff(first), initial=0)), len(flat))
+        own = slice(first[-1])
+        source[column[own], np.arange(first[-1]) - first[column[own]]] = entries[own]
+        return source
 
     def reaction_source(
         self, joints: list[tuple[tuple[str, ...], tuple[tuple[int, ...], ...]]], names: tuple[str, ...]
