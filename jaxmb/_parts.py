@@ -31,6 +31,8 @@ GROUND = "ground"
 
 def number(value: Any) -> Array:
     """A strongly typed float array."""
+    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
+        return value
     array = np.asarray(value) if not isinstance(value, Array) else value
     if not (np.issubdtype(array.dtype, np.number) or np.issubdtype(array.dtype, np.bool_)):
         raise ValueError(f"expected a number or an array of numbers, got {value!r}")

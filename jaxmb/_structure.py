@@ -4,9 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .assembly import nearest, open_joints, residual_size, tolerance
+from . import _chain_assembly
+from .assembly import INDEPENDENT, nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
 from .system._base import Ranks
+from .system.chain import may_be_long
 from .system.rigid_bodies import Implied, RigidBodySystem
 
 # Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and
@@ -22,6 +24,9 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations.
     """
+    if may_be_long(system) and bool(_independent_chain(system)):
+        rows = system.velocity_rows
+        return Ranks(rows, rows, rows, rows), ()
     found = _analyse(system)
     if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
         raise ValueError(
@@ -37,6 +42,16 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
     _check_determined(system, implied)
     return Ranks(position, coordinate, velocity, int(found["acceleration rank"])), implied
+
+
+@eqx.filter_jit
+def _independent_chain(system):
+    """Whether a long chain of joints can be assembled, and none of them is near to being redundant."""
+    held = np.zeros(system.nq, bool)
+    _, ok, pivot = _chain_assembly.positions(
+        system, jnp.zeros((), system.guess.q.dtype), system.guess.q, held, tolerance(system.guess.q.dtype)
+    )
+    return ok & (pivot > INDEPENDENT)
 
 
 @eqx.filter_jit

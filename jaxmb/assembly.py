@@ -15,13 +15,18 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from . import _chain_assembly
 from ._types import Scalar, State, VectorLike
 from .elimination import full_pivot
 from .rotations import normalize
 from .system import AbstractSystem, RigidBodySystem
+from .system.chain import is_long
 from .system.coordinates import prescribe
 
 _ITERATIONS = 100
+
+# Smallest pivot of block elimination, the square of a distance between rows of unit norm, that counts as independent.
+INDEPENDENT = 1e-5
 
 # Newton on the optimality conditions, which start near their solution: size of its last step, and how many at most.
 _REFINED = 1e-10
@@ -94,6 +99,9 @@ def positions(
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
+    if is_long(system):
+        q, ok, pivot = _chain_assembly.positions(system, t, guess, fixed, tolerance(guess.dtype))
+        return q, ok & (pivot > INDEPENDENT)
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
     start = lax.stop_gradient(guess)
     frozen = lax.stop_gradient(system)
@@ -151,6 +159,9 @@ def velocities(
     """The velocities nearest to the guess with some rates held; and whether every residual is at rounding level."""
     if system.velocity_rows == 0:
         return guess, jnp.array(True)
+    if is_long(system):
+        u, pivot = _chain_assembly.velocities(system, t, q, guess, np.array(held))
+        return u, jnp.all(jnp.isfinite(u)) & (pivot > INDEPENDENT)
     scale = jnp.where(np.array(held), 0.0, system.velocity_scale())
     u, rank, ok = guess, system.velocity_rank, jnp.array(True)
     jacobian = system.velocity_jacobian(t, q, u)

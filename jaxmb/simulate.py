@@ -15,12 +15,13 @@ from jaxtyping import Array, ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State
 from .elimination import full_pivot
-from .formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned
+from .formulations import AbstractFormulation, BlockMultipliers, Multipliers, NullSpace, Partitioned
 from .formulations._base import stages
-from .manifold import AbstractManifold, Free, Partition, Projection, project
+from .manifold import AbstractManifold, BlockProjection, Free, Partition, Projection, project
 from .manifold.partition import Chart
 from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController
 from .system import AbstractSystem
+from .system.chain import is_long
 from .trajectory import Trajectory
 
 # Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
@@ -71,9 +72,12 @@ def simulate(
         many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion found stiff is
         simulated again, with `Hermite` from `t0` on; not under `jit`, `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
-        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
+        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular;
+        `BlockMultipliers()` for long chains of joints.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
-        `Projection()` for others, and nothing of either for a system without constraints.
+        `Projection()` for others, and nothing of either for a system without constraints; for `Adams` on a planar scene
+        with 30 or more constraint rows whose joints form a chain, `BlockProjection()`, whose cost grows with the number
+        of joints and not with its cube.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
@@ -105,11 +109,9 @@ def simulate(
     choice = solver
     solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
     if manifold is None:
-        constrained = Partition() if isinstance(solver, AbstractMultistep) else Projection()
-        manifold = Free() if system.acceleration_rows == 0 else constrained
+        manifold = _manifold(system, solver, formulation)
     if formulation is None:
-        others = Multipliers() if system.regular else NullSpace()
-        formulation = Partitioned() if isinstance(manifold, Partition) else others
+        formulation = _formulation(system, manifold)
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=rtol, atol=atol)
@@ -156,6 +158,22 @@ def simulate(
         trajectory = eqx.tree_at(lambda trajectory: trajectory.ys, trajectory, jax.tree.map(spoiled, trajectory.ys))
         trajectory = result.error_if(trajectory, bad)
     return trajectory.trimmed()
+
+
+def _manifold(system, solver, formulation) -> AbstractManifold:
+    if system.acceleration_rows == 0:
+        return Free()
+    if isinstance(solver, Adams) and (is_long(system) if formulation is None else not formulation.assembles):
+        return BlockProjection()
+    return Partition() if isinstance(solver, AbstractMultistep) else Projection()
+
+
+def _formulation(system, manifold) -> AbstractFormulation:
+    if isinstance(manifold, Partition):
+        return Partitioned()
+    if isinstance(manifold, BlockProjection) or (isinstance(manifold, Projection) and is_long(system)):
+        return BlockMultipliers()
+    return Multipliers() if system.regular else NullSpace()
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..elimination import Factor, factor, full_pivot
 from ..system import AbstractInertia, AbstractSystem
+from ..system.chain import block_jacobian
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -27,11 +28,13 @@ class AbstractFormulation(eqx.Module):
 
     `inverts_mass` says whether it needs the inverse of the mass matrix, which is not there for every system;
     `partitions` says whether it needs the split in dependent and independent columns; without it only the independent
-    rows are needed, and no search for pivots where there is no redundancy.
+    rows are needed, and no search for pivots where there is no redundancy. `assembles` says whether it takes A as one
+    matrix; otherwise it takes the blocks of joints in a chain, and no factor.
     """
 
     partitions: AbstractVar[bool]
     inverts_mass: AbstractVar[bool]
+    assembles: ClassVar[bool] = True
 
     @abc.abstractmethod
     def solve(
@@ -75,6 +78,15 @@ def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None
         )
 
 
+def check_independent(system: AbstractSystem) -> None:
+    """Raise a `ValueError` for a system with redundant rows, which block elimination cannot drop."""
+    if system.acceleration_rank < system.acceleration_rows:
+        raise ValueError(
+            f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and block "
+            "elimination drops none; use Partition() or Projection()."
+        )
+
+
 def accelerations(
     system: AbstractSystem,
     formulation: AbstractFormulation,
@@ -84,12 +96,17 @@ def accelerations(
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
     """Accelerations u̇ and multipliers λ of a system at a state on its constraints.
 
-    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
+    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular, and for one
+    that needs a chain of independent joints where there is none.
     """
     check_mass(system, formulation)
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
-    if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
+    jacobian: Any
+    if not formulation.assembles:
+        check_independent(system)
+        jacobian, split = block_jacobian(system, t, q, u), every_row(0, 0, u.dtype)
+    elif formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         jacobian, split = linearize(system, t, q, u)
     else:
         jacobian, split = system.jacobian(t, q, u), every_row(system.acceleration_rows, system.nu, u.dtype)
@@ -102,7 +119,7 @@ def solve_constrained(
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
-    jacobian: Float[Array, "m nu"],
+    jacobian: Any,
     split: Factor,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
     """Accelerations u̇ and multipliers λ from the Jacobian A and its factor.

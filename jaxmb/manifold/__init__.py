@@ -1,6 +1,7 @@
 """Policies that keep the state on its constraints."""
 
 from ._base import AbstractManifold as AbstractManifold
+from .block_projection import BlockProjection as BlockProjection
 from .free import Free as Free
 from .partition import Partition as Partition
 from .projection import Projection as Projection, project as project

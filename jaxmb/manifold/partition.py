@@ -7,7 +7,6 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -77,6 +76,10 @@ class Partition(AbstractManifold):
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
+        if not formulation.assembles:
+            raise ValueError(
+                f"{type(formulation).__name__} finds no independent coordinates; use BlockProjection() with it."
+            )
         least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
         tol = jnp.clip(1e-3 * rtol, least, 1e-6) if self.newton_tol is None else jnp.asarray(self.newton_tol)
         return PartitionTerm(system, formulation, self.max_influence, tol), solver
@@ -130,13 +133,6 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
-
-    def contr(self, t0, t1, **kwargs):
-        del kwargs
-        return t1 - t0
-
-    def prod(self, vf, control):
-        return jax.tree.map(lambda v: control * v, vf)
 
     def init_chart(self, t, y, args):
         system, y = lax.stop_gradient((self.system, y))

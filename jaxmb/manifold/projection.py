@@ -15,9 +15,12 @@ from jaxtyping import Array
 from .._types import Scalar, State
 from ..elimination import full_pivot, solve_positive
 from ..solvers import Adams
-from ..system import AbstractSystem
+from ..system import AbstractSystem, DiagonalInertia
+from ..system.chain import is_long
+from ..system.corrector import corrector
 from ._base import AbstractManifold
 from .free import VectorField
+from .nearest import nearest
 
 _ITERATIONS = 8
 
@@ -84,6 +87,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
 def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order."""
+    if is_long(system):
+        return _project_chain(system, jnp.asarray(t, y.q.dtype), y)
     q = y.q
     if system.coordinate_rank > 0:
         t = jnp.asarray(t, q.dtype)
@@ -104,6 +109,12 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
             ahead = jacobian[rows] * square[None, :]
             u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
     return State(q, u)
+
+
+def _project_chain(system, t, y):
+    metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
+    tol = 64 * jnp.finfo(y.q.dtype).eps
+    return nearest(system, t, y, corrector(system, t, y, metric), tol)[0]
 
 
 def _independent(jacobian: Array, scale: Array, rank: int) -> Any:

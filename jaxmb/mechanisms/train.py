@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import planar
 from .._forces import Gravity
-from .._parts import AbstractForce
+from .._parts import AbstractForce, number
 from .._types import VectorLike
 from .._user import Force
 from ..scene import Scene
@@ -85,7 +85,9 @@ def train(
         planar.Body(name, mass=m, inertia=j, position=(x, 0.0), velocity=(v, 0.0))
         for name, m, j, x, v in zip(names, mass, inertia, place, speed, strict=True)
     ]
-    ends = {"point_a": (-reach, coupler_height), "point_b": (reach, coupler_height)}
+    # Numbers that all vehicles share are made arrays once.
+    shared = lambda **numbers: {name: number(value) for name, value in numbers.items()}
+    ends = shared(point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
     couplers = [
         coupler(f"coupler{k}", front, rear, **ends) for k, (front, rear) in enumerate(itertools.pairwise(names), 1)
     ]
@@ -95,32 +97,33 @@ def train(
     slope = np.arctan(grade)
     if suspension > 0:
         forces.append(Gravity((-gravity * np.sin(slope), -gravity * np.cos(slope))))
+        spring = shared(stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0)
+        ahead, behind = number((wheelbase / 2, 0.0)), number((-wheelbase / 2, 0.0))
         free = mass * gravity * np.cos(slope) / (2 * suspension)
         forces += [
             planar.Bushing(
                 f"spring{k}{end}",
                 "ground",
                 name,
-                stiffness=(0.0, suspension, 0.0),
-                damping=(0.0, suspension_damping, 0.0),
                 point_a=(0.0, height),
-                point_b=(side * wheelbase / 2, 0.0),
-                free_angle=0.0,
+                point_b=point,
+                **spring,
             )
             for k, (name, height) in enumerate(zip(names, free, strict=True), 1)
-            for end, side in (("a", 1), ("b", -1))
+            for end, point in (("a", ahead), ("b", behind))
         ]
     if np.any(resistance):
         w0, w1, w2 = np.asarray(resistance)
-        numbers = {"w0": w0, "w1": w1, "w2": w2, "transition": transition}
+        numbers = shared(w0=w0, w1=w1, w2=w2, transition=transition)
         forces += [Force(f"resistance{k}", name, _resistance, parameters=numbers) for k, name in enumerate(names, 1)]
     if np.any(brake):
+        numbers = shared(rise=brake_rise, transition=transition)
         forces += [
             Force(
                 f"brake{k}",
                 name,
                 _brake,
-                parameters={"force": b, "start": -x / wave_speed, "rise": brake_rise, "transition": transition},
+                parameters={"force": b, "start": -x / wave_speed} | numbers,
             )
             for k, (name, b, x) in enumerate(zip(names, brake, place, strict=True), 1)
         ]

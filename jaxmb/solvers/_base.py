@@ -10,6 +10,7 @@ import abc
 from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
+import jax
 from jaxtyping import Array, Bool, Int, PyTree
 
 Chart: TypeAlias = PyTree[Array]
@@ -39,9 +40,16 @@ class ManifoldEvaluation(NamedTuple):
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     """A vector field on a manifold, with a chart that says which components of the state are independent.
 
-    Besides the methods below a concrete term has diffrax's `vf`, `contr` and `prod` (as `diffrax.ODETerm`), so it also
-    runs under any other diffrax solver, then without charts.
+    Besides the methods below a concrete term has diffrax's `vf`, so it also runs under any other diffrax solver, then
+    without charts.
     """
+
+    def contr(self, t0, t1, **kwargs):
+        del kwargs
+        return t1 - t0
+
+    def prod(self, vf, control):
+        return jax.tree.map(lambda v: control * v, vf)
 
     @abc.abstractmethod
     def init_chart(self, t: Any, y: Y, args: Args) -> Chart:
