@@ -131,7 +131,7 @@ def may_be_long(system: AbstractSystem) -> bool:
     """The same before ranks are known."""
     if not isinstance(system, RigidBodySystem) or system.spatial or not LONG <= system.velocity_rows < system.nu:
         return False
-    if system.velocity_rows > system.position_rows:
+    if system.velocity_rows > system.position_rows or not system.plain:
         return False
     try:
         chain_of(system)
@@ -147,6 +147,12 @@ def chain_of(system: AbstractSystem) -> Chain:
     """
     if not isinstance(system, RigidBodySystem):
         raise ValueError("Only scenes have a joint graph; use Multipliers() and Partition() or Projection().")
+    if not system.plain:
+        names = [name for g in (*system.servos, *system.nonideal) for name in g.group.names]
+        raise ValueError(
+            f"Chains are of ideal joints and without programs, and there is {', '.join(names)}; use Partition() or "
+            "Projection()."
+        )
     groups = (*system.constraints, *system.velocity_constraints)
     if not groups:
         raise ValueError("There are no joints, and nothing to eliminate; use Multipliers().")
