@@ -7,6 +7,7 @@ from ._base import Mechanism as Mechanism, References as References
 from .andrews import andrews as andrews
 from .appell_hamel import appell_hamel as appell_hamel
 from .benenti import benenti as benenti
+from .bennett import bennett as bennett
 from .bricard import bricard as bricard
 from .car_axis import car_axis as car_axis
 from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
@@ -28,6 +29,7 @@ from .spatial_loop import spatial_loop as spatial_loop
 from .spatial_slider_crank import spatial_slider_crank as spatial_slider_crank
 from .spherical_four_bar import spherical_four_bar as spherical_four_bar
 from .stiff_four_bar import stiff_four_bar as stiff_four_bar
+from .swash_plate import swash_plate as swash_plate
 from .three_platform_snake import three_platform_snake as three_platform_snake
 from .tracking_chain import tracking_chain as tracking_chain
 from .train import train as train
@@ -51,6 +53,8 @@ _LIBRARY = {
         spatial_slider_crank,
         spatial_loop,
         bricard,
+        bennett,
+        swash_plate,
         flyball,
         rolling_disk,
         roller_racer,
