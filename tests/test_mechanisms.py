@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from oracles import linkages, one_freedom, trains
 from scipy.optimize import curve_fit
+from scipy.special import roots_laguerre
 
 import jaxmb as mb
 from jaxmb import mechanisms
 
 RTOL = 1e-10
 
-# Many bodies in space: by a method that is compiled sooner than the default.
+# By a method that is compiled sooner than the default.
 LINKAGES = ("swash_plate", "bennett")
 QUICKLY = {"rtol": 1e-11, "solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection()}
 
@@ -31,7 +32,7 @@ def run(name, **parameters):
     """The mechanism, and its motion saved at the times of its references; one compilation for all tests."""
     mechanism = library(name, **parameters)
     times = mechanism.references.times
-    method = QUICKLY if name in LINKAGES else {"rtol": RTOL}
+    method = QUICKLY if name in (*LINKAGES, "hanging_chain") else {"rtol": RTOL}
     return mechanism, mb.simulate(mechanism.system, mechanism.state, t1=times[-1], saveat=times, **method)
 
 
@@ -45,6 +46,8 @@ CASES = [
     ("train", {}, 1e-5),
     ("four_bar", {}, 1e-7),
     ("slider_crank", {}, 1e-7),
+    ("n_four_bar", {}, 1e-8),
+    ("hanging_chain", {}, 1e-8),
     ("andrews", {}, 1e-8),
     ("car_axis", {}, 1e-8),
     ("knife_edge", {}, 1e-8),
@@ -83,6 +86,10 @@ CONSERVATIVE = [
     "pendulum",
     "four_bar",
     "slider_crank",
+    "n_four_bar",
+    "hanging_chain",
+    "swash_plate",
+    "bennett",
     "chaplygin_sleigh",
     "free_body",
     "heavy_top",
@@ -111,6 +118,16 @@ def test_work_of_the_torque_is_the_energy_of_andrews_mechanism():
     np.testing.assert_allclose(trajectory.energy - start, 0.033 * turned, rtol=1e-8)
 
 
+@pytest.mark.parametrize("mode", [1, 3, 5])
+def test_a_hanging_chain_swings_in_its_classical_modes(mode):
+    """After half a period of small oscillations every mass is on the other side."""
+    frequency = np.sqrt(9.81 * 5 * roots_laguerre(5)[0][mode - 1])
+    chain, times = library("hanging_chain", mode=mode, amplitude=1e-5), np.array([0.2, 0.5, 1.0]) * np.pi / frequency
+    trajectory = mb.simulate(chain.system, chain.state, t1=times[-1], saveat=times, **QUICKLY)
+    start, places = np.asarray(chain.state.q[::2]), trajectory.ys.q[:, ::2]
+    np.testing.assert_allclose(places, np.cos(frequency * times)[:, None] * start, rtol=0, atol=1e-6 * 1e-5)
+
+
 def test_free_body_keeps_its_angular_momentum():
     mechanism, trajectory = run("free_body")
     start = mechanism.system.angular_momentum(mechanism.state.q, mechanism.state.u)
@@ -124,8 +141,8 @@ def test_values_of_the_train_are_those_of_an_independent_model():
     np.testing.assert_allclose(found / references.scales, references.values / references.scales, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["four_bar", "slider_crank"])
-def test_carried_values_are_those_of_a_model_with_one_coordinate(name):
+@pytest.mark.parametrize("name", ["four_bar", "slider_crank", "n_four_bar", "hanging_chain"])
+def test_carried_values_are_those_of_a_model_in_minimal_coordinates(name):
     references = library(name).references
     np.testing.assert_allclose(getattr(linkages, name)(references.times), references.values, rtol=1e-9)
 
@@ -323,6 +340,9 @@ def test_names_are_checked():
     [
         ("swash_plate", {"pistons": 0}, "at least one piston"),
         ("swash_plate", {"rod": 0.01}, "do not reach the pistons"),
+        ("n_four_bar", {"n": 0}, "n ≥ 1"),
+        ("hanging_chain", {"mode": 6}, "1 … n"),
+        ("hanging_chain", {"amplitude": 1.0}, "too much"),
         ("bennett", {"lengths": (1.0, 0.5)}, "leave no other twist"),
     ],
 )

@@ -15,8 +15,10 @@ from .constant_speed_particle import constant_speed_particle as constant_speed_p
 from .flyball import flyball as flyball
 from .four_bar import four_bar as four_bar
 from .free_body import free_body as free_body
+from .hanging_chain import hanging_chain as hanging_chain
 from .heavy_top import heavy_top as heavy_top
 from .knife_edge import knife_edge as knife_edge
+from .n_four_bar import n_four_bar as n_four_bar
 from .nonholonomic_cart import nonholonomic_cart as nonholonomic_cart
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
@@ -40,10 +42,12 @@ _LIBRARY = {
         pendulum,
         rod_chain,
         train,
+        hanging_chain,
         four_bar,
         stiff_four_bar,
         slider_crank,
         parallelogram,
+        n_four_bar,
         andrews,
         car_axis,
         knife_edge,

@@ -110,6 +110,60 @@ def slider_crank(
     return _solve(times, acceleration, observe, start, speed)
 
 
+def n_four_bar(times, *, n=2, length=1.0, speed=1.0, g=9.81):
+    """n + 1 upright bars and n level ones of equal mass and length, θ from upright: bars of the first kind turn about
+    their ends, the others move as their ends do.
+
+    **Returns:** place and velocity of the first tip, and θ̇, shape (times, 5).
+    """
+    turning, weight = (n + 1) / 3 + n, (n + 1) / 2 + n
+
+    def observe(theta, rate):
+        c, s = np.cos(theta), np.sin(theta)
+        return np.array([length * s, length * c, length * c * rate, -length * s * rate, rate])
+
+    acceleration = lambda theta, rate: weight * g * np.sin(theta) / (turning * length)
+    return _solve(times, acceleration, observe, 0.0, speed / length)
+
+
+def hanging_chain(times, *, n=5, length=1.0, mode=2, amplitude=0.1, g=9.81):
+    """Equal masses on n rods of length/n, with angles φ from the downward vertical, at rest at first in the shape of a
+    mode of small oscillations.
+
+        Σ_k a_jk (cos(φ_j − φ_k) φ̈_k + sin(φ_j − φ_k) φ̇_k²) = −(n + 1 − j) g/l sin φ_j,   a_jk = n + 1 − max(j, k)
+
+    **Returns:** place of the lowest mass, and angles, shape (times, 2 + n).
+    """
+    l = length / n
+    below = n - np.arange(n)
+    a = np.minimum(below[:, None], below)
+
+    def right(t, y):
+        angles, rates = y[:n], y[n:]
+        between = angles[:, None] - angles
+        force = -below * g / l * np.sin(angles) - (a * np.sin(between)) @ rates**2
+        return np.concatenate([rates, np.linalg.solve(a * np.cos(between), force)])
+
+    # Modes of small oscillations: of a φ̈ = −diag(below) g/l φ.
+    squares, shapes = np.linalg.eig(np.linalg.solve(a, np.diag(below)))
+    shape = shapes[:, np.argsort(squares)[mode - 1]]
+    across = np.cumsum(shape)
+    across *= np.sign(across[-1]) * amplitude / np.max(np.abs(across))
+    start = np.arcsin(np.diff(across, prepend=0.0) / l)
+    solution = solve_ivp(
+        right,
+        (0.0, times[-1]),
+        np.concatenate([start, np.zeros(n)]),
+        method="DOP853",
+        t_eval=times,
+        rtol=2.3e-14,
+        atol=1e-14,
+    )
+    angles = solution.y[:n].T
+    tip = l * np.stack([np.sin(angles).sum(axis=1), -np.cos(angles).sum(axis=1)], axis=1)
+    return np.concatenate([tip, angles], axis=1)
+
+
 def _solve(times, acceleration, observe, start, speed):
     solution = solve_ivp(
         lambda t, y: [y[1], acceleration(y[0], y[1])],

@@ -1,0 +1,104 @@
+"""The hanging chain."""
+
+import numpy as np
+from numpy.polynomial import laguerre
+
+from .. import planar
+from .._forces import Gravity
+from ..scene import Scene
+from ._base import Mechanism, References, build, mechanism
+
+
+@mechanism()
+def hanging_chain(
+    *,
+    n: int = 5,
+    length: float = 1.0,
+    mass: float = 1.0,
+    mode: int = 2,
+    amplitude: float = 0.1,
+    gravity: float = 9.81,
+) -> Mechanism:
+    """n equal masses on massless rods hang from the origin, released in the shape of a mode; y up.
+
+    Small oscillations of the k-th mode have the frequency `√(g x_k / l)`, with l the length of a rod and x_k the k-th
+    zero of Laguerre's polynomial L_n, and in it the masses are displaced in proportion to `L_j(x_k)`, j counted from
+    the lowest. For many masses the frequencies are those of a chain, `j_k √(g / length) / 2`, j_k the zeros of
+    Bessel's J_0.
+
+    Source: D. Bernoulli, Theoremata de oscillationibus corporum filo flexili connexorum et catenae verticaliter
+    suspensae, Comm. Acad. Sci. Petropol. 6, 1738. The reference values, of large oscillations, come from a model in the
+    rods' angles.
+
+    **Arguments:** `n` ≥ 1; `length` [m] and `mass` [kg] of the whole chain; `mode` k, 1 … n; `amplitude` [m],
+    the largest displacement to the side; `gravity` [m/s²].
+
+    **Labels:** `x`, `y` [m] of the lowest mass; `angle1`, `angle2`, … [rad] of the rods from the downward vertical.
+    """
+    if n < 1 or not 1 <= mode <= n:
+        raise ValueError(f"hanging_chain needs n ≥ 1 masses and a mode of 1 … n, got n = {n} and mode {mode}.")
+    l = length / n
+    zero = np.sort(laguerre.lagroots(np.eye(n + 1)[n]))[mode - 1]
+    shape = laguerre.lagvander(zero, n - 1).ravel()[::-1]
+    x = amplitude * shape / np.max(np.abs(shape))
+    across = np.diff(x, prepend=0.0) / l
+    if np.max(np.abs(across)) >= 1:
+        raise ValueError(f"An amplitude of {amplitude} m is too much for rods of {l} m in mode {mode}.")
+    y = -np.cumsum(l * np.sqrt(1 - across**2))
+    masses = [planar.PointMass(f"mass{k + 1}", mass=mass / n, position=(x[k], y[k])) for k in range(n)]
+    above = ["ground", *(body.name for body in masses)]
+    rods = [planar.Distance(f"rod{k + 1}", above[k], above[k + 1], length=l) for k in range(n)]
+    return build(
+        "hanging_chain",
+        Scene(masses, joints=rods, forces=[Gravity((0.0, -gravity))]),
+        t1=2.0,
+        observe=lambda trajectory: _observe(trajectory, n),
+        description=f"Chain of {n} masses, released in its mode {mode} of small oscillations (Bernoulli).",
+        references=_REFERENCES,
+    )
+
+
+def _observe(trajectory, n):
+    places = np.stack([trajectory[f"mass{k + 1}"].position for k in range(n)])
+    along = np.diff(places, axis=0, prepend=0.0)
+    observed = {"x": places[-1, :, 0], "y": places[-1, :, 1]}
+    return observed | {f"angle{k + 1}": np.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}
+
+
+_REFERENCES = References(
+    times=np.array([0.5, 1.0, 2.0]),
+    labels=("x", "y", "angle1", "angle2", "angle3", "angle4", "angle5"),
+    values=np.array(
+        [
+            [
+                -0.08452983967338461,
+                -0.94890114191677,
+                0.14986216497882424,
+                0.14340960462775787,
+                0.058891414923488115,
+                -0.1465160633089725,
+                -0.6786394902304814,
+            ],
+            [
+                0.035205414322076654,
+                -0.9902496546768087,
+                -0.07376887063782712,
+                -0.057735866419166004,
+                -0.03316188813547268,
+                0.05236032634848054,
+                0.2924011180995112,
+            ],
+            [
+                -0.07771980080338539,
+                -0.954222281911682,
+                0.13737321509599018,
+                0.14084739860459944,
+                0.07371121454026443,
+                -0.14495595513184523,
+                -0.6374129257940522,
+            ],
+        ]
+    ),
+    source="angles of the rods, DOP853 at 2e-14",
+    tolerance=1e-11,
+)
