@@ -18,7 +18,7 @@ from jaxmb import mechanisms
 RTOL = 1e-10
 
 # By a method that is compiled sooner than the default.
-LINKAGES = ("swash_plate", "bennett")
+LINKAGES = ("swash_plate", "bennett", "double_wishbone")
 QUICKLY = {"rtol": 1e-11, "solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection()}
 
 
@@ -32,7 +32,7 @@ def run(name, **parameters):
     """The mechanism, and its motion saved at the times of its references; one compilation for all tests."""
     mechanism = library(name, **parameters)
     times = mechanism.references.times
-    method = QUICKLY if name in (*LINKAGES, "hanging_chain") else {"rtol": RTOL}
+    method = QUICKLY if name in (*LINKAGES, "hanging_chain", "n_four_bar") else {"rtol": RTOL}
     return mechanism, mb.simulate(mechanism.system, mechanism.state, t1=times[-1], saveat=times, **method)
 
 
@@ -287,6 +287,20 @@ def test_steps_do_not_shrink_where_the_chart_changes():
     assert low <= 20
 
 
+# The suspension
+
+
+def test_stiff_bushings_tend_to_hinges():
+    """By the inverse of their stiffness."""
+    exact, errors = library("double_wishbone").references.values[0], []
+    for stiffness in (1e7, 1e8):
+        soft = mechanisms.double_wishbone(joints="bushings", bushing=(stiffness, 0.0), bushing_damping=(1e4, 0.0))
+        assert soft.system.nu - soft.system.velocity_rank == 11
+        end = soft.observe(mb.simulate(soft.system, soft.state, t1=0.05, **(QUICKLY | {"rtol": 1e-8})))
+        errors.append([float(end[label][-1]) for label in ("y", "toe")] - exact[[1, 3]])
+    np.testing.assert_allclose(errors[0] / errors[1], 10.0, rtol=0.2)
+
+
 # The rolling disk beyond steady motion
 
 
@@ -343,6 +357,8 @@ def test_names_are_checked():
         ("n_four_bar", {"n": 0}, "n ≥ 1"),
         ("hanging_chain", {"mode": 6}, "1 … n"),
         ("hanging_chain", {"amplitude": 1.0}, "too much"),
+        ("double_wishbone", {"joints": "rubber"}, "ideal, bushings"),
+        ("double_wishbone", {"points": {"weel": (0.0, 0.0, 0.0)}}, "wheel"),
         ("bennett", {"lengths": (1.0, 0.5)}, "leave no other twist"),
     ],
 )

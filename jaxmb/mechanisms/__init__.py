@@ -12,6 +12,7 @@ from .bricard import bricard as bricard
 from .car_axis import car_axis as car_axis
 from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
 from .constant_speed_particle import constant_speed_particle as constant_speed_particle
+from .double_wishbone import double_wishbone as double_wishbone
 from .flyball import flyball as flyball
 from .four_bar import four_bar as four_bar
 from .free_body import free_body as free_body
@@ -59,6 +60,7 @@ _LIBRARY = {
         bricard,
         bennett,
         swash_plate,
+        double_wishbone,
         flyball,
         rolling_disk,
         roller_racer,

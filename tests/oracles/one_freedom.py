@@ -161,3 +161,80 @@ def bennett(times, *, lengths=(0.3, 0.5), twist=70.0, masses=(0.6, 1.0, 0.6), st
     linkage = Linkage(np.array(masses), inertias, poses, -g * Y)
     motion = linkage.turned(times, start, speed)
     return np.array([[np.cos(q), np.sin(q), *output(q), rate] for q, rate in motion])
+
+
+def double_wishbone(times, *, masses=(4.0, 3.0, 30.0), stiffness=4e4, damping=1.5e3, tyre=2e5, speed=2.0, g=9.81):
+    """Lower arm, upper arm and upright of a left wheel, by the angle of the lower arm: x forward, y to the left, z up.
+
+    The upper ball is where the upper arm brings it to its distance from the lower one, the steering arm's end where
+    its distances from the balls and from the rack are what they were.
+
+    **Returns:** travel of the wheel's centre up and outward, camber, toe, and rate of travel, shape (times, 5).
+    """
+    front, rear = (
+        np.array([[0.14, 0.36, 0.24], [0.11, 0.43, 0.51]]),
+        np.array([[-0.22, 0.36, 0.25], [-0.15, 0.43, 0.5]]),
+    )
+    balls = np.array([[0.0, 0.74, 0.21], [-0.02, 0.69, 0.53]])
+    rack, end, wheel = np.array([[-0.12, 0.38, 0.29], [-0.13, 0.7, 0.27], [0.0, 0.78, 0.32]])
+    top, bottom = np.array([[0.0, 0.45, 0.62], [0.0, 0.6, 0.235]])
+    centres = (front + rear + balls) / 3
+    axes = [unit(f - r) for f, r in zip(front, rear, strict=True)]
+    square = lambda v: v @ v
+
+    def arms(q):
+        """Rotations of both, and their balls."""
+        lower = turn(axes[0], np.cos(q), np.sin(q))
+        low = front[0] + lower @ (balls[0] - front[0])
+        # |P + cos φ u + sin φ v − low| = distance: A cos φ + B sin φ = C.
+        arm = balls[1] - front[1]
+        along = (arm @ axes[1]) * axes[1]
+        u, v = arm - along, np.cross(axes[1], arm)
+        gap = front[1] + along - low
+        A, B = 2 * gap @ u, 2 * gap @ v
+        C = square(balls[1] - balls[0]) - square(gap) - square(u)
+        root = np.sign(B.real) * np.sqrt(A**2 + B**2 - C**2)
+        upper = turn(axes[1], (A * C + B * root) / (A**2 + B**2), (B * C - A * root) / (A**2 + B**2))
+        return lower, upper, low, front[1] + upper @ arm
+
+    def steered(low, high):
+        """The end of the steering arm, from three distances; of two such points that on the side it was built on."""
+        x = unit(high - low)
+        d = np.sqrt(square(high - low))
+        to_rack = rack - low
+        i = x @ to_rack
+        y = unit(to_rack - i * x)
+        j = y @ to_rack
+        far, middle = square(end - balls[0]), square(end - balls[1])
+        a = (far - middle + d**2) / (2 * d)
+        b = (far - square(end - rack) + i**2 + j**2 - 2 * i * a) / (2 * j)
+        return low + a * x + b * y + side * np.sqrt(far - a**2 - b**2) * np.cross(x, y)
+
+    side = 1.0
+    side = 1.0 if np.allclose(steered(*balls), end) else -1.0
+    built = triad(balls[1] - balls[0], end - balls[0])
+
+    def poses(q):
+        lower, upper, low, high = arms(q)
+        upright = triad(high - low, steered(low, high) - low) @ built.T
+        places = [front[0] + lower @ (centres[0] - front[0]), front[1] + upper @ (centres[1] - front[1])]
+        return np.array([*places, low + upright @ (wheel - balls[0])]), np.array([lower, upper, upright])
+
+    def length(q):
+        return np.sqrt(square(front[0] + turn(axes[0], np.cos(q), np.sin(q)) @ (bottom - front[0]) - top))
+
+    free = np.sqrt(square(bottom - top))
+    stored = lambda q: stiffness * (length(q) - free) ** 2 / 2 + tyre * (poses(q)[0][2, 2] - wheel[2]) ** 2 / 2
+    plates = [m / 12 * np.diag([0.0909, 0.0909, 0.18]) for m in masses[:2]]
+    inertias = np.array(
+        [*plates, masses[2] * np.diag([0.3**2 / 4 + 0.2**2 / 12, 0.3**2 / 2, 0.3**2 / 4 + 0.2**2 / 12])]
+    )
+    linkage = Linkage(np.array(masses), inertias, poses, -g * Z, stored)
+    resistance = lambda q: damping * (length(q + 1j * _TINY).imag / _TINY) ** 2
+    rise = lambda q: linkage.rates(q)[0][2, 2]
+    out = []
+    for q, rate in linkage.swung(times, 0.0, speed / rise(0.0), damping=resistance, span=(-0.15, 0.15)):
+        r, R = poses(q)
+        x, y, z = R[2][:, 1]
+        out.append([*(r[2] - wheel)[[2, 1]], -np.arcsin(z), np.arctan2(x, y), rise(q) * rate])
+    return np.array(out)
