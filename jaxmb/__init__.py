@@ -1,6 +1,7 @@
 """Accurate, differentiable dynamics of constrained mechanical systems in JAX."""
 
 from . import (
+    contact as contact,
     formulations as formulations,
     lagrangian as lagrangian,
     manifold as manifold,
@@ -9,6 +10,7 @@ from . import (
     report as report,
     solvers as solvers,
     spatial as spatial,
+    terrain as terrain,
     viz as viz,
 )
 from ._forces import Gravity as Gravity

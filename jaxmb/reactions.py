@@ -1,4 +1,4 @@
-"""Forces that joints exert."""
+"""Forces that joints and force elements exert."""
 
 from typing import NamedTuple
 
@@ -27,6 +27,23 @@ class Reaction(NamedTuple):
 def joint_names(system: AbstractSystem) -> tuple[str, ...]:
     """Names of the parts that exert constraint forces."""
     return tuple(dict.fromkeys(name for name, _ in system.rows))
+
+
+def force_names(system: RigidBodySystem) -> tuple[str, ...]:
+    """Names of the parts that exert applied forces."""
+    return tuple(dict.fromkeys(name for g in system.forces for name in g.group.names))
+
+
+def applied_force(system: RigidBodySystem, name: str, t: Scalar, y: State) -> Float[Array, "bodies v"]:
+    """Wrenches of one force element on its bodies, those of its components added up."""
+    poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
+    own = [
+        g.wrenches(t, poses, velocities)[k]
+        for g in system.forces
+        for k, other in enumerate(g.group.names)
+        if other == name
+    ]
+    return sum(own[1:], start=own[0])
 
 
 def constraint_force(

@@ -208,8 +208,7 @@ def _check_rotation(part, own, layout, poses):
 
 def _check_finite(part):
     for field in part.__dataclass_fields__:
-        value = getattr(part, field)
-        for item in jax.tree.leaves(value):
+        for item in jax.tree.leaves(getattr(part, field)):
             if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
                 raise ValueError(f"{label(part)}: {field} must be finite, got {np.asarray(item)}.")
 

@@ -1,6 +1,6 @@
 """A motion, with views by name."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
 from .manifold import project
-from .reactions import Reaction, constraint_force, joint_names, reaction
+from .reactions import Reaction, applied_force, constraint_force, force_names, joint_names, reaction
 from .system import RigidBodySystem
 
 
@@ -43,24 +43,22 @@ class BodyMotion(NamedTuple):
     angular_velocity: Array | None
 
 
-class _ByConstraint(Mapping[str, Any]):
-    """Something of each constraint by name, worked out when asked for."""
+class _ByName(Mapping[str, Any]):
+    """Something of each part by name, worked out when asked for."""
 
-    def __init__(self, trajectory: "Trajectory", what: Any):
-        self._trajectory, self._what = trajectory, what
+    def __init__(self, kind: str, names: tuple[str, ...], value: Callable[[str], Any]):
+        self._kind, self._names, self._value = kind, names, value
 
     def __getitem__(self, name: str) -> Any:
-        names = joint_names(self._trajectory.system)
-        if name not in names:
-            raise unknown("joint", name, names)
-        trajectory = self._trajectory
-        return _of_constraint(self._what, trajectory.system, name, trajectory.ts, trajectory.ys, trajectory.multipliers)
+        if name not in self._names:
+            raise unknown(self._kind, name, self._names)
+        return self._value(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(joint_names(self._trajectory.system))
+        return iter(self._names)
 
     def __len__(self) -> int:
-        return len(joint_names(self._trajectory.system))
+        return len(self._names)
 
 
 class Trajectory(eqx.Module):
@@ -170,12 +168,26 @@ class Trajectory(eqx.Module):
         """Forces of the joints of rigid bodies by name: `reactions["A"].force`."""
         if not isinstance(self.system, RigidBodySystem):
             raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
-        return _ByConstraint(self, reaction)
+        return self._by_constraint(reaction)
 
     @property
     def constraint_forces(self) -> Mapping[str, Array]:
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
-        return _ByConstraint(self, constraint_force)
+        return self._by_constraint(constraint_force)
+
+    def _by_constraint(self, what):
+        value = lambda name: _of_constraint(what, self.system, name, self.ts, self.ys, self.multipliers)
+        return _ByName("joint", joint_names(self.system), value)
+
+    @property
+    def forces(self) -> Mapping[str, Array]:
+        """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
+        (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
+        """
+        if not isinstance(self.system, RigidBodySystem):
+            raise ValueError("forces are of parts that act on bodies; this system has none.")
+        value = lambda name: _of_force(self.system, name, self.ts, self.ys)
+        return _ByName("force", force_names(self.system), value)
 
     @property
     @eqx.filter_jit
@@ -224,6 +236,11 @@ class Trajectory(eqx.Module):
 @eqx.filter_jit
 def _of_constraint(what, system, name, ts, ys, multipliers):
     return jax.vmap(lambda t, y, own: what(system, name, t, y, own))(ts, ys, multipliers)
+
+
+@eqx.filter_jit
+def _of_force(system, name, ts, ys):
+    return jax.vmap(lambda t, y: applied_force(system, name, t, y))(ts, ys)
 
 
 @eqx.filter_jit

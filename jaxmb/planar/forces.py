@@ -3,12 +3,14 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._forces import generalized_force
 from .._parts import AbstractForce, number, optional_number
-from .._resolve import fill, point_pair, positive, vector
+from .._resolve import fill, label, point_pair, positive, vector
+from .._smooth import ramp
 
 
 class Torque(AbstractForce):
@@ -68,6 +70,52 @@ class TorsionalSpringDamper(AbstractForce):
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * (poses[1, 2] - poses[0, 2] - self.free_angle) ** 2
+
+
+class BumpStop(AbstractForce):
+    """Progressive stops of a relative angle on both sides, `angle = angle_b − angle_a`.
+
+    Beyond a limit the potential is `stiffness δ^(exponent + 1) / (exponent + 1)` of a smoothed depth
+    `δ = ½ (d + √(d² + smoothing²))`, d = lower − angle or angle − upper: a moment on B of nearly `stiffness d^exponent`
+    back.
+
+    **Arguments:** `stiffness` [N m/rad^exponent] ≥ 0; `lower` < `upper` [rad], the limits; `exponent` > 0; `smoothing`
+    [rad] > 0.
+    """
+
+    name: str = eqx.field(static=True)
+    body_a: str = eqx.field(static=True)
+    body_b: str = eqx.field(static=True)
+    stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    lower: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    upper: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    exponent: Float[Array, ""] = eqx.field(converter=number, default=3.0, kw_only=True)
+    smoothing: Float[Array, ""] = eqx.field(converter=number, default=1e-3, kw_only=True)
+    conservative: ClassVar[bool] = True
+
+    @property
+    def bodies(self):
+        return (self.body_a, self.body_b)
+
+    def resolve(self, space, poses):
+        positive(self, "stiffness", self.stiffness, zero=True)
+        positive(self, "exponent", self.exponent)
+        positive(self, "smoothing", self.smoothing)
+        if not self.lower < self.upper:
+            raise ValueError(f"{label(self)}: lower must be less than upper, got {self.lower} and {self.upper}.")
+        return self
+
+    def _energy(self, angle):
+        depth = ramp(jnp.stack([self.lower - angle, angle - self.upper]), self.smoothing)
+        return self.stiffness * jnp.sum(depth ** (self.exponent + 1)) / (self.exponent + 1)
+
+    def wrenches(self, space, poses, velocities, t):
+        moment = -jax.grad(self._energy)(poses[1, 2] - poses[0, 2])
+        wrench = jnp.concatenate([jnp.zeros(2, poses.dtype), moment[None]])
+        return jnp.stack([-wrench, wrench])
+
+    def energy(self, space, poses, t):
+        return self._energy(poses[1, 2] - poses[0, 2])
 
 
 class Bushing(AbstractForce):

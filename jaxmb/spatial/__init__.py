@@ -2,6 +2,7 @@
 
 from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
 from .._friction import Friction as Friction
+from ..contact import Contact as Contact
 from .bodies import (
     Body as Body,
     PointMass as PointMass,

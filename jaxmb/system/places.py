@@ -1,5 +1,9 @@
-"""Where the parameters of a compiled scene stand in it, by name, `"part.field"`."""
+"""Where the parameters of a compiled scene stand in it, by name, `"part.field"`, and `"part.field.field"` for what a
+part is made of.
+"""
 
+import functools
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -21,12 +25,10 @@ def parameter_places(system: "RigidBodySystem") -> dict[str, list[tuple[Any, int
         for g, group in enumerate(getattr(system, kind)):
             part = group.group.part
             for field in part.__dataclass_fields__:
-                value = getattr(part, field)
-                keys = [None] if eqx.is_inexact_array(value) else list(value) if isinstance(value, dict) else []
-                for key in keys:
-                    where = _accessor(kind, g, field, key)
+                for path in _numbers(getattr(part, field)):
+                    where = _accessor(kind, g, (field, *path))
                     for k, name in enumerate(group.group.names):
-                        places.setdefault(f"{name}.{field if key is None else key}", []).append((where, k))
+                        places.setdefault(f"{name}.{'.'.join(_label(part, field, *path))}", []).append((where, k))
     for g, group in enumerate(system.servos):
         for k, name in enumerate(group.group.names):
             places.setdefault(f"{name}.damping", []).append((lambda s, g=g: s.servos[g].damping, k))
@@ -34,9 +36,26 @@ def parameter_places(system: "RigidBodySystem") -> dict[str, list[tuple[Any, int
     return places
 
 
-def _accessor(kind: str, group: int, field: str, key: str | None):
-    def where(system):
-        value = getattr(getattr(system, kind)[group].group.part, field)
-        return value if key is None else value[key]
+def _numbers(value: Any) -> Iterator[tuple[str, ...]]:
+    """Where the numbers of a field stand in it, key by key: nowhere further for an array."""
+    if eqx.is_inexact_array(value):
+        yield ()
+    elif isinstance(value, dict | eqx.Module):
+        for key in value if isinstance(value, dict) else value.__dataclass_fields__:
+            yield from ((key, *path) for path in _numbers(_get(value, key)))
 
-    return where
+
+def _get(value: Any, key: str) -> Any:
+    return value[key] if isinstance(value, dict) else getattr(value, key)
+
+
+def _label(value: Any, *path: str) -> Iterator[str]:
+    """The keys of a path without the names of the dictionaries on it."""
+    for key in path:
+        value = _get(value, key)
+        if not isinstance(value, dict):
+            yield key
+
+
+def _accessor(kind: str, group: int, path: tuple[str, ...]):
+    return lambda system: functools.reduce(_get, path, getattr(system, kind)[group].group.part)
