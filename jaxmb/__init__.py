@@ -27,5 +27,6 @@ from .assembly import assemble as assemble
 from .identify import Identification as Identification, identify as identify
 from .scene import Scene as Scene
 from .simulate import simulate as simulate
+from .statics import equilibrium as equilibrium
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load

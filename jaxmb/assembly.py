@@ -62,19 +62,11 @@ def assemble(
     """
     guess = system.guess if guess is None else guess
     t = jnp.asarray(t, guess.q.dtype)
-    q, fixed = prescribe("coordinate", system.coordinate_names(), fix or {}, guess.q)
     u, fixed_rates = prescribe("rate", system.rate_names(), rates or {}, guess.u)
-    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, q, u, t)))
+    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, guess, fix, u, t)))
     if concrete:
-        _check_finite(q, "coordinates")
         _check_finite(u, "rates")
-
-    whole = 0
-    if isinstance(system, RigidBodySystem):
-        q, whole = _normalize_fixed(system, q, fixed)
-    q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
-    if concrete and throw and not bool(ok):
-        raise ValueError(_cannot_assemble(system, t, q, fixed, system.coordinate_names()))
+    q, _, ok = configuration(system, guess.q, fix, t, throw)
     u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     if concrete and throw and not bool(ok_rates):
         raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
@@ -85,6 +77,26 @@ def assemble(
         )
     state = State(q, u)
     return state if throw else jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), state)
+
+
+def configuration(
+    system: AbstractSystem, guess: Float[Array, "nq"], fix: Mapping[str, VectorLike] | None, t: Scalar, throw: bool
+) -> tuple[Float[Array, "nq"], Bool[np.ndarray, "nq"], Bool[Array, ""]]:
+    """The first half of `assemble`: the coordinates, a mask of those that were prescribed, and whether the constraints
+    hold; an error if not, with `throw` and outside `jit`.
+    """
+    names = system.coordinate_names()
+    q, fixed = prescribe("coordinate", names, fix or {}, guess)
+    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, q, t)))
+    if concrete:
+        _check_finite(q, "coordinates")
+    whole = 0
+    if isinstance(system, RigidBodySystem):
+        q, whole = _normalize_fixed(system, q, fixed)
+    q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
+    if concrete and throw and not bool(ok):
+        raise ValueError(_cannot_assemble(system, t, q, fixed, names))
+    return q, fixed, ok
 
 
 @eqx.filter_jit
@@ -129,16 +141,16 @@ def positions(
         selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
     )
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
-    refined = lax.custom_root(optimality, nearby, _newton, _tangent_solve)[: system.nq]
+    refined = lax.custom_root(optimality, nearby, newton, tangent_solve)[: system.nq]
     ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined, jacobian) <= tolerance(q.dtype))
     return jnp.where(ok, refined, q), ok
 
 
-def _newton(residual, x):
+def newton(residual, x):
     def correct(carry):
         x, _, k = carry
         value, push = jax.linearize(residual, x)
-        step = _tangent_solve(push, value)
+        step = tangent_solve(push, value)
         return x - step, jnp.max(jnp.abs(step) / (1.0 + jnp.abs(x))), k + 1
 
     def proceed(carry):
@@ -148,7 +160,7 @@ def _newton(residual, x):
     return lax.while_loop(proceed, correct, (x, jnp.array(jnp.inf, x.dtype), jnp.array(0)))[0]
 
 
-def _tangent_solve(linear, b):
+def tangent_solve(linear, b):
     return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)
 
 

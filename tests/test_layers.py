@@ -16,7 +16,7 @@ LAYERS = [
     ["_forces", "_friction", "_servo", "_user", "terrain", "contact", "planar", "spatial"],
     ["system"],
     ["_chain_assembly"],
-    ["assembly"],
+    ["assembly", "statics"],
     ["_structure"],
     ["scene", "lagrangian"],
     ["formulations"],

@@ -1,0 +1,149 @@
+"""Static equilibrium: closed forms, balance of forces, derivatives, and what has none."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import mechanisms, planar, spatial
+from jaxmb.formulations import Partitioned, accelerations
+
+G = 9.81
+
+
+def cart():
+    """A cart on a level rail, with a pendulum that a spring at its pin turns."""
+    bodies = [
+        planar.Body("cart", mass=3.0, inertia=1.0, position=(0.4, 0.0)),
+        planar.Body("bob", mass=2.0, inertia=0.1, position=(0.4, -1.0), angle=-np.pi / 2),
+    ]
+    joints = [
+        planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0)),
+        planar.Revolute("pin", "cart", "bob", point=(0.4, 0.0)),
+    ]
+    spring = planar.TorsionalSpringDamper("spring", "cart", "bob", stiffness=5.0, free_angle=0.0)
+    return mb.Scene(bodies, joints=joints, forces=[spring, mb.Gravity((0.0, -G))]).compile()
+
+
+def bob_angle(stiffness, mass):
+    """From the balance of moments, k angle = −m g l cos(angle), by Newton's method."""
+    angle = -1.2
+    for _ in range(50):
+        angle -= (stiffness * angle + mass * G * np.cos(angle)) / (stiffness - mass * G * np.sin(angle))
+    return angle
+
+
+def balanced(system, state):
+    """Largest acceleration of a state at rest."""
+    solve = jax.jit(lambda system, q: accelerations(system, Partitioned(), 0.0, q, jnp.zeros(system.nu))[0])
+    return np.max(np.abs(solve(system, state.q)))
+
+
+@functools.cache
+def solver():
+    system = cart()
+
+    def solve(stiffness, mass, throw=False):
+        changed = mb.with_parameters(system, {"spring.stiffness": stiffness, "bob.mass": mass})
+        return mb.equilibrium(changed, throw=throw)
+
+    return solve
+
+
+def test_pendulum_on_a_spring_and_its_derivatives():
+    solve = solver()
+    state = solve(5.0, 2.0, throw=True)
+    angle = bob_angle(5.0, 2.0)
+    # The cart could be anywhere; short steps leave the middle between it and the bob about where it was.
+    x = float(state.q[0])
+    assert abs(x + 0.5 * np.cos(angle) - 0.4) < 1e-3
+    np.testing.assert_allclose(state.q, [x, 0.0, 0.0, x + np.cos(angle), np.sin(angle), angle], atol=1e-12)
+    np.testing.assert_array_equal(state.u, 0.0)
+
+    stiff = 5.0 - 2.0 * G * np.sin(angle)
+    slopes = [-angle / stiff, -G * np.cos(angle) / stiff]
+    of = lambda stiffness, mass: solve(stiffness, mass).q[5]
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(of, (0, 1)))(5.0, 2.0), slopes, rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(of, (0, 1)))(5.0, 2.0), slopes, rtol=1e-10)
+
+
+def test_members_without_equilibrium_do_not_spoil_a_batch():
+    masses = jnp.array([2.0, jnp.nan, 3.0])
+    of = jax.jit(jax.vmap(jax.value_and_grad(lambda mass: solver()(5.0, mass).q[5])))
+    angles, slopes = of(masses)
+    expected = np.array([bob_angle(5.0, mass) for mass in masses[::2]])
+    np.testing.assert_allclose(angles[::2], expected, rtol=1e-11)
+    np.testing.assert_allclose(
+        slopes[::2], -G * np.cos(expected) / (5.0 - masses[::2] * G * np.sin(expected)), rtol=1e-9
+    )
+    assert np.isnan(angles[1])
+
+
+def test_search_goes_down():
+    """From nearly upright to hanging, and not to the near equilibrium on top."""
+    system = mb.with_parameters(cart(), {"spring.stiffness": 0.0})
+    upright = mb.assemble(system, fix={"cart.x": -0.7, "bob.angle": 0.45 * np.pi})
+    state = mb.equilibrium(system, upright, fix={"cart.x": -0.7})
+    np.testing.assert_allclose(state.q[:2], [-0.7, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.sin(state.q[5]), -1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "bricard"])
+def test_redundant_joints(name):
+    """The potential is least where nothing accelerates."""
+    mechanism = mechanisms.get(name)
+    system = mechanism.system
+    state = mb.equilibrium(system, mechanism.state)
+    assert balanced(system, state) <= 1e-8
+    assert np.max(np.abs(system.coordinate_residual(0.0, state.q))) <= 1e-12
+    energy = lambda q: system.potential_energy(0.0, q)
+    assert energy(state.q) < energy(mechanism.state.q) - 1e-3
+
+
+def test_a_rigid_body_in_space_hangs_from_three_springs():
+    corners = np.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
+    plate = spatial.Body("plate", mass=4.0, inertia=(0.5, 0.6, 0.9), position=(0.1, 0.0, -0.5))
+    springs = [
+        spatial.SpringDamper(
+            f"spring{k}", "ground", "plate", stiffness=200.0 + 50.0 * k, free_length=0.3, point_a=c, point_b=0.8 * c
+        )
+        for k, c in enumerate(corners)
+    ]
+    system = mb.Scene([plate], forces=[*springs, mb.Gravity((0.0, 0.0, -G))]).compile()
+    state = mb.equilibrium(system)
+    udot = system.force(0.0, state.q, state.u)
+    np.testing.assert_allclose(udot, 0.0, atol=1e-8)
+    assert np.linalg.norm(state.q[3:]) == pytest.approx(1.0)
+    assert abs(state.q[5]) > 1e-3
+
+
+@pytest.mark.parametrize(
+    "forces, message",
+    [
+        ([mb.Gravity((0.0, -G))], r"body\.y \(-19\.6\)"),
+        ([planar.Torque("T", "body", torque=3.0)], r"body\.angle \(3\)"),
+    ],
+    ids=["falls", "turns"],
+)
+def test_what_nothing_balances_is_named(forces, message):
+    system = mb.Scene([planar.Body("body", mass=2.0, inertia=1.0)], forces=forces).compile()
+    with pytest.raises(ValueError, match=f"No static equilibrium.*{message}"):
+        mb.equilibrium(system)
+
+
+def test_what_cannot_rest_is_refused():
+    turn = lambda t, p: p["rate"] * t
+    drive = planar.Driver("drive", "ground", "bob", quantity="angle", motion=turn, parameters={"rate": 1.0})
+    pin = planar.Revolute("pin", "ground", "bob", point=(0.0, 0.0))
+    driven = mb.Scene([planar.Body("bob", mass=1.0, inertia=1.0)], joints=[pin, drive]).compile()
+    with pytest.raises(ValueError, match="driven at this time"):
+        mb.equilibrium(driven)
+    with pytest.raises(ValueError, match=r"cart\.y"):
+        mb.equilibrium(cart(), fix={"cart.y": 1.0})
+    with pytest.raises(ValueError, match="Unknown coordinate"):
+        mb.equilibrium(cart(), fix={"cart.z": 1.0})
+    with pytest.raises(ValueError, match="ideal"):
+        mb.equilibrium(mechanisms.get("rough_ring").system)
