@@ -3,7 +3,7 @@
 The configuration nearest to a guess satisfies `q = q_guess − S² Aᵀ(q) μ`, `Φ(q) = 0` (S: scales, zero where coordinates
 are held). With the constraints linearised at the last iterate μ follows from one block-tridiagonal system; repeated,
 that converges to the minimiser, at once where the guess is on the constraints. Its derivatives are those of the fixed
-point.
+point, by as many iterations again: they are as exact as those that found it.
 """
 
 import jax.numpy as jnp
@@ -14,8 +14,7 @@ from ._types import Scalar, State
 from .system import AbstractSystem, DiagonalInertia
 from .system.corrector import Corrector, corrector
 
-_ITERATIONS = 50
-_TANGENT_ITERATIONS = 24
+_ITERATIONS = 30
 
 
 def positions(
@@ -42,12 +41,13 @@ def positions(
 
     def tangent_solve(linear, b):
         # x = b + (1 − L) x: the linear map is near the identity where the guess is near the constraints.
-        return lax.fori_loop(0, _TANGENT_ITERATIONS, lambda _, x: b + (x - linear(x)), b)
+        return lax.fori_loop(0, _ITERATIONS, lambda _, x: b + (x - linear(x)), b)
 
     q = lax.custom_root(lambda q: q - improved(q), lax.stop_gradient(guess), solve, tangent_solve)
     pivot = _corrector(system, t, q, held).factor.smallest_pivot()
-    residual = jnp.max(jnp.abs(system.position_residual(t, q)))
-    return q, jnp.all(jnp.isfinite(q)) & (residual <= tol * system.length), pivot
+    # Another iteration changes nothing.
+    change = jnp.max(jnp.abs(improved(q) - q))
+    return q, jnp.all(jnp.isfinite(q)) & (change <= tol * system.length), pivot
 
 
 def velocities(

@@ -8,7 +8,7 @@ from . import _chain_assembly
 from .assembly import INDEPENDENT, nearest, open_joints, residual_size, tolerance
 from .elimination import full_pivot
 from .system._base import Ranks
-from .system.chain import may_be_long
+from .system.chain import VERY_LONG, may_be_long
 from .system.rigid_bodies import Implied, RigidBodySystem
 
 # Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and
@@ -24,7 +24,7 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations.
     """
-    if may_be_long(system) and bool(_independent_chain(system)):
+    if may_be_long(system, VERY_LONG) and bool(_independent_chain(system)):
         rows = system.velocity_rows
         return Ranks(rows, rows, rows, rows), ()
     found = _analyse(system)

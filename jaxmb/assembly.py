@@ -20,7 +20,7 @@ from ._types import Scalar, State, VectorLike
 from .elimination import full_pivot
 from .rotations import normalize
 from .system import AbstractSystem, RigidBodySystem
-from .system.chain import is_long
+from .system.chain import VERY_LONG, is_long
 from .system.coordinates import prescribe
 
 _ITERATIONS = 100
@@ -111,7 +111,7 @@ def positions(
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
-    if is_long(system):
+    if is_long(system, VERY_LONG):
         q, ok, pivot = _chain_assembly.positions(system, t, guess, fixed, tolerance(guess.dtype))
         return q, ok & (pivot > INDEPENDENT)
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
@@ -171,7 +171,7 @@ def velocities(
     """The velocities nearest to the guess with some rates held; and whether every residual is at rounding level."""
     if system.velocity_rows == 0:
         return guess, jnp.array(True)
-    if is_long(system):
+    if is_long(system, VERY_LONG):
         u, pivot = _chain_assembly.velocities(system, t, q, guess, np.array(held))
         return u, jnp.all(jnp.isfinite(u)) & (pivot > INDEPENDENT)
     scale = jnp.where(np.array(held), 0.0, system.velocity_scale())

@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 from oracles import trains as oracle
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import _chain_assembly, assembly, planar, spatial
+from jaxmb.formulations import BlockMultipliers, Multipliers, accelerations
+from jaxmb.manifold import BlockProjection
+from jaxmb.mechanisms.train import coupler_forces
 
 # A draft gear that is a linear spring.
 LINEAR = functools.partial(planar.DraftGear, stiffness=2e7, unloading=1.0, preload=0.0, slack=0.0, travel=10.0)
@@ -84,3 +88,285 @@ def test_frequencies_of_a_free_chain():
     stiffness = -jax.jacfwd(lambda q: system.force(0.0, q, system.guess.u))(system.guess.q)[np.ix_(along, along)]
     found = np.sqrt(np.linalg.eigvalsh(stiffness / m)[1:])
     np.testing.assert_allclose(found, 2 * np.sqrt(k / m) * np.sin(np.arange(1, n) * np.pi / (2 * n)), rtol=1e-9)
+
+
+def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
+    n, k, m, pull = 100, 2e7, 8e4, 3e5
+    mechanism = mb.mechanisms.train(n=n, coupler=LINEAR, pull=pull, **BARE)
+    times = np.arange(1, 601) * 0.01
+    sol = mb.simulate(mechanism.system, mechanism.state, t1=6.0, rtol=1e-8, atol=1e-9, saveat=times)
+    force = coupler_forces(sol)[:, 50]
+    assert 50 / np.sqrt(k / m) == pytest.approx(3.162, abs=1e-3)
+    assert np.interp(0.5 * pull, force[times < 3.5], times[times < 3.5]) == pytest.approx(3.273, abs=2e-3)
+    assert np.mean(force[(times > 5) & (times < 6)]) == pytest.approx(3.003e5, rel=0.01)
+    np.testing.assert_allclose(sol.linear_momentum[:, 0], pull * times, rtol=1e-12)
+
+
+def test_relative_coordinates_are_the_straight_motion_of_the_train():
+    rng = np.random.default_rng(0)
+    n, mass = 5, 8e4 * (1 + 0.3 * rng.random(5))
+    relative = mb.mechanisms.longitudinal_train(n=n, mass=mass, pull=1e5, grade=0.01).system
+    plane = mb.mechanisms.train(n=n, mass=mass, pull=1e5, grade=0.01, coupler_height=0.0).system
+    y, w = 0.05 * rng.normal(size=n), 0.2 * rng.normal(size=n)
+    absolute = lambda first, rest: np.cumsum(np.concatenate([[first], -rest]))
+    x, v = absolute(y[0], y[1:] + 13.0), absolute(w[0], w[1:])
+    still = lambda values: jnp.asarray(np.stack([values, 0 * values, 0 * values], axis=1).ravel())
+    found, _ = accelerations(relative, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
+    expected, _ = accelerations(plane, Multipliers(), 1.0, still(x), still(v))
+    np.testing.assert_allclose(absolute(found[0], np.asarray(found[1:])), expected[::3], rtol=0, atol=1e-11)
+    # Half the tensions of its neighbours, and its own.
+    S = np.concatenate([[0.0], relative.tensions(mb.State(jnp.asarray(y), jnp.asarray(w))), [0.0]])
+    bare = mb.mechanisms.longitudinal_train(n=n, mass=mass, resistance=(0, 0, 0), brake=0.0).system
+    found, _ = accelerations(bare, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
+    own = -S[1:-1] * (1 / mass[:-1] + 1 / mass[1:]) + S[:-2] / mass[:-1] + S[2:] / mass[1:]
+    np.testing.assert_allclose(found[1:], own, rtol=0, atol=1e-12 * np.max(np.abs(own)))
+
+
+@pytest.fixture(scope="module")
+def collision():
+    """Largest force of a coupler while two vehicles run into two at rest, from numbers of the first draft gear."""
+    mechanism = mb.mechanisms.longitudinal_train(
+        n=4, speed=(0.0, 0.0, 3.0, 3.0), extension=(0.01, -0.02, 0.02), brake=0.0, resistance=(0, 0, 0)
+    )
+
+    def peak(numbers, rtol, **options):
+        system = mb.with_parameters(mechanism.system, numbers)
+        sol = mb.simulate(
+            system, mechanism.state, t1=0.3, rtol=rtol, saveat=jnp.linspace(0.0, 0.3, 61), throw=False, **options
+        )
+        return -jnp.min(jax.vmap(system.tensions)(sol.ys)[:, 1])
+
+    return peak, {
+        f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"]
+        for name in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition")
+    }
+
+
+def test_derivatives_of_the_largest_force_in_a_collision(collision):
+    peak, numbers = collision
+    value, reverse = jax.jit(jax.value_and_grad(lambda numbers: peak(numbers, 1e-10)))(numbers)
+    forward = jax.jit(jax.jacfwd(lambda numbers: peak(numbers, 1e-10, adjoint=diffrax.ForwardMode())))(numbers)
+    tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
+    assert 1e5 < value < 1e7
+    for name, number in numbers.items():
+        h = 2e-5 * number
+        difference = (tight(numbers | {name: number + h}) - tight(numbers | {name: number - h})) / (2 * h)
+        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
+        np.testing.assert_allclose(forward[name], difference, rtol=1e-5, atol=5e-6 * value / number, err_msg=name)
+
+
+# Trains with hinges and drawbars
+
+
+@functools.cache
+def hinged(n, **numbers):
+    mass = 8e4 * (1 + 0.3 * np.random.default_rng(n).random(n))
+    return mb.mechanisms.train(n=n, coupler=planar.Revolute, mass=mass, inertia=16 * mass, **numbers)
+
+
+def random_state(system, rng, pitch=0.2):
+    q = np.asarray(system.guess.q) + np.tile([0.0, 0.0, 1.0], system.nq // 3) * pitch * rng.normal(size=system.nq)
+    return jnp.asarray(q), jnp.asarray(rng.normal(size=system.nu))
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 50])
+def test_hinge_forces_are_those_of_one_matrix_of_all(n):
+    system = hinged(n).system
+    solve = jax.jit(lambda q, u: (accelerations(system, BlockMultipliers(), 0.1, q, u), system.force(0.1, q, u)))
+    rng = np.random.default_rng(n)
+    for _ in range(3):
+        q, u = random_state(system, rng)
+        (udot, multipliers), force = solve(q, u)
+        arrays = (np.asarray(x).reshape(n, 3) for x in (q, u, force))
+        expected, forces = oracle.hinged_accelerations(*arrays, np.asarray(system.mass), np.asarray(system.rotary))
+        np.testing.assert_allclose(udot.reshape(n, 3), expected, atol=1e-12 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, atol=1e-12 * np.max(np.abs(forces)))
+
+
+def mixed_chains():
+    """Joints of one, two and three rows between the ground and bodies in no order, and a chain of its own."""
+    bodies = [planar.Body(name, mass=1.0 + k, inertia=0.1, position=(k, 0.1 * k)) for k, name in enumerate("abcdef")]
+    bodies.append(planar.PointMass("p", mass=0.5, position=(7.0, 1.0)))
+    joints = [
+        planar.Fixed("weld", "c", "a", point=(1.0, 0.3)),
+        planar.Distance("rod", "b", "a", length=1.0),
+        planar.Revolute("pin", "ground", "b", point=(0.7, 0.1)),
+        planar.PointOnLine("slot", "c", "ground", point=(2.5, 0.3), axis=(1.0, 0.0)),
+        planar.Revolute("own", "e", "d", point=(3.5, 0.2)),
+        planar.Distance("last", "p", "e"),
+        planar.KnifeEdge("blade", "d"),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def hanging_spheres():
+    bodies = [
+        spatial.Body(f"b{k}", mass=1.0 + k, inertia=(0.2, 0.3, 0.4 + 0.02 * k), position=(k, 0.0, 0.0))
+        for k in range(4)
+    ]
+    joints = [spatial.Spherical("s0", "ground", "b0", point=(-0.5, 0.0, 0.0))]
+    joints += [spatial.Spherical(f"s{k}", f"b{k - 1}", f"b{k}", point=(k - 0.5, 0.1, 0.0)) for k in range(1, 4)]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.parametrize("build", [mixed_chains, hanging_spheres])
+def test_any_joints_in_chains(build):
+    system = build()
+    rng = np.random.default_rng(0)
+    solve = jax.jit(
+        lambda q, u: [accelerations(system, road, 0.0, q, u) for road in (BlockMultipliers(), Multipliers())]
+    )
+    for _ in range(3):
+        q = system.normalize(system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
+        found, expected = solve(q, jnp.asarray(rng.normal(size=system.nu)))
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
+
+
+def undamped(coupler):
+    return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
+
+
+@pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, BlockProjection())])
+def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
+    system = undamped(coupler).system
+    rng = np.random.default_rng(1)
+    push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=18) * np.tile([0.3, 0.3, 0.02], 6)))
+    state = mb.assemble(system, push)
+    sol = mb.simulate(system, state, t1=10.0, rtol=1e-11, manifold=manifold, saveat=diffrax.SaveAt(t0=True, t1=True))
+    change = sol.energy - sol.energy[0]
+    assert np.max(np.abs(change)) <= 1e-9 * sol.kinetic_energy[0]
+    if manifold is not None:
+        assert np.max(np.abs(jax.vmap(lambda y: system.position_residual(0.0, y.q))(sol.ys))) <= 1e-13
+        assert np.max(np.abs(jax.vmap(lambda y: system.velocity_residual(0.0, y.q, y.u))(sol.ys))) <= 1e-13
+
+
+@pytest.fixture(scope="module")
+def long_chain():
+    return mb.mechanisms.get("rod_chain", n=16)
+
+
+def test_long_chains_are_assembled_as_short_ones_are(long_chain):
+    """The way without dense matrices against the other one, with derivatives."""
+    system, rng = long_chain.system, np.random.default_rng(0)
+    bend, turn = (jnp.asarray(rng.normal(size=48)) for _ in range(2))
+    held = np.isin(np.arange(48), [5, 20])
+    direction = jax.tree.map(lambda x: 1e-2 * x * jnp.asarray(rng.normal(size=x.shape)), system)
+    of_state = jnp.asarray(rng.normal(size=(2, 48)))
+
+    def by_blocks(system, guess):
+        q, ok, _ = _chain_assembly.positions(system, 0.0, guess.q, held, 1e-10)
+        return jnp.stack([q, _chain_assembly.velocities(system, 0.0, q, guess.u, held)[0]]), ok
+
+    def dense(system, guess):
+        q, ok = assembly.positions(system, 0.0, guess.q, tuple(held.tolist()), 32)
+        return jnp.stack([q, assembly.velocities(system, 0.0, q, guess.u, tuple(held.tolist()))[0]]), ok
+
+    @jax.jit
+    def evaluate(system, guess, direction):
+        pushed = lambda f: jax.jvp(lambda s, g: f(s, g)[0], (system, guess), (direction, guess))
+        back = lambda f: jax.grad(lambda s, g: jnp.vdot(of_state, f(s, g)[0]), (0, 1))(system, guess)
+        pulled = jax.tree.map(jnp.vdot, back(by_blocks), (direction, guess))
+        return pushed(by_blocks), pushed(dense), sum(jax.tree.leaves(pulled)), by_blocks(system, guess)[1]
+
+    guess = mb.State(long_chain.state.q + 5e-4 * bend, turn)
+    (found, dfound), (expected, dexpected), pulled, ok = evaluate(system, guess, direction)
+    assert ok
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
+    np.testing.assert_allclose(jnp.vdot(of_state, dfound), pulled, rtol=1e-10)
+
+
+def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
+    names = ("link3.mass", "link9.inertia", "pin5.point_a", "pin16.point_b")
+    numbers = {name: mb.parameters(long_chain.system)[name] for name in names}
+    # Off the constraints, so that the way to them counts as well.
+    bend = jnp.asarray(0.005 * np.random.default_rng(2).normal(size=48))
+    direction = {"link3.mass": 0.05, "link9.inertia": 1e-5, "pin5.point_a": (0.01, 0.02), "pin16.point_b": (0.02, 0.01)}
+    direction = {name: jnp.asarray(value) for name, value in direction.items()}
+
+    def tip(numbers, rtol, **options):
+        system = mb.with_parameters(long_chain.system, numbers)
+        state = mb.assemble(system, mb.State(long_chain.state.q + bend, long_chain.state.u))
+        sol = mb.simulate(system, state, t1=0.2, rtol=rtol, throw=False, **options)
+        return jnp.sum(sol["link16"].position[-1]) + 0.1 * sol["link16"].angular_velocity[-1]
+
+    along = lambda h: tip(jax.tree.map(lambda x, dx: x + h * dx, numbers, direction), 1e-12)
+    forward = lambda numbers: tip(numbers, 1e-10, adjoint=diffrax.ForwardMode())
+    _, push = jax.jit(lambda numbers: jax.jvp(forward, (numbers,), (direction,)))(numbers)
+    gradient = jax.jit(jax.grad(lambda numbers: tip(numbers, 1e-10)))(numbers)
+    pull = sum(jnp.vdot(gradient[name], direction[name]) for name in names)
+    value = jax.jit(along)
+    h = 1e-3
+    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(pull, push, rtol=1e-10)
+    np.testing.assert_allclose(push, difference, rtol=1e-7)
+
+
+def ring(*more, bodies=4):
+    """Bodies on a line with pins between neighbours, and more joints."""
+    line = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(k, 0.0)) for k in range(bodies)]
+    pins = [planar.Revolute(f"pin{k}", f"b{k}", f"b{k + 1}", point=(k + 0.5, 0.0)) for k in range(bodies - 1)]
+    return mb.Scene(line, joints=[*pins, *more]).compile()
+
+
+def redundant():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pins = [planar.Revolute(name, "ground", "body", point=(x, 0.0)) for name, x in (("left", -1.0), ("right", 1.0))]
+    return mb.Scene([body], joints=pins).compile()
+
+
+def pendulum_on_paper():
+    kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2)
+    rod = mb.lagrangian.Holonomic("rod", lambda t, q, p: q @ q - 1.0)
+    return mb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[rod], q=(1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("build", "options", "message"),
+    [
+        (lambda: ring(planar.Distance("back", "b3", "b0")), {}, "back closes a loop"),
+        (lambda: ring(planar.Distance("twin", "b0", "b1", point_a=(0, 1)), bodies=2), {}, "twin closes a loop"),
+        (lambda: ring(planar.Revolute("foot", "ground", "b1", point=(1, 0))), {}, "branch at b1.*pin0, pin1, foot"),
+        (redundant, {}, "only 3 are independent"),
+        (ring, {"solver": mb.solvers.Hermite()}, "BlockProjection needs Adams"),
+        (ring, {"formulation": Multipliers()}, "goes with BlockMultipliers"),
+        (ring, {"formulation": BlockMultipliers(), "manifold": mb.manifold.Partition()}, "no independent coordinates"),
+        (pendulum_on_paper, {}, "Only scenes have a joint graph"),
+    ],
+)
+def test_what_is_no_chain_is_refused(build, options, message):
+    system = build()
+    with pytest.raises(ValueError, match=message):
+        mb.simulate(system, system.guess, t1=1.0, **({"manifold": BlockProjection()} | options))
+
+
+# Cost
+
+
+def largest(jaxpr):
+    """The size of the largest array of a program, inner ones included."""
+    sizes = [int(np.prod(v.aval.shape)) for e in jaxpr.eqns for v in e.outvars]
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                sizes.append(largest(inner))
+    return max(sizes, default=0)
+
+
+@pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute, planar.Distance])
+def test_program_and_memory_of_long_trains(coupler):
+    """As many instructions for any number of vehicles, and no array that grows faster than it."""
+
+    def measure(n):
+        mechanism = mb.mechanisms.train(n=n, coupler=coupler)
+        road = BlockMultipliers() if mechanism.system.constraints else Multipliers()
+        right_hand_side = lambda system, q, u: accelerations(system, road, 0.1, q, u)[0]
+        arguments = mechanism.system, mechanism.state.q, mechanism.state.u
+        lines = jax.jit(right_hand_side).lower(*arguments).as_text().count("\n")
+        return lines, largest(jax.make_jaxpr(right_hand_side)(*arguments).jaxpr)
+
+    (few, small), (many, large) = measure(20), measure(80)
+    assert few == many
+    assert large <= 4.2 * small

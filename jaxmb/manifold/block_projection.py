@@ -76,7 +76,8 @@ class BlockTerm(AbstractManifoldTerm):
         return ManifoldEvaluation(y, f, chart, jnp.array(False), near)
 
     def restore(self, t, y, near, args):
-        y, here, iterations, failed = nearest(self.system, t, y, near.factors, self.newton_tol)
+        metric = self.system.inertia(t, y.q, y.u)
+        y, here, iterations, failed = nearest(self.system, t, y, metric, near.factors, self.newton_tol)
         f = State(self.system.rates(t, y.q, y.u), _accelerations(self.system, t, y, here))
         return ManifoldEvaluation(y, f, near.chart + iterations, failed, None)
 

@@ -5,19 +5,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from .._types import Scalar, State
-from ..system import AbstractSystem
+from ..system import AbstractInertia, AbstractSystem
 from ..system.corrector import Corrector, corrector
 
 _ITERATIONS = 8
 
 
 def nearest(
-    system: AbstractSystem, t: Scalar, y: State, near: Corrector, tol: Scalar
+    system: AbstractSystem, t: Scalar, y: State, metric: AbstractInertia, near: Corrector, tol: Scalar
 ) -> tuple[State, Corrector, Int[Array, ""], Bool[Array, ""]]:
     """The state on the constraints that the smallest displacement in the metric reaches; and the corrector there, the
     Newton iterations, and whether they failed.
 
-    `near`: a corrector at a state close by.
+    `near`: a corrector at a state close by, of which only the value counts.
     """
     frozen_system, frozen_t, before, frozen_near, tol = lax.stop_gradient((system, t, y, near, tol))
     found, iterations, failed = _newton(frozen_system, frozen_t, before.q, frozen_near, tol)
@@ -25,7 +25,7 @@ def nearest(
     own = corrector(frozen_system, frozen_t, State(found, before.u), frozen_near.metric)
     q = y.q + (found - before.q)
     q = _moved(system, t, q, own.remove(_position_rows(system, t, q)))
-    here = corrector(system, t, State(q, y.u), near.metric, own.factor)
+    here = corrector(system, t, State(q, y.u), metric, own.factor)
     u = y.u + here.remove(system.velocity_residual(t, q, y.u))
     return State(q, u), here, iterations, failed
 

@@ -114,7 +114,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
 def _project_chain(system, t, y):
     metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
     tol = 64 * jnp.finfo(y.q.dtype).eps
-    return nearest(system, t, y, corrector(system, t, y, metric), tol)[0]
+    return nearest(system, t, y, metric, corrector(system, t, y, metric), tol)[0]
 
 
 def _independent(jacobian: Array, scale: Array, rank: int) -> Any:

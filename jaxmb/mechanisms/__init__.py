@@ -19,6 +19,7 @@ from .free_body import free_body as free_body
 from .hanging_chain import hanging_chain as hanging_chain
 from .heavy_top import heavy_top as heavy_top
 from .knife_edge import knife_edge as knife_edge
+from .longitudinal_train import longitudinal_train as longitudinal_train
 from .n_four_bar import n_four_bar as n_four_bar
 from .nonholonomic_cart import nonholonomic_cart as nonholonomic_cart
 from .parallelogram import parallelogram as parallelogram
@@ -43,6 +44,7 @@ _LIBRARY = {
         pendulum,
         rod_chain,
         train,
+        longitudinal_train,
         hanging_chain,
         four_bar,
         stiff_four_bar,

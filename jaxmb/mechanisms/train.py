@@ -60,7 +60,7 @@ def train(
     - `coupler_length` [m], the distance of the coupled points at the start; default 0 for hinges, otherwise 1.
     - `mass` [kg] and `inertia` [kg m²], of all vehicles or of each, shape (n,).
     - `reach`, `coupler_height` [m]; `suspension` [N/m] and `suspension_damping` [N s/m] of each of the two springs,
-        `wheelbase` [m] apart; none with `suspension` zero, and then no gravity either.
+        `wheelbase` [m] apart; with `suspension` zero there are none, and gravity acts along the track only.
     - `speed` [m/s], of all vehicles or of each, at the start; `grade`, the rise of the track over its length.
     - `resistance` (w₀ [N], w₁ [N s/m], w₂ [N s²/m²]) against each vehicle, `w₀ + w₁ |v| + w₂ v²`.
     - `pull` [N] on the leading vehicle.
@@ -74,9 +74,8 @@ def train(
         raise ValueError(f"train needs n ≥ 1 vehicles, got {n}.")
     if coupler_length is None:
         coupler_length = 0.0 if coupler is planar.Revolute else 1.0
-    of_each = lambda name, value: _of_each(name, value, n)
     mass, inertia, speed, brake = (
-        of_each(name, value)
+        of_each(name, value, n)
         for name, value in (("mass", mass), ("inertia", inertia), ("speed", speed), ("brake", brake))
     )
     place = -(2 * reach + coupler_length) * np.arange(n)
@@ -95,8 +94,9 @@ def train(
 
     forces: list[Any] = list(couplers) if compliant else []
     slope = np.arctan(grade)
+    if suspension > 0 or grade:
+        forces.append(Gravity((-gravity * np.sin(slope), -gravity * np.cos(slope) if suspension > 0 else 0.0)))
     if suspension > 0:
-        forces.append(Gravity((-gravity * np.sin(slope), -gravity * np.cos(slope))))
         spring = shared(stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0)
         ahead, behind = number((wheelbase / 2, 0.0)), number((-wheelbase / 2, 0.0))
         free = mass * gravity * np.cos(slope) / (2 * suspension)
@@ -139,25 +139,35 @@ def train(
     )
 
 
-def _of_each(name, value, n):
+def of_each(name: str, value: VectorLike, n: int) -> np.ndarray:
+    """A number for each of n vehicles."""
     value = np.asarray(value, float)
     if value.shape not in ((), (n,)):
         raise ValueError(f"train: {name} must be a number or one for each of {n} vehicles, got shape {value.shape}.")
     return np.broadcast_to(value, (n,))
 
 
-def _along(force):
-    return jnp.stack([force, jnp.zeros_like(force), jnp.zeros_like(force)])
+def running_resistance(v, p):
+    """The force [N] of running resistance at a speed [m/s]."""
+    return -(p["w0"] + p["w1"] * jnp.abs(v) + p["w2"] * v**2) * jnp.tanh(v / p["transition"])
+
+
+def braking(t, v, p):
+    """The force [N] of the brakes at a time [s] and speed [m/s]."""
+    z = jnp.clip((t - p["start"]) / p["rise"], 0.0, 1.0)
+    return -p["force"] * z**3 * (10 + z * (6 * z - 15)) * jnp.tanh(v / p["transition"])
 
 
 def _resistance(poses, velocities, t, p):
-    v = velocities[0, 0]
-    return _along(-(p["w0"] + p["w1"] * jnp.abs(v) + p["w2"] * v**2) * jnp.tanh(v / p["transition"]))
+    return _along(running_resistance(velocities[0, 0], p))
 
 
 def _brake(poses, velocities, t, p):
-    z = jnp.clip((t - p["start"]) / p["rise"], 0.0, 1.0)
-    return _along(-p["force"] * z**3 * (10 + z * (6 * z - 15)) * jnp.tanh(velocities[0, 0] / p["transition"]))
+    return _along(braking(t, velocities[0, 0], p))
+
+
+def _along(force):
+    return jnp.stack([force, jnp.zeros_like(force), jnp.zeros_like(force)])
 
 
 def _observe(trajectory):

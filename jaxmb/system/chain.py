@@ -21,9 +21,11 @@ from .inertia import AbstractInertia
 from .layout import Layout, pick
 from .rigid_bodies import RigidBodySystem
 
-# From this number of rows on, chains are eliminated block by block (`simulate`, `assemble`, `Scene.compile`). A step of
-# `Adams` on a chain of 5, 10, 20, 35 rods takes 28, 46, 23, 33 µs that way and 39, 32, 111, 1076 µs by partitioning.
+# From this number of rows on, motions of chains are eliminated block by block. A step of `Adams` on a chain of 5, 10,
+# 20, 35 rods takes 28, 46, 23, 33 µs that way and 39, 32, 111, 1076 µs by partitioning.
 LONG = 30
+# From this number on their assembly as well, which asks for a better guess than dense matrices do.
+VERY_LONG = 300
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,14 +124,14 @@ def block_jacobian(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: 
     return BlockJacobian(pick(flat, chain.blocks_before), pick(flat, chain.blocks_after), chain)
 
 
-def is_long(system: AbstractSystem) -> bool:
-    """Whether it pays to eliminate block by block: many joints in the plane, all independent, that form a chain."""
-    return may_be_long(system) and system.velocity_rank == system.velocity_rows
+def is_long(system: AbstractSystem, rows: int = LONG) -> bool:
+    """Whether it pays to eliminate block by block: many rows in the plane, all independent, of joints in a chain."""
+    return may_be_long(system, rows) and system.velocity_rank == system.velocity_rows
 
 
-def may_be_long(system: AbstractSystem) -> bool:
+def may_be_long(system: AbstractSystem, rows: int = LONG) -> bool:
     """The same before ranks are known."""
-    if not isinstance(system, RigidBodySystem) or system.spatial or not LONG <= system.velocity_rows < system.nu:
+    if not isinstance(system, RigidBodySystem) or system.spatial or not rows <= system.velocity_rows < system.nu:
         return False
     if system.velocity_rows > system.position_rows or not system.plain:
         return False

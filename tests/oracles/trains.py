@@ -102,3 +102,19 @@ class Train:
             S, _, _, along = self.tension(a, b)
             forces.append(-S * along[:, 0])
         return q, u, np.array(forces)
+
+
+def hinged_accelerations(q, u, force, mass, inertia, *, reach=6.0, h=-0.5):
+    """Accelerations (n, 3) and hinge forces on the front vehicles (n − 1, 2), from one matrix of all of them."""
+    n = len(q)
+    rear, front = turned((-reach, h), q[:-1, 2]), turned((reach, h), q[1:, 2])
+    A, gamma = np.zeros((2 * n - 2, 3 * n)), np.zeros(2 * n - 2)
+    for j in range(n - 1):
+        rows = slice(2 * j, 2 * j + 2)
+        A[rows, 3 * j : 3 * j + 2], A[rows, 3 * j + 3 : 3 * j + 5] = np.eye(2), -np.eye(2)
+        A[rows, 3 * j + 2], A[rows, 3 * j + 5] = perp(rear[j : j + 1])[0], -perp(front[j : j + 1])[0]
+        gamma[rows] = rear[j] * u[j, 2] ** 2 - front[j] * u[j + 1, 2] ** 2
+    M = np.diag(np.stack([mass, mass, inertia], axis=1).ravel())
+    both = np.block([[M, -A.T], [A, np.zeros((len(A), len(A)))]])
+    solution = np.linalg.solve(both, np.concatenate([force.ravel(), gamma]))
+    return solution[: 3 * n].reshape(n, 3), solution[3 * n :].reshape(-1, 2)

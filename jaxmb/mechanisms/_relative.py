@@ -1,0 +1,188 @@
+"""A train on a straight track in relative coordinates, after V. A. Lazaryan and others.
+
+Coordinates are the place of the leading vehicle and the extensions of the couplers, `q = (x₁, y₁, …, yₙ₋₁)`, velocities
+their rates: slack of a centimetre is not a difference of places ten kilometres along the track. With the forces F_j on
+the vehicles and the tensions S_j of the couplers
+
+    ÿ_j = −S_j (1/m_j + 1/m_{j+1}) + S_{j−1}/m_j + S_{j+1}/m_{j+1} + F_j/m_j − F_{j+1}/m_{j+1}
+
+so the mass matrix is full, but its inverse tridiagonal.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import State
+from ..planar import DraftGear
+from ..system import AbstractInertia, AbstractSystem, DenseInertia
+from ..system._base import Ranks
+
+
+class RelativeInertia(AbstractInertia):
+    """`Bᵀ m B` with B the map from relative to absolute velocities. `mass`: shape (n,) [kg]."""
+
+    mass: Float[Array, "n"]
+
+    def product(self, v):
+        return forces_along(_scaled(self.mass, velocities(v)))
+
+    def solve(self, f):
+        ahead = jnp.concatenate([f[1:], jnp.zeros_like(f[:1])])
+        absolute = _scaled(1 / self.mass, ahead - jnp.concatenate([-f[:1], f[1:]]))
+        return jnp.concatenate([absolute[:1], absolute[:-1] - absolute[1:]])
+
+    def root(self):
+        # A full matrix, for formulations in frames only; no solution of the equations of motion needs it.
+        return DenseInertia(self.product(jnp.eye(self.mass.size, dtype=self.mass.dtype))).root()
+
+    def transpose(self):
+        return self
+
+
+def velocities(u: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """Velocities of the vehicles, from the first one's and the rates of extension."""
+    return jnp.cumsum(jnp.concatenate([u[:1], -u[1:]]), axis=0)
+
+
+def forces_along(f: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """Generalized forces along the relative coordinates of forces on the vehicles."""
+    behind = jnp.cumsum(f[::-1], axis=0)[::-1]
+    return jnp.concatenate([behind[:1], -behind[1:]])
+
+
+def _scaled(by, v):
+    return (by if v.ndim == 1 else by[:, None]) * v
+
+
+class RelativeTrain(AbstractSystem):
+    """A train on a straight track; every number a leaf.
+
+    **Fields:** `mass` [kg], shape (n,); `couplers`, a draft gear whose numbers have shape (n − 1,); `law(t, v,
+    numbers)`, the forces [N] on vehicles at absolute velocities v [m/s], and its `numbers`, by part and field, of shape
+    (n,), or () for those of all vehicles; `slope` [m/s²], the acceleration of gravity along the track, backwards;
+    `guess`; `length` [m].
+    """
+
+    mass: Float[Array, "n"]
+    couplers: DraftGear
+    law: Callable[..., Array] = eqx.field(static=True)
+    numbers: dict[str, dict[str, Array]]
+    slope: Float[Array, ""]
+    guess: State
+    length: Float[Array, ""]
+
+    position_rows: ClassVar[int] = 0
+    coordinate_rows: ClassVar[int] = 0
+    velocity_rows: ClassVar[int] = 0
+    acceleration_rows: ClassVar[int] = 0
+    ideal: ClassVar[bool] = True
+    regular: ClassVar[bool] = True
+    rates_are_velocities: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
+    homogeneous: ClassVar[bool] = True
+    ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
+    rows: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+    def __str__(self) -> str:
+        return f"train of {self.nq} vehicles on a straight track, in relative coordinates; no constraints"
+
+    @property
+    def nq(self) -> int:
+        return self.mass.shape[-1]
+
+    @property
+    def nu(self) -> int:
+        return self.nq
+
+    def coordinate_names(self):
+        return {"x1": [0]} | {f"y{k}": [k] for k in range(1, self.nq)}
+
+    def rate_names(self):
+        return self.coordinate_names()
+
+    def parameter_places(self):
+        places: dict[str, list[tuple[Callable[[Any], Array], int | None]]] = {}
+        for k in range(self.nq):
+            places[f"car{k + 1}.mass"] = [(lambda s: s.mass, k)]
+            for part, numbers in self.numbers.items():
+                for name, value in numbers.items():
+                    index = k if value.ndim else None
+                    places[f"{part}{k + 1 if value.ndim else ''}.{name}"] = [(_number(part, name), index)]
+        for k in range(self.nq - 1):
+            for name in self.couplers.__dataclass_fields__:
+                if eqx.is_inexact_array(getattr(self.couplers, name)) and name not in _PLACES:
+                    places[f"coupler{k + 1}.{name}"] = [(_gear(name), k)]
+        return places
+
+    def rates(self, t, q, u):
+        return u
+
+    def inertia(self, t, q, u):
+        return RelativeInertia(self.mass)
+
+    def force(self, t, q, u):
+        force = self.law(t, velocities(u), self.numbers) - self.mass * self.slope
+        tension = self.couplers.tension(q[1:], u[1:])
+        return forces_along(force) - jnp.concatenate([jnp.zeros_like(q[:1]), tension])
+
+    def tensions(self, y: State) -> Float[Array, "n-1"]:
+        """Forces [N] of the couplers, positive in draft."""
+        return self.couplers.tension(y.q[1:], y.u[1:])
+
+    def kinetic_energy(self, t, q, u):
+        return 0.5 * jnp.sum(self.mass * velocities(u) ** 2)
+
+    def potential_energy(self, t, q):
+        # Places along the track but for a constant: those of couplers without extension.
+        return jnp.sum(self.couplers.stored(q[1:])) + self.slope * jnp.sum(self.mass * velocities(q))
+
+    def normalize(self, q):
+        return q
+
+    def coordinate_scale(self):
+        return jnp.ones(self.nq)
+
+    def velocity_scale(self):
+        return jnp.ones(self.nu)
+
+    # No constraints
+
+    def position_residual(self, t, q):
+        return jnp.zeros(0, q.dtype)
+
+    def coordinate_residual(self, t, q):
+        return jnp.zeros(0, q.dtype)
+
+    def coordinate_jacobian(self, t, q):
+        return jnp.zeros((0, self.nq), q.dtype)
+
+    def velocity_residual(self, t, q, u):
+        return jnp.zeros(0, q.dtype)
+
+    def jacobian(self, t, q, u):
+        return jnp.zeros((0, self.nu), q.dtype)
+
+    def constraint_force(self, t, q, u, multipliers):
+        return jnp.zeros_like(u)
+
+    def nonideal_force(self, t, q, u, multipliers):
+        return jnp.zeros_like(u)
+
+    def acceleration_residual(self, t, q, u, udot):
+        return jnp.zeros(0, q.dtype)
+
+
+# Where a coupler is attached, which does not matter on a straight track.
+_PLACES = ("point_a", "point_b", "free_length")
+
+
+def _number(part, name):
+    return lambda system: system.numbers[part][name]
+
+
+def _gear(name):
+    return lambda system: getattr(system.couplers, name)

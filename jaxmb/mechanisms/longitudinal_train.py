@@ -1,0 +1,101 @@
+"""Trains on a straight track in relative coordinates."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import planar
+from .._parts import number
+from .._types import State, VectorLike
+from ..planar._space import PLANE
+from ._base import Mechanism, build, mechanism
+from ._relative import RelativeTrain, velocities
+from .train import braking, of_each, running_resistance
+
+
+@mechanism()
+def longitudinal_train(
+    *,
+    n: int = 4,
+    coupler: Callable[..., planar.DraftGear] = planar.DraftGear,
+    mass: VectorLike = 8e4,
+    speed: VectorLike = 20.0,
+    extension: VectorLike = 0.0,
+    spacing: float = 13.0,
+    grade: float = 0.0,
+    resistance: VectorLike = (1200.0, 12.0, 1.5),
+    pull: float = 0.0,
+    brake: VectorLike = 8e4,
+    brake_rise: float = 2.0,
+    wave_speed: float = 250.0,
+    transition: float = 0.1,
+    gravity: float = 9.81,
+    t1: float = 3.0,
+) -> Mechanism:
+    """An emergency stop of a train of n vehicles that move along a straight track only, in relative coordinates.
+
+    Coordinates are the place `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers, so that
+    slack keeps all its digits in a train of any length. Otherwise as `train`, without pitch.
+
+    Source: V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974.
+
+    **Arguments:**
+
+    - `n` ≥ 1, the number of vehicles; `coupler(name, front, rear, free_length=)`: makes a draft gear.
+    - `mass` [kg], `speed` [m/s] and `brake` [N], of all vehicles or of each, shape (n,).
+    - `extension` [m] of all couplers or of each at the start, shape (n − 1,); `spacing` [m] of the vehicles without it,
+        for the delay of the brakes.
+    - the others as in `train`.
+
+    **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.
+    """
+    if n < 1:
+        raise ValueError(f"longitudinal_train needs n ≥ 1 vehicles, got {n}.")
+    mass, speed, brake = (
+        number(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
+    )
+    extension = number(of_each("extension", extension, n - 1))
+    gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, jnp.zeros((2, 3)))
+    w0, w1, w2 = np.asarray(resistance)
+    numbers = {
+        "resistance": {"w0": w0, "w1": w1, "w2": w2, "transition": transition},
+        "brake": {
+            "force": brake,
+            "start": spacing * np.arange(n) / wave_speed,
+            "rise": brake_rise,
+            "transition": transition,
+        },
+        "pull": {"force": pull},
+    }
+    system = RelativeTrain(
+        mass=mass,
+        couplers=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n - 1, *leaf.shape)), gear),
+        law=_law,
+        numbers=jax.tree.map(number, numbers),
+        slope=number(gravity * np.sin(np.arctan(grade))),
+        guess=State(jnp.append(0.0, extension), jnp.concatenate([speed[:1], speed[:-1] - speed[1:]])),
+        length=number(spacing),
+    )
+    return build(
+        "longitudinal_train",
+        system,
+        t1=t1,
+        observe=_observe,
+        description=f"Emergency stop of a train of {n} vehicles along a straight track, in relative coordinates.",
+    )
+
+
+def _law(t, v, p):
+    along = running_resistance(v, p["resistance"]) + braking(t, v, p["brake"])
+    return along.at[0].add(p["pull"]["force"])
+
+
+def _observe(trajectory):
+    system = trajectory.system
+    forces = jax.vmap(system.tensions)(trajectory.ys)
+    speeds = jax.vmap(velocities)(trajectory.ys.u)
+    observed = {name: trajectory[name] for name in system.coordinate_names()}
+    observed |= {f"v{k + 1}": speeds[:, k] for k in range(system.nq)}
+    return observed | {f"F{k + 1}": forces[:, k] for k in range(system.nq - 1)}
