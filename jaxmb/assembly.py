@@ -67,7 +67,11 @@ def assemble(
     if concrete:
         _check_finite(u, "rates")
     q, _, ok = configuration(system, guess.q, fix, t, throw)
-    u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
+    if concrete and system.homogeneous and not np.any(u) and not np.any(fixed_rates):
+        # At rest, and nothing asks for motion: there is nothing to compile.
+        ok_rates = jnp.array(True)
+    else:
+        u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     if concrete and throw and not bool(ok_rates):
         raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
     ok = ok & ok_rates
