@@ -7,6 +7,7 @@ point, by as many iterations again: they are as exact as those that found it.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -18,7 +19,7 @@ _ITERATIONS = 30
 
 
 def positions(
-    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: Bool[Array, "nq"], tol: float
+    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: Bool[np.ndarray, "nq"], tol: float
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""], Float[Array, ""]]:
     """The configuration nearest to a guess; whether it was found; and the smallest pivot there."""
 
@@ -51,7 +52,7 @@ def positions(
 
 
 def velocities(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[Array, "nu"]
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[np.ndarray, "nu"]
 ) -> tuple[Float[Array, "nu"], Float[Array, ""]]:
     """The velocities nearest to a guess, and the smallest pivot."""
     here = _corrector(system, t, q, held)

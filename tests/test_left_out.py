@@ -112,10 +112,12 @@ def test_scleronomic_scene_has_no_time_derivative():
 
 
 @pytest.mark.parametrize("what", ["forward", "reverse"])
-def test_program_does_not_grow_with_the_number_of_bodies(what):
+@pytest.mark.parametrize("manifold", [mb.manifold.Partition(), mb.manifold.BlockProjection()])
+def test_program_does_not_grow_with_the_number_of_bodies(what, manifold):
     def lines(n):
         mechanism = mb.mechanisms.get("rod_chain", n=n)
-        end = lambda system, state: mb.simulate(system, state, t1=1.0, throw=False, max_steps=1000).ys.q[-1, 0]
+        options = {"throw": False, "max_steps": 1000, "manifold": manifold}
+        end = lambda system, state: mb.simulate(system, state, t1=1.0, **options).ys.q[-1, 0]
         gradient = lambda system, state: jax.grad(lambda state: end(system, state))(state)
         function = end if what == "forward" else gradient
         return jax.jit(function).lower(mechanism.system, mechanism.state).as_text().count("\n")

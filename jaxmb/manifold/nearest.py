@@ -17,6 +17,8 @@ def nearest(
     """The state on the constraints that the smallest displacement in the metric reaches; and the corrector there, the
     Newton iterations, and whether they failed.
 
+    Derivatives are exact for a state on the constraints, and off them wrong by as much as it is displaced.
+
     `near`: a corrector at a state close by, of which only the value counts.
     """
     frozen_system, frozen_t, before, frozen_near, tol = lax.stop_gradient((system, t, y, near, tol))

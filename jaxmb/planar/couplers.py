@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from .._forces import between_points, fill_points, separation, separation_rate
 from .._parts import AbstractForce, number, optional_number
 from .._resolve import fill, label, positive
-from .._types import Scalar
 from ..rotations import norm
 
 
@@ -79,11 +78,11 @@ class DraftGear(AbstractForce):
         positive(part, "free_length", part.free_length, zero=True)
         return part
 
-    def tension(self, extension: Scalar, rate: Scalar) -> Float[Array, ""]:
+    def tension(self, extension: Float[Array, "..."], rate: Float[Array, "..."]) -> Float[Array, "..."]:
         """The force [N], positive in draft, at an extension [m] and its rate [m/s]."""
         return self._against(extension - self.slack, rate) - self._against(-extension - self.slack, -rate)
 
-    def stored(self, extension: Scalar) -> Float[Array, ""]:
+    def stored(self, extension: Float[Array, "..."]) -> Float[Array, "..."]:
         """The energy [J] of the springs: that of the mean of loading and unloading, from which friction only takes."""
         return self._stored(extension - self.slack) + self._stored(-extension - self.slack)
 

@@ -7,6 +7,7 @@ i − 1 and i + 1 only: `A M⁻¹ Aᵀ` is block-tridiagonal.
 
 import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -172,8 +173,8 @@ def _find(layout: Layout, body_names: tuple[str, ...], groups: tuple[Any, ...]) 
     none, size = layout.bodies, layout.space.velocity_size
     ways = _walk(none, body_names, names, bodies)
 
-    first = np.append(0, np.cumsum(rows))
-    start = np.append(0, np.cumsum([n * len(own) * size for n, own in zip(rows, bodies, strict=True)]))
+    first = [0, *itertools.accumulate(rows)]
+    start = [0, *itertools.accumulate(n * len(own) * size for n, own in zip(rows, bodies, strict=True))]
     count, widest = len(names), max(rows)
     rows_of, sides = np.full((count, widest), first[-1]), np.full((2, count, widest, size), start[-1])
     shared, joints_of = np.full((2, count), none), np.full((2, none), count)
