@@ -13,6 +13,7 @@ import jaxmb as mb
 from jaxmb import _chain_assembly, assembly, planar, spatial
 from jaxmb.formulations import BlockMultipliers, Multipliers, accelerations
 from jaxmb.manifold import BlockProjection
+from jaxmb.mechanisms._relative import velocities
 from jaxmb.mechanisms.train import coupler_forces
 
 # A draft gear that is a linear spring.
@@ -120,6 +121,21 @@ def test_relative_coordinates_are_the_straight_motion_of_the_train():
     found, _ = accelerations(bare, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
     own = -S[1:-1] * (1 / mass[:-1] + 1 / mass[1:]) + S[:-2] / mass[:-1] + S[2:] / mass[1:]
     np.testing.assert_allclose(found[1:], own, rtol=0, atol=1e-12 * np.max(np.abs(own)))
+
+
+def test_slow_and_fast_collisions():
+    """Vehicles that meet at a nanometre or a hundred metres a second, their slack open, shut or in between."""
+    system = mb.mechanisms.longitudinal_train(n=4, brake=0.0, resistance=(0, 0, 0)).system
+    run = jax.jit(lambda state: mb.simulate(system, state, t1=1.0, rtol=1e-9, throw=False))
+    for speed in (0.0, 1e-9, 1e-3, 100.0):
+        for y in ((0.0, 0.0, 0.0), (0.02, -0.02, 0.02), (-0.02, 0.0225, -0.0225)):
+            state = mb.State(jnp.array([0.0, *y]), speed * jnp.array([0.0, 0.0, -1.0, 0.0]))
+            sol = run(state)
+            assert sol.result == mb.RESULTS.successful
+            energy = lambda y: system.kinetic_energy(0.0, y.q, y.u) + system.potential_energy(0.0, y.q)
+            end = jax.tree.map(lambda x: x[-1], sol.ys)
+            assert energy(end) <= energy(state) + 1e-6 * (1e-3 + system.kinetic_energy(0.0, state.q, state.u))
+            np.testing.assert_allclose(np.sum(velocities(end.u)), 2 * speed, rtol=1e-9, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +291,19 @@ def test_long_chains_are_assembled_as_short_ones_are(long_chain):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
     np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
     np.testing.assert_allclose(jnp.vdot(of_state, dfound), pulled, rtol=1e-10)
+
+
+def test_long_chains_need_no_choice(long_chain):
+    """The same motion by both solvers' defaults, joint by joint."""
+    assert "joint by joint" in str(long_chain.system)
+    ends = []
+    for solver in (None, diffrax.Tsit5()):
+        sol = mb.simulate(long_chain.system, long_chain.state, t1=0.1, rtol=1e-9, solver=solver)
+        assert isinstance(sol.formulation, BlockMultipliers)
+        assert np.all(sol.constraint_violation.position <= 1e-13)
+        ends.append(sol.ys)
+    np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-6)
 
 
 def test_derivatives_of_the_motion_of_a_long_chain(long_chain):

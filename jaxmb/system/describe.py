@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from ._base import AbstractSystem
+from .chain import is_long
 from .rigid_bodies import RigidBodySystem
 
 
@@ -125,6 +126,8 @@ def describe(system: RigidBodySystem) -> Description:
 
 def _left_out(system: RigidBodySystem) -> list[str]:
     out = constraints_left_out(system)
+    if is_long(system):
+        out.append("joints in chains: no matrix of all constraints, no charts; joint by joint with Adams")
     if not system.spatial:
         out.append("planar: no Euler parameters, no gyroscopic moment")
     if not system.forces and not system.nonideal:
