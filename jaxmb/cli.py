@@ -59,7 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
 
     report = commands.add_parser(
-        "report", help="measure error against run time for several solvers, or what each formulation costs"
+        "report",
+        help="measure error against run time for several solvers and ways to integrate, or what each formulation costs",
     )
     report.add_argument(
         "mechanism", nargs="+", help="a name from `jaxmb mechanisms`; after the word `formulations`, the cost of those"
@@ -112,7 +113,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    from .report import formulation_costs, work_precision
+    from .report import formulation_costs, method_costs, work_precision
 
     *words, arguments.mechanism = arguments.mechanism
     if words not in ([], ["formulations"]):
@@ -127,7 +128,13 @@ def _report(arguments: argparse.Namespace) -> None:
     print(precision)
     out = _folder(arguments)
     (out / "work_precision.json").write_text(json.dumps(precision.to_dict(), indent=1))
-    print(f"\nWrote {out / 'work_precision.json'}")
+    written = [out / "work_precision.json"]
+    if mechanism.system.acceleration_rows:
+        costs = method_costs(mechanism, repeats=arguments.repeats)
+        print(f"\n{costs}")
+        written.append(out / "method_costs.json")
+        written[-1].write_text(json.dumps(costs.to_dict(), indent=1))
+    print(f"\nWrote {', '.join(map(str, written))}")
     _write_figures(out, precision, None)
 
 

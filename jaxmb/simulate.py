@@ -17,7 +17,7 @@ from ._types import Scalar, State
 from .elimination import full_pivot
 from .formulations import AbstractFormulation, BlockMultipliers, Multipliers, NullSpace, Partitioned
 from .formulations._base import stages
-from .manifold import AbstractManifold, BlockProjection, Free, Partition, Projection, project
+from .manifold import AbstractManifold, Baumgarte, BlockProjection, Free, Partition, Projection, project
 from .manifold.partition import Chart
 from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController
 from .system import AbstractSystem
@@ -121,6 +121,9 @@ def simulate(
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
 
+    points = _save_at(saveat)
+    interpolated = event is not None or (points.subs is not None and points.subs.ts is not None)
+
     def motion(solver):
         term, prepared = manifold.prepare(system, formulation, solver, rtol)
         return _integrate(
@@ -130,13 +133,13 @@ def simulate(
             prepared,
             times,
             state,
-            _save_at(saveat),
+            points,
             stepsize_controller,
             adjoint,
             event,
             max_steps,
             meter,
-            restore=event is not None or isinstance(manifold, Free),
+            restore=_way_back(manifold, interpolated),
         )
 
     trajectory = motion(solver)
@@ -198,8 +201,8 @@ def _integrate(
     )
     ts, saved = solution.ts[0], solution.ys[0]
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
-    if isinstance(saved, State) and (restore or (saveat.subs is not None and saveat.subs.ts is not None)):
-        saved = _restore(system, ts, saved)
+    if isinstance(saved, State) and restore is not None:
+        saved = _restore(system, ts, saved, restore)
     return Trajectory(
         system=system,
         formulation=formulation,
@@ -263,11 +266,19 @@ def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     )
 
 
-def _restore(system, ts, saved):
-    """Bring interpolated states back to the constraints; entries after the end of a run stay as they are."""
+def _way_back(manifold: AbstractManifold, interpolated: bool) -> Any:
+    """What saved states need: those between steps are not on the constraints, and free ones never are quite."""
+    if isinstance(manifold, Baumgarte):
+        # How far its states are off is what one looks for.
+        return _normalized
+    return _on_manifold if interpolated or isinstance(manifold, Free) else None
+
+
+def _restore(system, ts, saved, back):
+    """Bring states back to where they belong; entries after the end of a run stay as they are."""
     finite = jnp.isfinite(ts)
     inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(_first(y))), saved)
-    restored = jax.vmap(lambda t, y: _on_manifold(system, t, y))(jnp.where(finite, ts, 0.0), inside)
+    restored = jax.vmap(lambda t, y: back(system, t, y))(jnp.where(finite, ts, 0.0), inside)
     return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), restored, saved)
 
 
@@ -275,8 +286,13 @@ def _first(y):
     return jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
 
 
+def _normalized(system, t, y):
+    del t
+    return State(system.normalize(y.q), y.u)
+
+
 def _on_manifold(system, t, y):
-    return project(system, t, State(system.normalize(y.q), y.u))
+    return project(system, t, _normalized(system, t, y))
 
 
 def _diagnose(system, start, end, solution):

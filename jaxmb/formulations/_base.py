@@ -93,8 +93,10 @@ def accelerations(
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
+    demand: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ of a system at a state on its constraints.
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `demand`, those of
+    `A u̇ = γ − demand`.
 
     **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular, and for one
     that needs a chain of independent joints where there is none.
@@ -110,7 +112,7 @@ def accelerations(
         jacobian, split = linearize(system, t, q, u)
     else:
         jacobian, split = system.jacobian(t, q, u), every_row(system.acceleration_rows, system.nu, u.dtype)
-    return solve_constrained(system, formulation, t, q, u, jacobian, split)
+    return solve_constrained(system, formulation, t, q, u, jacobian, split, demand)
 
 
 def solve_constrained(
@@ -121,14 +123,16 @@ def solve_constrained(
     u: Float[Array, "nu"],
     jacobian: Any,
     split: Factor,
+    demand: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ from the Jacobian A and its factor.
+    """The same from the Jacobian A and its factor.
 
     Where constraints are not ideal, their force C follows from the multipliers of ideal ones, and then accelerations
     from C as from any other force (F. E. Udwadia and P. Phohomsiri, Proc. R. Soc. A 463, 2007): `M u̇ = F + C + Aᵀ λ`.
     """
     inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+    gamma = gamma if demand is None else gamma - demand
     udot, multipliers = formulation.solve(inertia, force, jacobian, gamma, split)
     if system.ideal:
         return udot, multipliers

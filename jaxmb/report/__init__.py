@@ -1,4 +1,4 @@
-"""What accuracy costs: error against run time and evaluations; and what each formulation does."""
+"""What accuracy costs: error against run time and evaluations; what each formulation does, and each way of integrating."""
 
 from .formulations import (
     Cost as Cost,
@@ -6,5 +6,6 @@ from .formulations import (
     every_formulation as every_formulation,
     formulation_costs as formulation_costs,
 )
+from .method_costs import MethodCost as MethodCost, MethodCosts as MethodCosts, method_costs as method_costs
 from .timing import interleaved as interleaved, timed_compile as timed_compile
 from .work_precision import Run as Run, WorkPrecision as WorkPrecision, work_precision as work_precision

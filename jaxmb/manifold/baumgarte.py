@@ -1,0 +1,57 @@
+"""Baumgarte's stabilisation: accelerations that bring the state back to its constraints.
+
+Source: J. Baumgarte, "Stabilization of constraints and integrals of motion in dynamical systems", Comput. Methods Appl.
+Mech. Eng. 1, 1972.
+"""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import State
+from ..formulations import AbstractFormulation, accelerations
+from ..formulations._base import check_mass
+from ..system import AbstractSystem
+from ._base import AbstractManifold
+
+
+class Baumgarte(AbstractManifold):
+    """Integrate all coordinates and velocities, with constraints on accelerations that decay, for any solver.
+
+    Of constraints between positions `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, of those between velocities `ψ̇ + rate ψ = 0`: the
+    state is near the constraints, not on them, and a rate much above that of the motion makes it stiff. For comparison
+    with `Partition`, which needs no such number.
+
+    **Arguments:** `rate` [1/s] > 0.
+    """
+
+    rate: float = eqx.field(static=True, default=10.0)
+
+    def __check_init__(self):
+        if not (np.isfinite(self.rate) and self.rate > 0):
+            raise ValueError(f"Baumgarte: rate must be positive and finite, got {self.rate}.")
+
+    def prepare(self, system, formulation, solver, rtol):
+        check_mass(system, formulation)
+        return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
+
+
+class StabilisedField(eqx.Module):
+    """`(q, u) ↦ (K(t, q, u), u̇)` with accelerations that stabilise the constraints."""
+
+    system: AbstractSystem
+    formulation: AbstractFormulation
+    rate: float = eqx.field(static=True)
+
+    def __call__(self, t, y, args):
+        del args
+        system, q, u = self.system, self.system.normalize(y.q), y.u
+        position = system.position_residual(t, q)
+        velocity = system.velocity_residual(t, q, u)
+        holonomic = np.arange(system.velocity_rows) < system.position_rows
+        demand = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
+        demand = demand + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
+        demand = jnp.pad(demand, (0, system.acceleration_rows - demand.size))
+        udot, _ = accelerations(system, self.formulation, t, q, u, demand)
+        return State(system.rates(t, q, u), udot)

@@ -1,0 +1,231 @@
+"""What whole ways of integrating a constrained motion cost at equal error: in evaluations, linear algebra, and time."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import numpy as np
+
+from .._results import RESULTS
+from .._types import State
+from ..formulations import Multipliers, NullSpace, Partitioned
+from ..manifold import AbstractManifold, Baumgarte, Partition
+from ..mechanisms import Mechanism, References
+from ..simulate import simulate
+from ..solvers import Adams, Hermite
+from ..system import AbstractSystem
+from ..trajectory import Trajectory
+from .evaluations import evaluations
+from .reference import reference
+from .stabilised_dae import applies_to, stabilised_dae
+from .timing import interleaved
+
+ERRORS = (1e-3, 1e-5, 1e-7)
+
+# Tolerances are tried from the first on, some to a decade, until the error is small enough.
+_TOLERANCES = 10.0 ** -np.arange(2.5, 12.0, 0.5)
+# Of Baumgarte's stabilisation [1/s].
+_RATE = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class MethodCost:
+    """One method, with the coarsest tolerance that meets a bound of the error.
+
+    **Fields:** `method`; `bound` and `error`, the largest relative error of what the mechanism observes at the end;
+    `rtol`; `evaluations` of the accelerations, or of the residual of implicit equations; `matrices` made for Newton's
+    method; `flops` of linear algebra, in full matrices; `time` [s] of a warm run. NaN and zeros where no tolerance
+    meets the bound.
+    """
+
+    method: str
+    bound: float
+    error: float
+    rtol: float
+    evaluations: int
+    matrices: int
+    flops: float
+    time: float
+
+
+@dataclasses.dataclass(frozen=True)
+class MethodCosts:
+    """What `method_costs` returns; `print` shows a table. `remarks`: what was left out, and why."""
+
+    mechanism: str
+    t1: float
+    costs: tuple[MethodCost, ...]
+    remarks: tuple[str, ...]
+
+    def __str__(self) -> str:
+        rows = [_HEADER, *map(_cells, self.costs)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+        title = f"{self.mechanism}, {self.t1:g} s: what it takes for an error at the end below each bound"
+        return "\n".join([title, *map(text, rows), *self.remarks])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists, for JSON."""
+        return dataclasses.asdict(self)
+
+
+_HEADER = ("method", "bound", "error", "rtol", "evaluations", "matrices", "Mflop", "run [ms]")
+
+
+def _cells(cost: MethodCost) -> tuple[str, ...]:
+    if not np.isfinite(cost.error):
+        return (cost.method, f"{cost.bound:.0e}", "not met", *["–"] * 5)
+    counts = str(cost.evaluations), str(cost.matrices), f"{cost.flops / 1e6:.1f}", f"{1e3 * cost.time:.2f}"
+    return (cost.method, f"{cost.bound:.0e}", f"{cost.error:.1e}", f"{cost.rtol:.0e}", *counts)
+
+
+class _Run(NamedTuple):
+    """What one run gave: its error, infinite if it failed; evaluations and matrices."""
+
+    error: float
+    evaluations: int
+    matrices: int
+
+
+class _Method(NamedTuple):
+    """`run(rtol)` is timed, `judge` says what its result is worth; floating point operations of an evaluation and of
+    a matrix.
+    """
+
+    run: Callable[[float], Any]
+    judge: Callable[[Any], _Run]
+    evaluation: float
+    matrix: float
+
+
+def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repeats: int = 5) -> MethodCosts:
+    """Compare coordinate partitioning with integrating all coordinates, at equal error.
+
+    The methods are partitioning with `Adams` and with `Hermite`; all coordinates with multipliers and Baumgarte's
+    stabilisation, with `Adams` and with `Dopri8` of diffrax; and, where scikit-sundae is there and the joints are
+    holonomic, planar and not redundant, implicit BDF (SUNDIALS' IDA) on the stabilised equations of index 2. The last
+    is called back from Python for every evaluation, which its time contains.
+
+    Counts of linear algebra are those of full matrices: elimination of the constraints and Cholesky's factor of the
+    reduced mass matrix; of A M⁻¹ Aᵀ; and LU of everything for the implicit methods.
+
+    **Arguments:** `errors`: bounds of the largest relative error at the end, of what the mechanism observes; `repeats`:
+    timed runs of each, in turns, of which the shortest counts.
+
+    **Raises:** `ValueError` for a mechanism without constraints.
+    """
+    system, state = mechanism.system, mechanism.state
+    if system.acceleration_rows == 0:
+        raise ValueError(f"{mechanism.name!r} has no constraints: there are no coordinates to choose.")
+    known = reference(mechanism, min(errors) / 100)
+    t1, remarks = float(known.times[-1]), []
+    methods = _simulations(mechanism, known)
+    if not applies_to(system):
+        remarks.append("IDA is left out: its equations are for planar, holonomic joints without redundant rows.")
+    else:
+        try:
+            methods["stabilised index 2, IDA"] = _implicit(mechanism, known, stabilised_dae(system, state, t1))
+        except ImportError as error:
+            remarks.append(f"{error}.")
+    found, runs = [], []
+    for name, method in methods.items():
+        tried = {}
+        for bound in errors:
+            for rtol in _TOLERANCES:
+                if rtol not in tried:
+                    tried[rtol] = method.judge(method.run(rtol))
+                if tried[rtol].error <= bound:
+                    found.append((name, bound, rtol, tried[rtol]))
+                    runs.append(lambda method=method, rtol=rtol: method.run(rtol))
+                    break
+            else:
+                found.append((name, bound, float("nan"), None))
+    times = iter(interleaved(runs, repeats))
+    costs = []
+    for name, bound, rtol, run in found:
+        if run is None:
+            costs.append(MethodCost(name, bound, float("nan"), rtol, 0, 0, 0.0, float("nan")))
+            continue
+        flops = run.evaluations * methods[name].evaluation + run.matrices * methods[name].matrix
+        costs.append(MethodCost(name, bound, run.error, rtol, run.evaluations, run.matrices, flops, min(next(times))))
+    return MethodCosts(mechanism.name, t1, tuple(costs), tuple(remarks))
+
+
+def _simulations(mechanism: Mechanism, known: References) -> dict[str, _Method]:
+    system = mechanism.system
+    n, m = system.nu, system.acceleration_rank
+    free = n - m
+    # Gauss–Jordan on m × n at every predicted state, the reduced mass matrix and its Cholesky factor at every one.
+    reduced = 2 * free * free * n + free**3 / 3
+    eliminated = 2 * m * m * n
+    multipliers = m * m * n + m**3 / 3
+    # One complex matrix of the free coordinates and velocities is inverted.
+    newton = 8 * (2 * free) ** 3
+    stabilised = Baumgarte(_RATE)
+    ways = {
+        "partitioning, Adams": (Adams(), Partition(), eliminated / 2 + reduced, 0.0),
+        "partitioning, Hermite": (Hermite(), Partition(), eliminated + reduced, newton),
+        "multipliers, Baumgarte, Adams": (Adams(), stabilised, multipliers, 0.0),
+        "multipliers, Baumgarte, Dopri8": (diffrax.Dopri8(), stabilised, multipliers, 0.0),
+    }
+    return {name: _simulation(mechanism, known, *way) for name, way in ways.items()}
+
+
+def _simulation(
+    mechanism: Mechanism,
+    known: References,
+    solver: diffrax.AbstractSolver,
+    manifold: AbstractManifold,
+    evaluation: float,
+    matrix: float,
+) -> _Method:
+    t1 = float(known.times[-1])
+    others = Multipliers() if mechanism.system.regular else NullSpace()
+    formulation = Partitioned() if isinstance(manifold, Partition) else others
+
+    @eqx.filter_jit
+    def compiled(system: AbstractSystem, state: State, rtol: Any) -> Trajectory:
+        options: dict[str, Any] = {"solver": solver, "manifold": manifold, "formulation": formulation}
+        return simulate(
+            system, state, t1=t1, rtol=rtol, throw=False, adjoint=diffrax.ForwardMode(), max_steps=1_000_000, **options
+        )
+
+    def judge(trajectory: Trajectory) -> _Run:
+        if not bool(trajectory.result == RESULTS.successful):
+            return _Run(float("inf"), 0, 0)
+        count = evaluations(solver, trajectory.stats)
+        assert count is not None
+        matrices = int(trajectory.stats.get("num_matrices", 0))
+        return _Run(_error(mechanism, known, trajectory.ts, trajectory.ys), count, matrices)
+
+    return _Method(lambda rtol: compiled(mechanism.system, mechanism.state, rtol), judge, evaluation, matrix)
+
+
+def _implicit(mechanism: Mechanism, known: References, run: Callable[[float], Any]) -> _Method:
+    size = 2 * mechanism.system.nu + 2 * mechanism.system.position_rows
+
+    def judge(found: Any) -> _Run:
+        if found.end is None:
+            return _Run(float("inf"), 0, 0)
+        ys = jax.tree.map(lambda x: x[None], found.end)
+        return _Run(_error(mechanism, known, known.times[-1:], ys), found.evaluations, found.matrices)
+
+    return _Method(run, judge, 2.0 * size**2, 2 * size**3 / 3)
+
+
+def _error(mechanism: Mechanism, known: References, ts: Any, ys: Any) -> float:
+    trajectory = Trajectory(
+        system=mechanism.system,
+        formulation=Multipliers(),
+        ts=jax.numpy.asarray(ts),
+        ys=ys,
+        stats={},
+        result=RESULTS.successful,
+        interpolation=None,
+        event_mask=None,
+    )
+    errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
+    return max(float(error[-1]) for error in errors.values())
