@@ -1,7 +1,7 @@
 """The hanging chain."""
 
+import jax.numpy as jnp
 import numpy as np
-from numpy.polynomial import laguerre
 
 from .. import planar
 from .._forces import Gravity
@@ -38,9 +38,11 @@ def hanging_chain(
     if n < 1 or not 1 <= mode <= n:
         raise ValueError(f"hanging_chain needs n ≥ 1 masses and a mode of 1 … n, got n = {n} and mode {mode}.")
     l = length / n
-    zero = np.sort(laguerre.lagroots(np.eye(n + 1)[n]))[mode - 1]
-    shape = laguerre.lagvander(zero, n - 1).ravel()[::-1]
-    x = amplitude * shape / np.max(np.abs(shape))
+    # The matrix of the polynomials' recurrence, and of the chain's stiffness: L_0, L_1, … at zeros of L_n.
+    j = np.arange(n)
+    below = np.diag(j[1:], 1)
+    shape = np.linalg.eigh(np.diag(2 * j + 1) - below - below.T)[1][:, mode - 1]
+    x = amplitude * np.sign(shape[0]) * shape[::-1] / np.max(np.abs(shape))
     across = np.diff(x, prepend=0.0) / l
     if np.max(np.abs(across)) >= 1:
         raise ValueError(f"An amplitude of {amplitude} m is too much for rods of {l} m in mode {mode}.")
@@ -59,10 +61,10 @@ def hanging_chain(
 
 
 def _observe(trajectory, n):
-    places = np.stack([trajectory[f"mass{k + 1}"].position for k in range(n)])
-    along = np.diff(places, axis=0, prepend=0.0)
+    places = jnp.stack([trajectory[f"mass{k + 1}"].position for k in range(n)])
+    along = jnp.diff(places, axis=0, prepend=jnp.zeros_like(places[:1]))
     observed = {"x": places[-1, :, 0], "y": places[-1, :, 1]}
-    return observed | {f"angle{k + 1}": np.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}
+    return observed | {f"angle{k + 1}": jnp.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}
 
 
 _REFERENCES = References(
