@@ -358,6 +358,7 @@ def test_names_are_checked():
         ("hanging_chain", {"mode": 6}, "1 … n"),
         ("hanging_chain", {"amplitude": 1.0}, "too much"),
         ("double_wishbone", {"joints": "rubber"}, "ideal, bushings"),
+        ("double_wishbone", {"bushing": (1e6, 0.0)}, "no bushings"),
         ("double_wishbone", {"points": {"weel": (0.0, 0.0, 0.0)}}, "wheel"),
         ("bennett", {"lengths": (1.0, 0.5)}, "leave no other twist"),
     ],

@@ -30,6 +30,7 @@ _POINTS = {
     "spring_top": (0.0, 0.45, 0.62),
     "spring_bottom": (0.0, 0.6, 0.235),
 }
+_ARMS = ("lower", "upper")
 
 
 @mechanism()
@@ -43,8 +44,8 @@ def double_wishbone(
     speed: float = 2.0,
     gravity: float = 9.81,
     joints: Literal["ideal", "bushings"] = "ideal",
-    bushing: tuple[float, float] = (5e6, 20.0),
-    bushing_damping: tuple[float, float] = (2e3, 0.1),
+    bushing: tuple[float, float] | None = None,
+    bushing_damping: tuple[float, float] | None = None,
 ) -> Mechanism:
     """A left wheel on a lower and an upper arm, a tie rod and a spring, jounces on its tyre beside a car that stands
     still; x forward, y to the left, z up.
@@ -60,13 +61,18 @@ def double_wishbone(
     `spring_bottom`, the latter on the lower arm; `masses` [kg] of lower arm, upper arm, and upright with wheel;
     `stiffness` [N/m] and `damping` [N s/m] of the spring; `tyre` [N/m], vertical stiffness; `speed` [m/s] of the
     wheel's centre at the start, upward; `gravity` [m/s²]; `joints` of arms and car; `bushing` [N/m, N m/rad], against
-    shifts and turns in all directions, and `bushing_damping` [N s/m, N m s/rad].
+    shifts and turns in all directions, default 5·10⁶ and 20, and `bushing_damping` [N s/m, N m s/rad], default 2·10³
+    and 0.1.
 
     **Labels:** `z`, `y` [m], travel of the wheel's centre, up and outward; `camber` [rad], top outward; `toe` [rad],
     front inward; `rate` [m/s], ż.
     """
     if joints not in ("ideal", "bushings"):
         raise ValueError(f"The joints are ideal, bushings; got {joints!r}.")
+    if joints == "ideal" and not (bushing is None and bushing_damping is None):
+        raise ValueError(
+            "Ideal joints have no bushings: leave out bushing and bushing_damping, or give joints='bushings'."
+        )
     for name in points or {}:
         if name not in _POINTS:
             raise unknown("point", name, _POINTS)
@@ -92,7 +98,13 @@ def double_wishbone(
         moving = np.asarray(assemble(rigid, rates=rates).u).reshape(len(bodies), 6)
         where = lambda body: (body.velocity, body.angular_velocity)
         bodies = [eqx.tree_at(where, body, (u[:3], u[3:])) for body, u in zip(bodies, moving, strict=True)]
-        forces += [_bushing(f"{arm}_{end}", arm, P, bushing, bushing_damping) for arm in _ARMS for end in _ENDS]
+        of = lambda pair: np.repeat(np.asarray(pair, float), 3)
+        stiff, damped = of(bushing or (5e6, 20.0)), of(bushing_damping or (2e3, 0.1))
+        forces += [
+            spatial.Bushing(f"{arm}_{end}", "ground", arm, point=P[f"{arm}_{end}"], stiffness=stiff, damping=damped)
+            for arm in _ARMS
+            for end in ("front", "rear")
+        ]
     return build(
         "double_wishbone",
         Scene(bodies, joints=[*hinges, *links] if joints == "ideal" else links, forces=forces),
@@ -102,9 +114,6 @@ def double_wishbone(
         references=_REFERENCES,
         rates=rates,
     )
-
-
-_ARMS, _ENDS = ("lower", "upper"), ("front", "rear")
 
 
 def _arm(name, mass, P):
@@ -121,11 +130,6 @@ def _hinge(arm, P):
     front, rear = P[f"{arm}_front"], P[f"{arm}_rear"]
     along = front - rear
     return spatial.Revolute(f"{arm}_hinge", "ground", arm, point=front, axis=along / np.linalg.norm(along))
-
-
-def _bushing(name, arm, P, stiffness, damping):
-    of = lambda pair: np.repeat(np.asarray(pair, float), 3)
-    return spatial.Bushing(name, "ground", arm, point=P[name], stiffness=of(stiffness), damping=of(damping))
 
 
 def _push(poses, velocities, t, p):
