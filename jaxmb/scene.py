@@ -79,7 +79,7 @@ class Scene(eqx.Module):
             jnp.asarray(np.concatenate([body.pose() for body in self.bodies])),
             jnp.asarray(np.concatenate([body.velocities() for body in self.bodies])),
         )
-        given = np.append(guess.q, np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
+        given: Any = np.append(guess.q, np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):

@@ -51,6 +51,11 @@ def test_report(capsys, tmp_path):
     out = capsys.readouterr().out
     assert all(name in out for name in ("Adams", "Tsit5", "Dopri8"))
     assert len(json.loads((tmp_path / "work_precision.json").read_text())["runs"]) == 3
+    # What partitioning costs, and the same with all coordinates.
+    costs = json.loads((tmp_path / "method_costs.json").read_text())["costs"]
+    assert {cost["bound"] for cost in costs} == {1e-3, 1e-5, 1e-7} and "multipliers, Baumgarte" in out
+    for cost in costs:
+        assert 0 < cost["error"] <= cost["bound"] and cost["evaluations"] > 0 and cost["flops"] > 0
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What accuracy costs: error against run time and evaluations; what each formulation does, and each way of integrating."""
+"""What accuracy costs: error against run time and evaluations; what formulations do, and whole ways of integrating."""
 
 from .formulations import (
     Cost as Cost,

@@ -223,7 +223,7 @@ def _error(mechanism: Mechanism, known: References, ts: Any, ys: Any) -> float:
         ts=jax.numpy.asarray(ts),
         ys=ys,
         stats={},
-        result=RESULTS.successful,
+        result=RESULTS.successful,  # pyright: ignore[reportArgumentType]
         interpolation=None,
         event_mask=None,
     )
