@@ -29,11 +29,11 @@ def test_rank_orders_and_influence(m, n, rank):
     solved = factor(A, order, rank)
     np.testing.assert_allclose(A @ solved.basis, 0, atol=1e-11 * max(1, float(jnp.max(jnp.abs(A)))))
     independent = np.asarray(order.columns)[rank:]
-    np.testing.assert_allclose(solved.basis[independent], np.eye(n - rank), atol=0)
+    np.testing.assert_allclose(solved.basis[independent], np.eye(n - rank), rtol=0, atol=0)
     # The correction solves consistent equations and leaves independent columns alone.
     x = jnp.asarray(RNG.normal(size=n))
     moved = solved.correction @ (A @ x)
-    np.testing.assert_allclose(A @ moved, A @ x, atol=1e-10 * max(1, float(jnp.max(jnp.abs(A @ x)))))
+    np.testing.assert_allclose(A @ moved, A @ x, rtol=0, atol=1e-10 * max(1, float(jnp.max(jnp.abs(A @ x)))))
     np.testing.assert_allclose(moved[independent], 0, atol=0)
 
 
@@ -106,7 +106,7 @@ def test_solve_positive(n):
     root = jnp.asarray(RNG.normal(size=(n, n)))
     M = root @ root.T + jnp.eye(n)
     b = jnp.asarray(RNG.normal(size=n))
-    np.testing.assert_allclose(M @ solve_positive(M, b), b, atol=1e-10)
+    np.testing.assert_allclose(M @ solve_positive(M, b), b, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("n", [1, 5])
@@ -114,7 +114,7 @@ def test_cholesky_and_its_derivatives(n):
     start, along = RNG.normal(size=(2, n, n))
     M = jnp.asarray(start @ start.T + np.eye(n))
     dM = jnp.asarray(along + along.T)
-    np.testing.assert_allclose(cholesky(M), np.linalg.cholesky(M), atol=1e-13)
+    np.testing.assert_allclose(cholesky(M), np.linalg.cholesky(M), rtol=0, atol=1e-13)
     # Results that are the same for every root have derivatives; this one knows its own without a root.
     force = jnp.asarray(RNG.normal(size=n))
     distance = lambda s: jnp.sum(solve_positive(cholesky(M + s * dM), force) ** 2)

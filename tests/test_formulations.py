@@ -79,9 +79,9 @@ def test_equal_to_numpy_whichever_rows_and_columns_are_chosen(dense):
             all_rows = np.zeros(RANK + 1)
             all_rows[kept] = some
             for k, name in enumerate(ROADS):
-                np.testing.assert_allclose(udot[k], expected, atol=1e-11, err_msg=name)
+                np.testing.assert_allclose(udot[k], expected, rtol=0, atol=1e-11, err_msg=name)
                 np.testing.assert_allclose(
-                    multipliers[k], all_rows, atol=1e-11 * (1 + np.max(np.abs(some))), err_msg=name
+                    multipliers[k], all_rows, rtol=0, atol=1e-11 * (1 + np.max(np.abs(some))), err_msg=name
                 )
 
 
@@ -106,10 +106,12 @@ def test_singular_mass():
     udot, multipliers = jax.jit(lambda *args: solve_by_all(DenseInertia(M), *args, roads))(F, A, gamma, order)
     expected, _ = by_numpy(M, F, A, gamma, np.arange(RANK))
     for k, name in enumerate(roads):
-        np.testing.assert_allclose(udot[k], expected, atol=1e-11, err_msg=name)
-        np.testing.assert_allclose(A @ udot[k], gamma, atol=1e-14 * (1 + np.max(np.abs(gamma))), err_msg=name)
+        np.testing.assert_allclose(udot[k], expected, rtol=0, atol=1e-11, err_msg=name)
+        np.testing.assert_allclose(A @ udot[k], gamma, rtol=0, atol=1e-14 * (1 + np.max(np.abs(gamma))), err_msg=name)
         force = M @ udot[k] - F
-        np.testing.assert_allclose(A.T @ multipliers[k], force, atol=1e-14 * (1 + np.max(np.abs(force))), err_msg=name)
+        np.testing.assert_allclose(
+            A.T @ multipliers[k], force, rtol=0, atol=1e-14 * (1 + np.max(np.abs(force))), err_msg=name
+        )
 
 
 def test_forces_that_do_virtual_work():
@@ -125,12 +127,12 @@ def test_forces_that_do_virtual_work():
     # Only the part along motions that the constraint allows acts.
     outcomes = zip(ROADS, solve(force), solve(force + rough), solve(force + 3.0 * A[0]), strict=True)
     for name, (ideal, multipliers), (udot, _), (same, _) in outcomes:
-        np.testing.assert_allclose(A @ ideal, gamma, atol=1e-14, err_msg=name)
-        np.testing.assert_allclose(moments * ideal - force, A.T @ multipliers, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(A @ ideal, gamma, rtol=0, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(moments * ideal - force, A.T @ multipliers, rtol=0, atol=1e-14, err_msg=name)
         np.testing.assert_allclose(admissible.T @ (moments * ideal - force), 0.0, atol=1e-14, err_msg=name)
-        np.testing.assert_allclose(A @ udot, gamma, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(A @ udot, gamma, rtol=0, atol=1e-14, err_msg=name)
         np.testing.assert_allclose(admissible.T @ (moments * udot - force - rough), 0.0, atol=1e-14, err_msg=name)
-        np.testing.assert_allclose(same, ideal, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(same, ideal, rtol=0, atol=1e-14, err_msg=name)
 
 
 @pytest.mark.parametrize("redundant", [False, True])
@@ -158,14 +160,16 @@ def test_derivatives(redundant):
     h = 1e-5
     difference = lambda of: (of(start + h * direction) - of(start - h * direction)) / (2 * h)
     size = np.max(np.abs(first))
-    np.testing.assert_allclose(first_reverse, first, atol=1e-12 * size)
-    np.testing.assert_allclose(first, jnp.broadcast_to(first[:1], first.shape), atol=1e-11 * size)
-    np.testing.assert_allclose(first @ direction, difference(jax.jit(solutions)), atol=1e-8 * size)
+    np.testing.assert_allclose(first_reverse, first, rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(first, jnp.broadcast_to(first[:1], first.shape), rtol=0, atol=1e-11 * size)
+    np.testing.assert_allclose(first @ direction, difference(jax.jit(solutions)), rtol=0, atol=1e-8 * size)
     if redundant:
         size = np.max(np.abs(second))
-        np.testing.assert_allclose(second_reverse, second, atol=1e-12 * size)
-        np.testing.assert_allclose(second, jnp.broadcast_to(second[:1], second.shape), atol=1e-11 * size)
-        np.testing.assert_allclose(second, difference(lambda entries: derivatives(entries)[0][0]), atol=1e-8 * size)
+        np.testing.assert_allclose(second_reverse, second, rtol=0, atol=1e-12 * size)
+        np.testing.assert_allclose(second, jnp.broadcast_to(second[:1], second.shape), rtol=0, atol=1e-11 * size)
+        np.testing.assert_allclose(
+            second, difference(lambda entries: derivatives(entries)[0][0]), rtol=0, atol=1e-8 * size
+        )
 
 
 def test_roots_of_mass_matrices():
@@ -199,7 +203,7 @@ def test_roots_of_mass_matrices():
             yield from zip(*(map(symmetric, jax.tree.leaves(x)) for x in (framed, plain)), strict=True)
 
     for found, expected in jax.jit(lambda inertias: list(compare(inertias)))(inertias):
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 # With no more bodies than it takes to have all their joints.
@@ -284,17 +288,17 @@ def test_formulations_agree(name):
         motion, multipliers, left, (sums, sizes), (power, powers), (least, more), excess = solve(q, u, change)
         for values in (motion[2][0], multipliers):
             for k, road in enumerate(roads):
-                np.testing.assert_allclose(values[k], values[0], atol=1e-10 * largest(values[0]), err_msg=road)
+                np.testing.assert_allclose(values[k], values[0], rtol=0, atol=1e-10 * largest(values[0]), err_msg=road)
         np.testing.assert_allclose(left[0], 0.0, atol=1e-9 * largest(sums))
         np.testing.assert_allclose(left, 0.0, atol=1e-10 * largest(sizes))
         # The ideal force of constraints does no work in displacements that they allow.
         np.testing.assert_allclose(power, 0.0, atol=1e-10 * largest(powers))
         if system.ideal and system.regular:
-            np.testing.assert_allclose(more - least, excess, atol=1e-12 * more)
+            np.testing.assert_allclose(more - least, excess, rtol=0, atol=1e-12 * more)
         for values in motion:
             for k, road in enumerate(roads):
                 bound = 1e-8 * largest(values[:, 0])
-                np.testing.assert_allclose(values[:, k], values[:, 0], atol=bound, err_msg=road)
+                np.testing.assert_allclose(values[:, k], values[:, 0], rtol=0, atol=bound, err_msg=road)
 
 
 MOTIONS = {
@@ -321,8 +325,8 @@ def motions():
 def test_motions_by_every_formulation(road, motions):
     for way, expected in motions:
         end = way(ROADS[road])
-        np.testing.assert_allclose(end.q, expected.q, atol=1e-9)
-        np.testing.assert_allclose(end.u, expected.u, atol=1e-8)
+        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-8)
 
 
 def test_unknown_form_is_an_error():
@@ -350,7 +354,7 @@ class SaddlePoint(AbstractFormulation):
 
 def test_a_formulation_of_ones_own(motions):
     for way, expected in motions:
-        np.testing.assert_allclose(way(SaddlePoint()).q, expected.q, atol=1e-9)
+        np.testing.assert_allclose(way(SaddlePoint()).q, expected.q, rtol=0, atol=1e-9)
 
 
 def test_formulations_that_need_the_inverse_of_a_singular_mass_matrix_are_refused():

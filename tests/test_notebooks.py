@@ -54,4 +54,4 @@ def test_readme_example(capsys):
     exec(code.group(1), {})
     promised = [float(number) for number in code.group(1).rsplit("#", 1)[1].split()]
     printed = [float(number) for number in capsys.readouterr().out.split()]
-    np.testing.assert_allclose(printed, promised, atol=1e-6)
+    np.testing.assert_allclose(printed, promised, rtol=0, atol=1e-6)

@@ -79,7 +79,7 @@ def check_parameter_derivatives(f, part, rng):
     central = lambda h: (f(perturbed(part, direction, h)) - f(perturbed(part, direction, -h))) / (2 * h)
     difference = (4 * central(1e-4) - central(2e-4)) / 3
     scale = 1.0 + float(jnp.max(jnp.abs(difference)))
-    np.testing.assert_allclose(derivative, difference, atol=1e-7 * scale)
+    np.testing.assert_allclose(derivative, difference, rtol=0, atol=1e-7 * scale)
 
 
 # Joints
@@ -219,7 +219,7 @@ def test_joint_resolves_to_body_fixed_form(setup):
     )
     if "point_a" in fields and type(setup.part) is not spatial.Distance:
         A, B = SPACE.point(setup.poses[0], setup.part.point_a), SPACE.point(setup.poses[1], setup.part.point_b)
-        np.testing.assert_allclose(A, B, atol=1e-13)
+        np.testing.assert_allclose(A, B, rtol=0, atol=1e-13)
 
 
 def test_joint_parameter_derivatives(setup):
@@ -257,7 +257,7 @@ def test_weld_and_slide_keep_a_given_orientation():
         np.testing.assert_allclose(at(orientation), 0.0, atol=1e-15)
         # A turn away by a small angle shows as that angle.
         away = rot.multiply(orientation, turn(jnp.array([0.0, 1.0, 0.0]), jnp.array(1e-4)))
-        np.testing.assert_allclose(at(away)[-3:], [0.0, 1e-4, 0.0], atol=1e-12)
+        np.testing.assert_allclose(at(away)[-3:], [0.0, 1e-4, 0.0], rtol=0, atol=1e-12)
 
 
 def test_screw_error_is_axial_distance():
@@ -307,12 +307,12 @@ def test_angle_driver_passes_many_turns():
     for t in (0.0, 0.4, 1.0, 5.0, 50.0):
         turned = poses.at[1].set(move(poses[1], turn(axis, jnp.array(3.0 * t)), point, STILL))
         np.testing.assert_allclose(hinge.residual(SPACE, turned, t), 0.0, atol=1e-12)
-        np.testing.assert_allclose(part.residual(SPACE, turned, jnp.array(t)), [0.0], atol=1e-12)
+        np.testing.assert_allclose(part.residual(SPACE, turned, jnp.array(t)), [0.0], rtol=0, atol=1e-12)
         wrapped = np.angle(np.exp(3.0j * t))
-        np.testing.assert_allclose(part.value(SPACE, turned), wrapped, atol=1e-12)
+        np.testing.assert_allclose(part.value(SPACE, turned), wrapped, rtol=0, atol=1e-12)
         # The row is the error of the angle, so its multiplier is the driving moment.
         jacobian = velocity_jacobian(lambda q, t=t: part.residual(SPACE, q, jnp.array(t)), turned)
-        np.testing.assert_allclose(jacobian[0, 9:], rot.unrotate(turned[1, 3:], axis), atol=1e-12)
+        np.testing.assert_allclose(jacobian[0, 9:], rot.unrotate(turned[1, 3:], axis), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("quantity", ["x", "y", "z", "distance"])
@@ -324,7 +324,7 @@ def test_length_driver(quantity):
         np.linalg.norm(d) if quantity == "distance" else rot.rotation_matrix(poses[0, 3:])[:, "xyz".index(quantity)] @ d
     )
     np.testing.assert_allclose(part.value(SPACE, poses), expected, rtol=1e-13)
-    np.testing.assert_allclose(part.residual(SPACE, poses, jnp.array(expected / 3.0)), [0.0], atol=1e-14)
+    np.testing.assert_allclose(part.residual(SPACE, poses, jnp.array(expected / 3.0)), [0.0], rtol=0, atol=1e-14)
 
 
 # Rolling
@@ -405,7 +405,7 @@ def test_rolling_sphere(spin):
     velocity = np.linalg.lstsq(np.asarray(jacobian), -np.asarray(at_rest), rcond=None)[0] + basis[3:].sum(0)
     rho = SPACE.body_direction(pose, -0.2 * sphere.normal)
     carried = (spin or 0.0) * np.cross(sphere.normal, pose[:3] - sphere.point)
-    np.testing.assert_allclose(SPACE.point_velocity(pose, jnp.asarray(velocity), rho), carried, atol=1e-13)
+    np.testing.assert_allclose(SPACE.point_velocity(pose, jnp.asarray(velocity), rho), carried, rtol=0, atol=1e-13)
 
 
 def test_knife_edge():
@@ -413,7 +413,7 @@ def test_knife_edge():
     blade = spatial.KnifeEdge("blade", "a", point=(0.2, 0.0, 0.0)).resolve(SPACE, pose)
     rows = lambda u: blade.residual(SPACE, pose, jnp.asarray(u)[None], 0.0)
     heading = np.array([np.cos(0.7), np.sin(0.7), 0.0])
-    np.testing.assert_allclose(rows([*heading, 0.0, 0.0, 0.0]), [0.0], atol=1e-15)
+    np.testing.assert_allclose(rows([*heading, 0.0, 0.0, 0.0]), [0.0], rtol=0, atol=1e-15)
     np.testing.assert_allclose(rows([-heading[1], heading[0], 0.0, 0.0, 0.0, 0.0]), [1.0])
     np.testing.assert_allclose(rows([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), [0.0])
     np.testing.assert_allclose(rows([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), [0.2])
@@ -500,7 +500,10 @@ def test_forces_are_blind_to_the_sign_of_euler_parameters():
         part = part.resolve(SPACE, given)
         flipped = poses.at[1, 3:].multiply(-1.0)
         np.testing.assert_allclose(
-            part.wrenches(SPACE, flipped, velocities, 0.0), part.wrenches(SPACE, poses, velocities, 0.0), atol=1e-13
+            part.wrenches(SPACE, flipped, velocities, 0.0),
+            part.wrenches(SPACE, poses, velocities, 0.0),
+            rtol=0,
+            atol=1e-13,
         )
 
 
@@ -532,7 +535,7 @@ def test_spring_of_zero_length(free_length):
     np.testing.assert_allclose(law(poses), 0.0, atol=1e-15)
     np.testing.assert_allclose(jax.grad(lambda q: part.energy(SPACE, q, 0.0))(poses), 0.0, atol=1e-15)
     jacobian = jax.jit(jax.jacfwd(law))(poses)
-    np.testing.assert_allclose(jacobian[1, :3, 1, :3], -30.0 * np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(jacobian[1, :3, 1, :3], -30.0 * np.eye(3), rtol=0, atol=1e-13)
 
 
 def test_torsional_spring_moment():
@@ -545,8 +548,8 @@ def test_torsional_spring_moment():
         moment = rot.unrotate(poses[1, 3:], axis)
         velocities = jnp.zeros((2, 6)).at[1, 3:].set(0.7 * moment)
         wrenches = part.wrenches(SPACE, poses, velocities, 0.0)
-        np.testing.assert_allclose(wrenches[1, 3:], (-30.0 * angle - 2.0 * 0.7) * moment, atol=1e-11)
-        np.testing.assert_allclose(part.energy(SPACE, poses, 0.0), 15.0 * angle**2, atol=1e-11)
+        np.testing.assert_allclose(wrenches[1, 3:], (-30.0 * angle - 2.0 * 0.7) * moment, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(part.energy(SPACE, poses, 0.0), 15.0 * angle**2, rtol=0, atol=1e-11)
 
 
 def test_torsional_spring_is_finite_where_its_angle_is_undefined():
@@ -567,10 +570,10 @@ def test_bushing_law():
     moment = rot.rotate(turned[1, 3:], part.wrenches(SPACE, turned, still, 0.0)[1, 3:])
     offset = SPACE.point(turned[1], part.point_b) - turned[1, :3]
     force = part.wrenches(SPACE, turned, still, 0.0)[1, :3]
-    np.testing.assert_allclose(moment - jnp.cross(offset, force), -5.0 * np.sin(2.0) * axis, atol=1e-12)
+    np.testing.assert_allclose(moment - jnp.cross(offset, force), -5.0 * np.sin(2.0) * axis, rtol=0, atol=1e-12)
     shifted = given.at[1, :3].add(SPACE.direction(given[0], jnp.array([0.1, 0.2, 0.3])))
     force = SPACE.body_direction(given[0], part.wrenches(SPACE, shifted, still, 0.0)[1, :3])
-    np.testing.assert_allclose(force, [-0.1, -0.4, -0.9], atol=1e-13)
+    np.testing.assert_allclose(force, [-0.1, -0.4, -0.9], rtol=0, atol=1e-13)
 
 
 # Bodies
