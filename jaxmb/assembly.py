@@ -145,12 +145,12 @@ def positions(
         selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
     )
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
-    refined = lax.custom_root(optimality, nearby, newton, tangent_solve)[: system.nq]
+    refined = lax.custom_root(optimality, nearby, _newton, tangent_solve)[: system.nq]
     ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined, jacobian) <= tolerance(q.dtype))
     return jnp.where(ok, refined, q), ok
 
 
-def newton(residual, x):
+def _newton(residual, x):
     def correct(carry):
         x, _, k = carry
         value, push = jax.linearize(residual, x)

@@ -3,8 +3,7 @@
 At rest the applied forces and those of the constraints balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search
 follows the forces along the displacements that the constraints allow, by Newton's method with the curvatures of the
 potential made positive and with bounded steps, so that it goes down to where a conservative system rests and not up to
-where it would be balanced; the end is polished by Newton's method proper. Derivatives are those of the balance, by the
-implicit function theorem.
+where it would be balanced. Derivatives are those of the balance, by the implicit function theorem.
 """
 
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ._types import Scalar, State, VectorLike
-from .assembly import configuration, newton, tangent_solve, tolerance
+from .assembly import configuration, tangent_solve, tolerance
 from .rotations import norm
 from .system import AbstractSystem
 
@@ -203,8 +202,8 @@ def _balanced(
     balance = _Balance(system, t, start[np.array(held, int)], held)
     q, near, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
 
-    # The equilibrium exactly, by Newton's method on the balance and the rows. What is loose or implied is made
-    # definite: nothing moves along loose directions, and multipliers are as small as they can be.
+    # The equations that it solves, for their derivatives. What is loose or implied is made definite: nothing moves
+    # along loose directions, and multipliers are as small as they can be.
     n, stiff = system.nu, jnp.max(jnp.abs(near.curvatures))
     loose = jnp.where(near.loose[None, :], near.directions, 0.0) @ near.directions.T
     jacobian = lax.stop_gradient(balance).jacobian(q)
@@ -219,8 +218,8 @@ def _balanced(
         return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
 
     known = jnp.concatenate([jnp.zeros(n, q.dtype), near.multipliers])
-    found = lax.custom_root(equations, known, newton, tangent_solve)
-    return balance.moved(q, found[:n]), near.force / system.velocity_scale(), ok & jnp.all(jnp.isfinite(found))
+    solved = lax.custom_root(equations, known, lambda _, x: x, tangent_solve)
+    return balance.moved(q, solved[:n]), near.force / system.velocity_scale(), ok
 
 
 def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
@@ -233,6 +232,7 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
 
     def advance(carry):
         q, near, step, radius, _, k = carry
+        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(near.correction))
         trial = balance.moved(q, step + near.correction)
         there = _linearise(balance, trial)
         # Too long a step ends where the forces push back half as hard as they pushed at its beginning, or harder.
@@ -245,9 +245,9 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
         step = _step(near)
         longest = jnp.max(jnp.abs(step))
-        found = longest + jnp.max(jnp.abs(near.correction)) <= close
         step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
-        return q, near, step, radius, found, k + 1
+        # What is left after so small a step of Newton's method is its square.
+        return q, near, step, radius, good & (size <= close) & (k > 0), k + 1
 
     # At first nothing is known, and nothing moves.
     unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))

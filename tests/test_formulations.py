@@ -207,7 +207,13 @@ def test_roots_of_mass_matrices():
 
 
 # With no more bodies than it takes to have all their joints.
-FEW = {"rod_chain": {"n": 5}, "hanging_chain": {"n": 3}, "n_four_bar": {"n": 1}, "swash_plate": {"pistons": 1}}
+FEW = {
+    "rod_chain": {"n": 5},
+    "hanging_chain": {"n": 3},
+    "n_four_bar": {"n": 1},
+    "swash_plate": {"pistons": 1},
+    "tracked_vehicle": {"n_wheels": 2},
+}
 LIBRARY = {name: FEW.get(name, {}) for name in mb.mechanisms.names()}
 
 

@@ -50,6 +50,7 @@ CASES = [
     ("hanging_chain", {}, 1e-8),
     ("andrews", {}, 1e-8),
     ("car_axis", {}, 1e-8),
+    ("tracked_vehicle", {}, 1e-8),
     ("knife_edge", {}, 1e-8),
     ("chaplygin_sleigh", {}, 1e-8),
     ("free_body", {}, 1e-7),

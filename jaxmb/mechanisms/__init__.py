@@ -3,6 +3,7 @@
 from typing import Any
 
 from .._names import unknown
+from . import ride as ride
 from ._base import Mechanism as Mechanism, References as References
 from .andrews import andrews as andrews
 from .appell_hamel import appell_hamel as appell_hamel
@@ -35,6 +36,7 @@ from .spherical_four_bar import spherical_four_bar as spherical_four_bar
 from .stiff_four_bar import stiff_four_bar as stiff_four_bar
 from .swash_plate import swash_plate as swash_plate
 from .three_platform_snake import three_platform_snake as three_platform_snake
+from .tracked_vehicle import tracked_vehicle as tracked_vehicle
 from .tracking_chain import tracking_chain as tracking_chain
 from .train import train as train
 
@@ -53,6 +55,7 @@ _LIBRARY = {
         n_four_bar,
         andrews,
         car_axis,
+        tracked_vehicle,
         knife_edge,
         chaplygin_sleigh,
         free_body,

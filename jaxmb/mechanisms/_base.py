@@ -75,6 +75,7 @@ class Mechanism:
         references.
     - `description`: what it is and where its data come from.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
+    - `start(system, guess)`: how the state was made, or None where it was assembled and no more.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Mechanism:
     description: str
     fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
+    start: Callable[[Any, State], State] | None = None
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
@@ -112,12 +114,16 @@ class Mechanism:
         }
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
-        """The same mechanism with some parameters replaced, assembled again near its present state; also under `jit`.
+        """The same mechanism with some parameters replaced, its state made again near the present one; also under
+        `jit`.
 
         **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
         """
         system = with_parameters(self.system, values)
-        state = assemble(system, self.state, fix=self.fix, rates=self.rates)
+        if self.start is None:
+            state = assemble(system, self.state, fix=self.fix, rates=self.rates)
+        else:
+            state = self.start(system, self.state)
         return dataclasses.replace(self, system=system, state=state, references=None)
 
 
@@ -160,6 +166,16 @@ def point_motion(trajectory: Trajectory, body: str, s: VectorLike) -> tuple[Arra
     return jax.vmap(at)(trajectory.ys)
 
 
+def point_acceleration(trajectory: Trajectory, body: str, s: VectorLike) -> Array:
+    """Acceleration [m/s²] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
+    system = trajectory.system
+    space, k = system.layout.space, system.body_names.index(body)
+    s = jnp.asarray(s, float)
+    velocity = lambda q, u: space.point_velocity(system.poses(q)[k], system.velocities(u)[k], s)
+    at = lambda y, qdot, udot: jax.jvp(velocity, (y.q, y.u), (qdot, udot))[1]
+    return jax.vmap(at)(trajectory.ys, trajectory.rates, trajectory.accelerations)
+
+
 def build(
     name: str,
     scene: Scene | AbstractSystem,
@@ -170,13 +186,14 @@ def build(
     references: References | None = None,
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
+    start: Callable[[Any, State], State] | None = None,
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
-    state = assemble(system, fix=fix, rates=rates)
-    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates)
+    state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start)
 
 
 def of_bodies(model: Model, **defaults: bool) -> bool:

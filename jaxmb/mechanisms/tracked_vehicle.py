@@ -1,0 +1,230 @@
+"""Tracked vehicles with sprung road wheels in the plane, one or two coupled."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from .. import contact, planar
+from .._forces import Gravity
+from .._types import State, VectorLike
+from .._user import Force
+from ..scene import Scene
+from ..statics import equilibrium
+from ..system import parameters, with_parameters
+from ..terrain import AbstractTerrain, Bump
+from ._base import Mechanism, References, build, mechanism
+from .ride import PREFIXES, arm_travel
+
+# Arm pivots of five wheels, in the hull [m]; of other numbers they lie evenly between the outer ones.
+_PIVOTS = np.array([(1.639, -0.487), (0.972, -0.487), (0.305, -0.487), (-0.362, -0.487), (-1.028, -0.487)])
+
+
+@mechanism(variants=("units",))
+def tracked_vehicle(
+    *,
+    n_wheels: int = 5,
+    units: Literal[1, 2] = 1,
+    speed: float = 5.0,
+    torque: float = 3000.0,
+    terrain: AbstractTerrain | None = None,
+    hull_mass: float = 7819.24,
+    hull_inertia: float = 27287.61,
+    arm_mass: float = 150.52,
+    arm_inertia: float | None = None,
+    wheel_mass: float = 300.0,
+    wheel_inertia: float = 14.0,
+    radius: float = 0.305,
+    trail: float = 0.288,
+    drop: float = 0.134,
+    pivots: VectorLike | None = None,
+    sprocket: VectorLike = (2.006, -0.406),
+    idler: VectorLike = (-1.824, -0.526),
+    torsion_stiffness: float = 5e4,
+    torsion_damping: float = 5e3,
+    stop_angle: float = 0.6,
+    stop_stiffness: float = 2e6,
+    pretension: float = 1.5e4,
+    track_stiffness: float = 4e5,
+    ground_stiffness: float = 8e5,
+    ground_damping: float = 2e4,
+    friction: float = 0.7,
+    transition_speed: float = 0.3,
+    hitch_rear: VectorLike = (-2.4, -0.2),
+    hitch_front: VectorLike = (2.4, -0.2),
+    hitch_stiffness: float = 2e5,
+    hitch_damping: float = 2e4,
+    gravity: float = 9.81,
+) -> Mechanism:
+    """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
+    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2`
+    another carrier is towed by a hitch, and there are twice as many less two.
+
+    It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
+    right pair; x is forward, y up.
+
+    Source: the kind of vehicle of R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension
+    Reduction in Analysis of Constrained Dynamic Systems", J. Mech. Design 104(1), 1982, with 13 and 24 degrees of
+    freedom; dimensions and masses close to those of the M113 model of Project Chrono. The reference values were
+    computed in minimal coordinates by a Runge–Kutta method of order 8.
+
+    **Arguments:** `n_wheels` ≥ 1; `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, with
+    its reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²],
+    of the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
+    below its pivot in the design position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull;
+    torsion bars [N m/rad, N m s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad]
+    from there [N m/rad³]; track, of the length of the design position [N, N/m]; ground [N/m, N s/m]; `friction` with
+    its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and damping [N m/rad, N m s/rad];
+    `gravity` [m/s²].
+
+    **Labels:** `x`, `y` [m], `phi` [rad] of the hull, `a1`, … [rad] of the arms from their design position, upwards
+    negative; of the towed unit `rear_x`, ….
+    """
+    if n_wheels < 1:
+        raise ValueError(f"tracked_vehicle needs n_wheels ≥ 1, got {n_wheels}.")
+    if units not in (1, 2):
+        raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
+    if pivots is None:
+        pivots = _PIVOTS if n_wheels == 5 else np.linspace(_PIVOTS[0], _PIVOTS[-1], n_wheels)
+    pivots = np.asarray(pivots, float)
+    if pivots.shape != (n_wheels, 2):
+        raise ValueError(f"tracked_vehicle: pivots must have shape ({n_wheels}, 2), got {pivots.shape}.")
+    length, design = np.hypot(trail, drop), np.pi + np.arctan2(drop, trail)
+    reach = np.array([-trail, -drop])
+    if arm_inertia is None:
+        arm_inertia = 1.54 + planar.rod(arm_mass, length)
+    twist = (hull_mass / n_wheels + arm_mass) * gravity * trail / torsion_stiffness
+    wheels = range(1, n_wheels + 1)
+
+    bodies, joints, forces = [], [], []
+    place = np.array([0.0, radius + drop - pivots[0, 1]])
+    for p in PREFIXES[:units]:
+        hull = f"{p}hull"
+        bodies.append(planar.Body(hull, mass=hull_mass, inertia=hull_inertia, position=place))
+        arm, wheel = {"mass": arm_mass, "inertia": arm_inertia}, {"mass": wheel_mass, "inertia": wheel_inertia}
+        for k, pivot in zip(wheels, place + pivots, strict=True):
+            bodies.append(planar.Body(f"{p}arm{k}", position=pivot + reach / 2, angle=design, **arm))
+        for k, pivot in zip(wheels, place + pivots, strict=True):
+            bodies.append(planar.Body(f"{p}wheel{k}", position=pivot + reach, **wheel))
+        for k, pivot in zip(wheels, pivots, strict=True):
+            pair, half = (hull, f"{p}arm{k}"), (length / 2, 0.0)
+            joints += [
+                planar.Revolute(f"{p}pivot{k}", *pair, point_a=pivot, point_b=(-length / 2, 0.0)),
+                planar.Revolute(f"{p}axle{k}", f"{p}arm{k}", f"{p}wheel{k}", point_a=half, point_b=(0.0, 0.0)),
+            ]
+            bar = {"stiffness": torsion_stiffness, "damping": torsion_damping, "free_angle": design + twist}
+            stop = {"stiffness": stop_stiffness, "lower": design - stop_angle, "upper": design + stop_angle}
+            forces += [
+                planar.TorsionalSpringDamper(f"{p}bar{k}", *pair, **bar),
+                planar.BumpStop(f"{p}stop{k}", *pair, **stop),
+            ]
+        path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
+        forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
+        driven = (hull, *(f"{p}wheel{k}" for k in wheels))
+        forces.append(Force(f"{p}drive", driven, _drive, parameters={"torque": torque}))
+        place = place + np.asarray(hitch_rear) - np.asarray(hitch_front)
+    if units == 2:
+        pair = ("hull", "rear_hull")
+        joints.append(planar.Revolute("hitch", *pair, point_a=hitch_rear, point_b=hitch_front))
+        bend = {"stiffness": hitch_stiffness, "damping": hitch_damping, "free_angle": 0.0}
+        forces.append(planar.TorsionalSpringDamper("hitch_spring", *pair, **bend))
+    road = planar.Contact(
+        "road",
+        [body.name for body in bodies if "wheel" in body.name],
+        terrain=Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
+        normal=contact.Linear(ground_stiffness),
+        friction=contact.Coulomb(friction, transition_speed=transition_speed),
+        radius=radius,
+        damping=ground_damping,
+        onset="linear",
+        depth="vertical",
+    )
+    return build(
+        "tracked_vehicle",
+        Scene(bodies, joints=joints, forces=[*forces, road, Gravity((0.0, -gravity))]),
+        t1=1.5,
+        observe=_observe,
+        description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
+        references=_REFERENCES[units],
+        fix={"hull.x": 0.0},
+        start=lambda system, guess: _rolling(system, guess, speed),
+    )
+
+
+def _drive(poses, velocities, t, p):
+    n = poses.shape[0] - 1
+    moments = jnp.concatenate([p["torque"][None], jnp.full(n, -1 / n, poses.dtype) * p["torque"]])
+    return jnp.zeros((n + 1, 3), poses.dtype).at[:, 2].set(moments)
+
+
+def _rolling(system, guess, speed):
+    """In static equilibrium without drive, moving forward with wheels that roll."""
+    drives = [name for name in parameters(system) if name.endswith("drive.torque")]
+    still = with_parameters(system, dict.fromkeys(drives, 0.0))
+    rest = equilibrium(still, guess, fix={"hull.x": 0.0})
+    wheels = np.array(["wheel" in name for name in system.body_names])
+    turn = jnp.where(wheels, -speed / parameters(system)["road.radius"], 0.0)
+    u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
+    return State(rest.q, u.reshape(-1))
+
+
+def _observe(trajectory):
+    observed = {}
+    for unit, p in enumerate(PREFIXES, start=1):
+        if f"{p}hull" in trajectory.system.body_names:
+            hull, travel = trajectory[f"{p}hull"], arm_travel(trajectory, unit=unit)
+            observed |= {f"{p}x": hull.position[:, 0], f"{p}y": hull.position[:, 1], f"{p}phi": hull.angle}
+            observed |= {f"{p}a{k + 1}": travel[:, k] for k in range(travel.shape[1])}
+    return observed
+
+
+_SOURCE = "minimal coordinates, Runge–Kutta method of order 8"
+_REFERENCES = {
+    1: References(
+        times=np.array([0.5, 1.0, 1.5]),
+        labels=("x", "y", "phi"),
+        values=np.array(
+            [
+                [2.61085798931969, 0.901098716083570, 0.00610065148341],
+                [5.35923980461595, 0.950519106033969, 0.04338680007403],
+                [8.24014542540776, 0.898593479742995, -0.01868034501957],
+            ]
+        ),
+        source=_SOURCE,
+        tolerance=1e-10,
+    ),
+    2: References(
+        times=np.array([0.5, 1.0, 1.5]),
+        labels=("x", "y", "phi", "rear_x", "rear_y", "rear_phi"),
+        values=np.array(
+            [
+                [
+                    2.61197544144702,
+                    0.902300281302783,
+                    0.000464589124938,
+                    -2.18802717305855,
+                    0.900032447411396,
+                    0.000480341078139,
+                ],
+                [
+                    5.40640262990527,
+                    0.934491601883477,
+                    0.015504099914322,
+                    0.610171001981034,
+                    0.901807065275057,
+                    -0.001875053942165,
+                ],
+                [
+                    8.39247455278833,
+                    0.907575301554893,
+                    -0.001084883650678,
+                    3.59235957375105,
+                    0.911382517316909,
+                    -0.000501417919300,
+                ],
+            ]
+        ),
+        source=_SOURCE,
+        tolerance=1e-10,
+    ),
+}
