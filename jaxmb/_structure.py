@@ -16,6 +16,8 @@ from .system.rigid_bodies import Implied, RigidBodySystem
 # 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
+# More rows than this do not fit in dense matrices of reasonable size.
+_DENSE = 3000
 
 
 def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]:
@@ -24,9 +26,20 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations.
     """
-    if may_be_long(system, VERY_LONG) and bool(_independent_chain(system)):
+    if may_be_long(system, VERY_LONG):
         rows = system.velocity_rows
-        return Ranks(rows, rows, rows, rows), ()
+        if bool(_independent_chain(system)):
+            return Ranks(rows, rows, rows, rows), ()
+        if rows > _DENSE:
+            listed = open_joints(system, 0.0, system.guess.q)
+            raise ValueError(
+                f"These {rows} constraint rows are too many for dense matrices, and joint by joint they cannot be "
+                + (
+                    f"assembled from the given poses, which leave open {listed}. Give poses nearer to the constraints."
+                    if listed
+                    else "told from redundant ones. Move the points of joints apart."
+                )
+            )
     found = _analyse(system)
     if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
         raise ValueError(

@@ -108,10 +108,6 @@ def simulate(
     times = number(t0), number(t1), None if dt0 is None else number(dt0)
     choice = solver
     solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
-    if manifold is None:
-        manifold = _manifold(system, solver, formulation)
-    if formulation is None:
-        formulation = _formulation(system, manifold)
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=rtol, atol=atol)
@@ -125,10 +121,12 @@ def simulate(
     interpolated = event is not None or (points.subs is not None and points.subs.ts is not None)
 
     def motion(solver):
-        term, prepared = manifold.prepare(system, formulation, solver, rtol)
+        policy = _manifold(system, solver, formulation) if manifold is None else manifold
+        road = _formulation(system, policy) if formulation is None else formulation
+        term, prepared = policy.prepare(system, road, solver, rtol)
         return _integrate(
             system,
-            formulation,
+            road,
             term,
             prepared,
             times,
@@ -139,7 +137,7 @@ def simulate(
             event,
             max_steps,
             meter,
-            restore=_way_back(manifold, interpolated),
+            restore=_way_back(policy, interpolated),
         )
 
     trajectory = motion(solver)

@@ -79,6 +79,21 @@ def test_numbers_of_draft_gears_are_checked(numbers, message):
         mb.mechanisms.train(n=2, coupler=functools.partial(planar.DraftGear, **numbers))
 
 
+@pytest.mark.parametrize("make", [mb.mechanisms.train, mb.mechanisms.longitudinal_train])
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"n": 0}, "n ≥ 1"),
+        ({"mass": (1.0, 2.0, 3.0)}, r"mass must be a number or one for each of 4 vehicles, got shape \(3,\)"),
+        ({"resistance": 3.0}, "resistance must be"),
+        ({"brake_rise": 0.0}, "brake_rise must be positive"),
+    ],
+)
+def test_numbers_of_trains_are_checked(make, numbers, message):
+    with pytest.raises(ValueError, match=message):
+        make(**numbers)
+
+
 # Trains with draft gears
 
 
@@ -237,6 +252,17 @@ def test_any_joints_in_chains(build):
         found, expected = solve(q, jnp.asarray(rng.normal(size=system.nu)))
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
+
+
+def test_a_chain_in_space_moves_as_by_partitioning():
+    system = hanging_spheres()
+    ends = [
+        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys
+        for manifold in (BlockProjection(), None)
+    ]
+    np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-7)
+    assert np.max(np.abs(system.coordinate_residual(0.3, ends[0].q[-1]))) <= 1e-13
 
 
 def undamped(coupler):

@@ -107,7 +107,7 @@ def accelerations(
     jacobian: Any
     if not formulation.assembles:
         check_independent(system)
-        jacobian, split = block_jacobian(system, t, q, u), every_row(0, 0, u.dtype)
+        jacobian, split = block_jacobian(system, t, q, u), None
     elif formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         jacobian, split = linearize(system, t, q, u)
     else:
@@ -122,10 +122,10 @@ def solve_constrained(
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
     jacobian: Any,
-    split: Factor,
+    split: Any,
     demand: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """The same from the Jacobian A and its factor.
+    """The same from the Jacobian A and its factor, or from its blocks and none.
 
     Where constraints are not ideal, their force C follows from the multipliers of ideal ones, and then accelerations
     from C as from any other force (F. E. Udwadia and P. Phohomsiri, Proc. R. Soc. A 463, 2007): `M u̇ = F + C + Aᵀ λ`.

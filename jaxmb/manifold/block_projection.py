@@ -71,6 +71,7 @@ class BlockTerm(AbstractManifoldTerm):
         return jnp.array(0)
 
     def evaluate(self, t, y, chart, args):
+        y = State(self.system.normalize(y.q), y.u)
         near = corrector(self.system, t, y, self.system.inertia(t, y.q, y.u))
         f = State(self.system.rates(t, y.q, y.u), _accelerations(self.system, t, y, near))
         return ManifoldEvaluation(y, f, chart, jnp.array(False), near)

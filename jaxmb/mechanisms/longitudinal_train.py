@@ -12,7 +12,7 @@ from .._types import State, VectorLike
 from ..planar._space import PLANE
 from ._base import Mechanism, build, mechanism
 from ._relative import RelativeTrain, velocities
-from .train import braking, of_each, running_resistance
+from .train import braking, check_train, davis, of_each, running_resistance
 
 
 @mechanism()
@@ -37,7 +37,9 @@ def longitudinal_train(
     """An emergency stop of a train of n vehicles that move along a straight track only, in relative coordinates.
 
     Coordinates are the place `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers, so that
-    slack keeps all its digits in a train of any length. Otherwise as `train`, without pitch.
+    slack keeps all its digits in a train of any length, and tolerances are relative to it. (The stop of 300 vehicles,
+    coupler forces with an error of 500 N on average: rtol 1e-4 and 14000 steps; in places along the track, 4 km long,
+    1e-7 and about as many, and 5000 N with 1e-6.) Otherwise as `train`, without pitch.
 
     Source: V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974.
 
@@ -51,16 +53,14 @@ def longitudinal_train(
 
     **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.
     """
-    if n < 1:
-        raise ValueError(f"longitudinal_train needs n ≥ 1 vehicles, got {n}.")
+    check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
     mass, speed, brake = (
         number(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
     )
     extension = number(of_each("extension", extension, n - 1))
     gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, jnp.zeros((2, 3)))
-    w0, w1, w2 = np.asarray(resistance)
     numbers = {
-        "resistance": {"w0": w0, "w1": w1, "w2": w2, "transition": transition},
+        "resistance": davis(resistance) | {"transition": transition},
         "brake": {
             "force": brake,
             "start": spacing * np.arange(n) / wave_speed,

@@ -48,6 +48,9 @@ def train(
     vehicle are applied when the pressure wave arrives from the head of the train, and rise to their force in
     `brake_rise`.
 
+    Tolerances are relative to places along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
+    coupler. Long trains want smaller ones, or `longitudinal_train`.
+
     Source: after V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974; the numbers
     are those of a loaded four-axle wagon, with a generic friction draft gear.
 
@@ -62,7 +65,8 @@ def train(
     - `reach`, `coupler_height` [m]; `suspension` [N/m] and `suspension_damping` [N s/m] of each of the two springs,
         `wheelbase` [m] apart; with `suspension` zero there are none, and gravity acts along the track only.
     - `speed` [m/s], of all vehicles or of each, at the start; `grade`, the rise of the track over its length.
-    - `resistance` (w₀ [N], w₁ [N s/m], w₂ [N s²/m²]) against each vehicle, `w₀ + w₁ |v| + w₂ v²`.
+    - `resistance` (w₀ [N], w₁ [N s/m], w₂ [N s²/m²]) against each vehicle, `w₀ + w₁ |v| + w₂ v²`; 0 for
+        none.
     - `pull` [N] on the leading vehicle.
     - `brake` [N], of all vehicles or of each, built up over `brake_rise` [s]; `wave_speed` [m/s].
     - `transition` [m/s], the speed at which resistance and brakes have three quarters of their force.
@@ -70,8 +74,7 @@ def train(
     **Labels:** `x1`, `x2`, … [m], `pitch1`, … [rad], `v1`, … [m/s] of the vehicles; `F1`, … [N], the force of the
     couplers on the vehicles behind them, forwards: positive in draft, negative in buff.
     """
-    if n < 1:
-        raise ValueError(f"train needs n ≥ 1 vehicles, got {n}.")
+    check_train(n, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
     if coupler_length is None:
         coupler_length = 0.0 if coupler is planar.Revolute else 1.0
     mass, inertia, speed, brake = (
@@ -113,8 +116,7 @@ def train(
             for end, point in (("a", ahead), ("b", behind))
         ]
     if np.any(resistance):
-        w0, w1, w2 = np.asarray(resistance)
-        numbers = shared(w0=w0, w1=w1, w2=w2, transition=transition)
+        numbers = shared(**davis(resistance), transition=transition)
         forces += [Force(f"resistance{k}", name, _resistance, parameters=numbers) for k, name in enumerate(names, 1)]
     if np.any(brake):
         numbers = shared(rise=brake_rise, transition=transition)
@@ -145,6 +147,25 @@ def of_each(name: str, value: VectorLike, n: int) -> np.ndarray:
     if value.shape not in ((), (n,)):
         raise ValueError(f"train: {name} must be a number or one for each of {n} vehicles, got shape {value.shape}.")
     return np.broadcast_to(value, (n,))
+
+
+def davis(resistance: VectorLike) -> dict[str, float]:
+    """The three numbers of running resistance by name."""
+    numbers = np.asarray(resistance, float)
+    if not np.any(numbers):
+        numbers = np.zeros(3)
+    if numbers.shape != (3,):
+        raise ValueError(f"train: resistance must be (w0, w1, w2), or 0 for none; got shape {numbers.shape}.")
+    return dict(zip(("w0", "w1", "w2"), numbers.tolist(), strict=True))
+
+
+def check_train(n: int, **positive: float) -> None:
+    """Raise a `ValueError` for trains without vehicles, and for numbers that must be positive and are not."""
+    if n < 1:
+        raise ValueError(f"A train needs n ≥ 1 vehicles, got {n}.")
+    for name, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"train: {name} must be positive, got {value}.")
 
 
 def running_resistance(v, p):

@@ -51,12 +51,20 @@ def evaluation(make, n):
     return built, best, program.as_text().count("\n"), run.memory_analysis().temp_size_in_bytes
 
 
-def braking(make, name, n=1000, t1=10.0):
+def braking(make, name, n):
+    """Until the pressure wave has reached the last vehicle and its brakes are on."""
     mechanism = make(n=n)
-    meter = diffrax.TextProgressMeter()
+    t1 = 13.0 * n / 250.0 + 2.0
     for what in ("with compiling", "again"):
         start = time.perf_counter()
-        sol = mb.simulate(mechanism.system, mechanism.state, t1=t1, rtol=1e-6, progress_meter=meter)
+        sol = mb.simulate(
+            mechanism.system,
+            mechanism.state,
+            t1=t1,
+            rtol=1e-6,
+            max_steps=10**6,
+            progress_meter=diffrax.TextProgressMeter(minimum_increase=0.1),
+        )
         sol.ys.q.block_until_ready()
         seconds = time.perf_counter() - start
         counts = {key: int(sol.stats[key]) for key in ("num_steps", "num_rejected_steps", "num_evaluations")}
