@@ -10,7 +10,7 @@ import pytest
 from oracles import trains as oracle
 
 import jaxmb as mb
-from jaxmb import _chain_assembly, assembly, planar, spatial
+from jaxmb import _chain_assembly, _structure, assembly, planar, spatial
 from jaxmb.formulations import BlockMultipliers, Multipliers, accelerations
 from jaxmb.manifold import BlockProjection
 from jaxmb.mechanisms._relative import velocities
@@ -365,6 +365,21 @@ def redundant():
     body = planar.Body("body", mass=1.0, inertia=0.1)
     pins = [planar.Revolute(name, "ground", "body", point=(x, 0.0)) for name, x in (("left", -1.0), ("right", 1.0))]
     return mb.Scene([body], joints=pins).compile()
+
+
+def test_very_long_chains_are_compiled_without_dense_matrices(monkeypatch):
+    def refused(system):
+        raise AssertionError("a dense Jacobian is made")
+
+    monkeypatch.setattr(_structure, "VERY_LONG", 10)
+    monkeypatch.setattr(_structure, "_DENSE", 10)
+    monkeypatch.setattr(_structure, "_analyse", refused)
+    foot = planar.Revolute("foot", "ground", "b0", point=(-0.5, 0.0))
+    system = ring(foot, bodies=8)
+    assert (system.velocity_rows, system.velocity_rank, system.coordinate_rank) == (16, 16, 16)
+    far = planar.Revolute("far", "ground", "b7", point_a=(99.0, 0.0), point_b=(0.5, 0.0))
+    with pytest.raises(ValueError, match=r"cannot be assembled.*leave open far"):
+        ring(foot, far, bodies=8)
 
 
 def pendulum_on_paper():
