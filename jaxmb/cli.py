@@ -1,6 +1,7 @@
 """The command line: `jaxmb mechanisms | run | report`."""
 
 import argparse
+import ast
 import dataclasses
 import json
 import sys
@@ -57,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
     run.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
     run.set_defaults(command=_run)
+    _add_parameters(run)
 
     report = commands.add_parser(
         "report",
@@ -70,7 +72,30 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
     report.add_argument("--out", type=Path, help="folder for the table and the figure (default jaxmb-output/NAME)")
     report.set_defaults(command=_report)
+    _add_parameters(report)
     return parser
+
+
+def _add_parameters(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=_assignment,
+        metavar="NAME=VALUE",
+        help="a keyword argument of the mechanism, such as units=2; may be given more than once",
+    )
+
+
+def _assignment(text: str) -> tuple[str, object]:
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"expected NAME=VALUE, got {text!r}")
+    try:
+        return name, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        # A word, such as the name of a variant.
+        return name, value
 
 
 def _mechanisms(arguments: argparse.Namespace) -> None:
@@ -142,7 +167,7 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
     """The mechanism, ending at `--t1` with the reference values up to there."""
     from . import mechanisms
 
-    mechanism = mechanisms.get(arguments.mechanism)
+    mechanism = mechanisms.get(arguments.mechanism, **dict(arguments.set))
     t1, known = arguments.t1, mechanism.references
     if t1 is None:
         return mechanism

@@ -9,7 +9,7 @@ import diffrax
 import pytest
 
 import jaxmb as mb
-from jaxmb.cli import main
+from jaxmb.cli import _parser, main
 
 
 def test_mechanisms(capsys):
@@ -66,6 +66,7 @@ def test_report(capsys, tmp_path):
         (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
         (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
         (["report", "costs", "pendulum"], "got 'costs' before it"),
+        (["run", "pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
     ],
 )
 def test_wrong_words(words, message, capsys, tmp_path):
@@ -78,6 +79,16 @@ def test_no_command(capsys):
         main([])
     assert ended.value.code == 2
     assert "usage: jaxmb" in capsys.readouterr().err
+
+
+def test_parameters_of_a_mechanism():
+    parse = _parser().parse_args
+    assert dict(parse(["run", "tracked_vehicle", "--set", "units=2", "--set", "model=bodies"]).set) == {
+        "units": 2,
+        "model": "bodies",
+    }
+    with pytest.raises(SystemExit):
+        parse(["run", "pendulum", "--set", "mass"])
 
 
 def test_as_a_module():

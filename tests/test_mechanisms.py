@@ -344,7 +344,7 @@ def test_every_mechanism_starts_on_its_constraints(name):
 def test_names_are_checked():
     with pytest.raises(ValueError, match="four_bar"):
         mechanisms.get("four_bars")
-    with pytest.raises(TypeError, match="colour"):
+    with pytest.raises(ValueError, match="colour"):
         mechanisms.get("pendulum", colour="red")
     with pytest.raises(ValueError, match="iftomm"):
         mechanisms.andrews(problem="ode")

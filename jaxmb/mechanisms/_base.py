@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .._names import unknown
 from .._types import State, VectorLike
 from ..assembly import assemble
 from ..scene import Scene
@@ -138,6 +139,9 @@ def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mech
 
         @functools.wraps(function)
         def build(**parameters: Any) -> Mechanism:
+            for name in parameters:
+                if name not in defaults:
+                    raise unknown(f"parameter of {function.__name__}", name, defaults)
             made = function(**parameters)
             published = all(name in variants or _same(value, defaults[name]) for name, value in parameters.items())
             return made if published else dataclasses.replace(made, references=None)
