@@ -186,12 +186,12 @@ def _step(near: _Linearised) -> Float[Array, "n"]:
     along = near.directions.T @ near.force
     largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
     noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(near.curvatures) + largest(near.sizes * near.multipliers))
-    along = jnp.where(near.loose & (jnp.abs(along) <= noise), 0.0, along)
+    quiet = near.loose & (jnp.abs(along) <= noise)
     size = jnp.abs(near.curvatures)
-    bent = jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)) - near.curvatures
-    return jnp.linalg.solve(
-        near.stiffness + (near.directions * bent[None, :]) @ near.directions.T, near.directions @ along
-    )
+    # Quiet directions count as stiff, so that rounding errors of the others do not move along them.
+    size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
+    stiffness = near.stiffness + (near.directions * (size - near.curvatures)[None, :]) @ near.directions.T
+    return jnp.linalg.solve(stiffness, near.directions @ jnp.where(quiet, 0.0, along))
 
 
 @eqx.filter_jit
