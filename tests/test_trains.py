@@ -180,8 +180,12 @@ def test_derivatives_of_the_largest_force_in_a_collision(collision):
     tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
     assert 1e5 < value < 1e7
     for name, number in numbers.items():
-        h = 2e-5 * number
-        difference = (tight(numbers | {name: number + h}) - tight(numbers | {name: number - h})) / (2 * h)
+        h = 1e-5 * number
+        central = lambda h, name=name, number=number: (
+            (tight(numbers | {name: number + h}) - tight(numbers | {name: number - h})) / (2 * h)
+        )
+        # Richardson's extrapolation: the stop bends the force over a millimetre.
+        difference = (4 * central(h) - central(2 * h)) / 3
         np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
         np.testing.assert_allclose(forward[name], difference, rtol=1e-5, atol=5e-6 * value / number, err_msg=name)
 

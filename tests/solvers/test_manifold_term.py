@@ -150,7 +150,8 @@ def test_batch_with_charts_and_failures_equals_loop():
     batch = jax.jit(jax.vmap(run))(rates)
     single = jax.jit(run)
     loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(rate) for rate in rates])
-    np.testing.assert_allclose(batch[0], loop[0], rtol=0, atol=1e-12)
+    # Rounding makes steps a little longer or shorter.
+    np.testing.assert_allclose(batch[0], loop[0], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(batch[1], loop[1])
     np.testing.assert_array_equal(batch[2], loop[2])
 
