@@ -9,8 +9,9 @@ import pytest
 from jax.extend import core
 
 import jaxmb as mb
-from jaxmb import elimination, planar, rotations, spatial
-from jaxmb.manifold import constrained, projection
+from jaxmb import contact, elimination, planar, rotations, spatial
+from jaxmb.manifold import constrained, partition, projection
+from jaxmb.system import chain
 
 
 def primitives(jaxpr) -> Counter:
@@ -87,6 +88,17 @@ def test_free_body_in_space_has_no_charts(monkeypatch):
     refuse(monkeypatch, elimination, "full_pivot", "factor", "gauss_jordan")
     refuse(monkeypatch, constrained, "evaluate", "factor")
     assert program(system)["argmax"] == 0
+
+
+def test_ideal_scene_without_contact_tracks_or_couplers_has_nothing_of_them(monkeypatch):
+    refuse(monkeypatch, contact.Contact, "wrenches", "energy", "resolve")
+    refuse(monkeypatch, planar.Track, "wrenches", "length", "energy")
+    refuse(monkeypatch, planar.DraftGear, "wrenches", "tension", "energy")
+    refuse(monkeypatch, planar.Friction, "wrenches", "slip")
+    refuse(monkeypatch, partition, "evaluate_general")
+    refuse(monkeypatch, chain, "block_jacobian")
+    four_bar = mb.mechanisms.four_bar()
+    assert program(four_bar.system)["tanh"] == 0
 
 
 def test_planar_scene_has_no_euler_parameters(monkeypatch):

@@ -135,6 +135,22 @@ def test_free_body_keeps_its_angular_momentum():
     np.testing.assert_allclose(trajectory.angular_momentum, np.tile(start, (3, 1)), rtol=0, atol=1e-8)
 
 
+def test_steady_precession():
+    """Started on it, a top keeps its tilt, whichever of the two rates it precesses with; and its energy."""
+    across, along, mass, distance, tilt, spin = 0.0045, 0.004, 1.0, 0.05, np.pi / 6, 30.0
+    about_tip, weight = across + mass * distance**2, mass * 9.81 * distance
+    root = np.sqrt((along * spin) ** 2 - 4 * about_tip * weight * np.cos(tilt))
+    times = np.linspace(0.0, 10.0, 101)
+    for precession in (along * spin + np.array([-root, root])) / (2 * about_tip * np.cos(tilt)):
+        inertia = across, along
+        top = mechanisms.heavy_top(inertia=inertia, distance=distance, precession=precession, spin=spin)
+        motion = mb.simulate(top.system, top.state, t1=10.0, rtol=1e-11, saveat=times, max_steps=200_000)
+        height = np.asarray(motion["top"].position[:, 2]) / distance
+        np.testing.assert_allclose(np.arccos(height), tilt, rtol=0, atol=1e-9)
+        energy = np.asarray(motion.energy)
+        np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+
+
 def test_values_of_the_train_are_those_of_an_independent_model():
     references = library("train").references
     q, u, forces = trains.Train(4).motion(references.times)

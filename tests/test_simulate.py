@@ -213,3 +213,20 @@ def test_spring_of_zero_length_is_linear():
     np.testing.assert_allclose(slope, np.cos(2.0), rtol=0, atol=1e-8)
     # x = sin(ω t) / ω with ω² = k / m.
     np.testing.assert_allclose(stiffness, (2.0 * np.cos(2.0) - np.sin(2.0)) / 4.0 / (2 * 2.0 * 2.0), rtol=0, atol=1e-8)
+
+
+def test_baumgarte_brings_a_state_back_as_its_rate_says():
+    """A pendulum 1 cm off its pin: Φ̈ + 2 rate Φ̇ + rate² Φ = 0, so Φ0 (1 + rate t) e^(−rate t)."""
+    pendulum = mb.mechanisms.get("pendulum").system
+    q = np.array(pendulum.guess.q)
+    q[0] += 0.01
+    off = np.asarray(pendulum.position_residual(0.0, jnp.asarray(q)))
+    start = mb.State(jnp.asarray(q), jnp.zeros(pendulum.nu))
+    times = jnp.linspace(0.0, 1.0, 5)
+    manifold = mb.manifold.Baumgarte(5.0)
+    motion = mb.simulate(pendulum, start, t1=1.0, rtol=1e-10, manifold=manifold, saveat=times)
+    residual = jax.vmap(pendulum.position_residual)(times, motion.ys.q)
+    decay = (1 + 5.0 * times) * jnp.exp(-5.0 * times)
+    np.testing.assert_allclose(residual, decay[:, None] * off[None, :], rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match="rate must be positive"):
+        mb.manifold.Baumgarte(0.0)
