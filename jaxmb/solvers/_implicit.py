@@ -82,8 +82,8 @@ def _warn():
 class Linearization(eqx.Module):
     """How a state and its derivatives in time change with the free components.
 
-    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g, None where `J²` takes its
-    place, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where they are not asked for;
+    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held, None where that
+    is left out and `J²` is all of the derivative of g, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where they are not asked for;
     `renewals`: how many steps are still to make a matrix of their own.
     """
 
@@ -97,11 +97,17 @@ class Linearization(eqx.Module):
 def linearize(
     field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool, spectrum: bool
 ) -> Linearization:
-    """The derivatives of a field with respect to the free components; if asked for, those of g, and the spectrum."""
+    """The derivatives of a field with respect to the free components; if asked for, those of g at a held rate, and the
+    spectrum.
+    """
+
+    def held(t, y):
+        (y, f), push, _ = jax.linearize(field, t, y, has_aux=True)
+        return y, f, push(jnp.ones_like(t), lax.stop_gradient(f))[1]
+
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
     zero = jnp.zeros_like(t)
-    fields = lambda t, y: derivatives(field, t, y)[:3] if exact else field(t, y)[0]
-    _, push = jax.linearize(fields, t, y)
+    _, push = jax.linearize(held if exact else lambda t, y: field(t, y)[0], t, y)
     state, *others = jax.vmap(lambda along: push(zero, along), out_axes=-1)(unit)
     return Linearization(
         state,
@@ -113,8 +119,8 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """With `P = 1 - a J - b J²`: `newton`, its inverse; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of P is less
-    than the one asked for.
+    """With `P = 1 - a J - b J²`, less b times the derivative of g at a held rate where that is known: `newton`, its
+    inverse; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of J² in P is less than the one asked for.
     """
 
     newton: Float[Array, "free free"]
@@ -134,6 +140,13 @@ def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses
     along, across = jnp.real(once), jnp.imag(once) / imaginary
     rate = a * along + (real**2 - imaginary**2) * across
     return Inverses(along + real * across, rate, jnp.maximum(least - square, jnp.zeros_like(square)))
+
+
+def inverses_with(held: Float[Array, "free free"], jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
+    """The same with `held`, the derivative of g at a held rate."""
+    inverses, identity = inverses_of(jacobian, a, b), jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
+    rest = inverse(identity - inverses.newton @ (b * held + inverses.beyond * jacobian @ jacobian))
+    return Inverses(rest @ inverses.newton, rest @ inverses.rate, jnp.zeros_like(inverses.beyond))
 
 
 # One member of a batch after the other; see `jaxmb.elimination`.
@@ -220,7 +233,7 @@ def solve(
         corrected = f - matrix.rate @ change
         g = g + matrix.rate @ (corrected - along)[free]
         if matrix.acceleration is not None:
-            g = g + (matrix.rate @ matrix.rate[free] - matrix.acceleration) @ change
+            g = g - matrix.acceleration @ change
         now = size(matrix.state @ change)
         return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
@@ -235,7 +248,10 @@ def solve(
         anew = (matrix.renewals > 0) | (k > 0)
         renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start), old.renewals)
         matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
-        inverses = inverses_of(matrix.rate[free], a, b)
+        if matrix.acceleration is None:
+            inverses = inverses_of(matrix.rate[free], a, b)
+        else:
+            inverses = inverses_with(matrix.acceleration[free], matrix.rate[free], a, b)
         first = _Iterate(nothing._replace(y=start), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol

@@ -119,7 +119,8 @@ class Hermite(AbstractMultistep):
             pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a single
             one fixes the order. The first of them is approached from $k = 1$.
         - `matrix`: what Newton's method takes for the derivative of $g$: the `"square"` of that of $f$, so that one
-            complex matrix is inverted (W. H. Enright), or the `"exact"` one, which needs third derivatives.
+            complex matrix is inverted (W. H. Enright), or the `"exact"` one, which needs third derivatives. On
+            mechanisms whose stiff directions turn it saves a third of the evaluations and is about as fast.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
             leave them out.
