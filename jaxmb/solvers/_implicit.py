@@ -83,8 +83,8 @@ class Linearization(eqx.Module):
     """How a state and its derivatives in time change with the free components.
 
     **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held, None where
-    that is left out and `J²` is all of it, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where they
-    are not asked for; `renewals`: how many steps are still to make a matrix of their own.
+    that is left out and `J²` is all of it, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where
+    they are not asked for; `renewals`: how many steps are still to make a matrix of their own.
     """
 
     state: Float[Array, "n free"]
