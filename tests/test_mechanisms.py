@@ -108,7 +108,7 @@ def test_energy_is_conserved(name):
     system, state = mechanism.system, mechanism.state
     start = system.kinetic_energy(0.0, state.q, state.u) + system.potential_energy(0.0, state.q)
     size = np.max(np.abs(trajectory.kinetic_energy))
-    np.testing.assert_allclose(trajectory.energy, start, rtol=0, atol=1e-8 * size)
+    np.testing.assert_allclose(trajectory.energy, start, rtol=0, atol=1e-9 * size)
 
 
 def test_work_of_the_torque_is_the_energy_of_andrews_mechanism():
