@@ -170,7 +170,8 @@ def _check_names(scene: Scene):
             raise ValueError(f"{label(part)}: a name must not be empty or contain a dot.")
         seen.add(part.name)
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
-    joints = dict.fromkeys(part.name for part in scene.joints)
+    # A program of a Servo is no joint: nothing slides in it.
+    joints = dict.fromkeys(part.name for part in scene.joints if not isinstance(part, Servo))
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractNonIdeal):
             if part.joint not in joints:

@@ -267,6 +267,9 @@ def test_bad_input():
     angle = functools.partial(planar.Driver, body_a="ground", body_b="arm", quantity="angle", parameters={})
     with pytest.raises(ValueError, match="stiffness must be non-negative"):
         scene(joints=[mb.Servo(angle("turn", motion=lambda t, p: t), stiffness=-1.0)])
+    with pytest.raises(ValueError, match="Unknown joint 'turn'"):
+        program = mb.Servo(angle("turn", motion=lambda t, p: t))
+        scene(joints=[program], forces=[planar.Friction("rub", "turn", coefficient=0.1, radius=0.1)])
     with pytest.raises(ValueError, match=r"accelerations asked for by.*turn.*contradict"):
         both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
         scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])

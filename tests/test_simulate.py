@@ -230,3 +230,28 @@ def test_baumgarte_brings_a_state_back_as_its_rate_says():
     np.testing.assert_allclose(residual, decay[:, None] * off[None, :], rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match="rate must be positive"):
         mb.manifold.Baumgarte(0.0)
+
+
+def test_derivatives_with_baumgarte():
+    """Forward, reverse and central differences of a tighter solution, compiled and in a batch."""
+    pendulum = mb.mechanisms.get("pendulum")
+    start = jnp.array([9.81, 0.3])
+
+    def end(x, rtol, adjoint):
+        gravity = {"gravity.acceleration": jnp.stack([jnp.zeros(()), -x[0]])}
+        system = mb.with_parameters(pendulum.system, gravity)
+        state = mb.State(pendulum.state.q, pendulum.state.u.at[1].add(x[1]))
+        options = {"manifold": mb.manifold.Baumgarte(5.0), "adjoint": adjoint, "max_steps": 512}
+        return jnp.sum(mb.simulate(system, state, t1=0.5, rtol=rtol, **options).ys.q[-1, :2])
+
+    batch = lambda f: jax.jit(jax.vmap(f, in_axes=(0, None)))
+    twice = lambda x, rtol: (end(x, rtol, diffrax.ForwardMode()),) * 2
+    forward_and_value = batch(jax.jacfwd(twice, has_aux=True))
+    forward = forward_and_value(start[None], 1e-9)[0][0]
+    reverse = batch(jax.grad(lambda x, rtol: end(x, rtol, None)))(start[None], 1e-9)[0]
+    assert np.all(np.abs(forward) > 1e-3)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    h = 1e-4
+    value = lambda x: forward_and_value(x[None], 1e-12)[1][0]
+    central = [(value(start + h * e) - value(start - h * e)) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(forward, central, rtol=1e-5)
