@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ..rotations import norm
 from .kinematics import Parameters
 
 if TYPE_CHECKING:
@@ -81,11 +82,7 @@ class Friction(AbstractNonIdeal):
 
     def force(self, t, q, v, ideal, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
-        if self.normal is None:
-            square = ideal @ ideal
-            normal = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-        else:
-            normal = jnp.abs(self.normal(t, q, multipliers, parameters))
+        normal = norm(ideal) if self.normal is None else jnp.abs(self.normal(t, q, multipliers, parameters))
         return -parameters[self.coefficient] * normal * pull(s / jnp.sqrt(s @ s + self.smoothing**2))[0]
 
 
