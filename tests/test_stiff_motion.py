@@ -21,7 +21,7 @@ def library(name):
 
 
 @functools.cache
-def bushing(matrix="square"):
+def bushing():
     """The library's stiff four-bar as one program: stiffness, damping, mass of the coupler, tolerance -> its end."""
     mechanism = library("stiff_four_bar")
     rigid = np.array([1.0, 1.0, 0.0])
@@ -36,7 +36,7 @@ def bushing(matrix="square"):
             t1=1.0,
             rtol=rtol,
             atol=atol,
-            solver=Hermite(matrix=matrix),
+            solver=Hermite(),
             adjoint=diffrax.ForwardMode(),
             max_steps=30000,
             throw=False,
@@ -70,21 +70,21 @@ def test_stiffness_does_not_make_steps_shorter():
 
 
 def test_velocities_that_need_not_be_known_so_well():
-    """A vibration that shows in velocities only is stepped over where these may be wrong by it."""
+    """A vibration that shows in velocities only is stepped over where these may be wrong by it.
+
+    For several tolerances: errors and steps vary from one to the next.
+    """
     expected = library("stiff_four_bar").references.values[-1, :3]
-    for stiffness, most in ((1e8, 120), (1e10, 200)):
-        ys, stats, successful = bushing()(stiffness=stiffness, rtol=1e-6, of_velocities=1e-3)
-        assert successful and stats["num_accepted_steps"] < most
-        # The softer one is the linkage of the reference, the other a rigid one to 1e-8 m.
-        np.testing.assert_allclose(ys.q[-1, 2::3], expected, rtol=2e-6 if stiffness == 1e8 else 1e-4)
-
-
-def test_exact_matrix_saves_iterations():
-    """Where a stiff direction turns within a step, the square of J is not the whole derivative of g."""
-    ends = [bushing(matrix)(stiffness=1e10, rtol=1e-6, of_velocities=1e-3) for matrix in ("square", "exact")]
-    (square, counts, _), (exact, fewer, _) = ends
-    assert int(fewer["num_evaluations"]) < 0.8 * int(counts["num_evaluations"])
-    np.testing.assert_allclose(exact.q, square.q, rtol=0, atol=1e-4)
+    counts = {1e8: [], 1e10: []}
+    for of_velocities in np.geomspace(5e-4, 2e-3, 9):
+        for stiffness in counts:
+            ys, stats, successful = bushing()(stiffness=stiffness, rtol=1e-6, of_velocities=of_velocities)
+            assert successful
+            counts[stiffness].append(int(stats["num_accepted_steps"]))
+            # The softer one is the linkage of the reference, the other a rigid one to 1e-8 m.
+            np.testing.assert_allclose(ys.q[-1, 2::3], expected, rtol=2e-5 if stiffness == 1e8 else 1e-4)
+    assert np.mean(counts[1e8]) < 120
+    assert np.mean(counts[1e10]) < 1.15 * np.mean(counts[1e8])
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e2])

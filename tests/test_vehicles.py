@@ -123,6 +123,7 @@ HARD = {
     "lands": {"speed": 15.0, "peak": 0.3, "t1": 0.7},
     "strikes its stops": {"speed": 15.0, "peak": 0.6, "t1": 0.4},
     **{f"{k:.0e} N/m": {"stiffness": k} for k in (1e4, 1e6, 1e9)},
+    **{f"{v:.0e} m/s": {"speed": v, "t1": t1} for v, t1 in ((1e-6, 0.3), (1e-3, 0.3), (1e2, 0.1))},
 }
 
 

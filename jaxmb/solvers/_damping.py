@@ -1,8 +1,11 @@
-"""Which formulas damp the stiff components of a problem, by the eigenvalues of its Jacobian.
+"""Which formulas treat the stiff components of a problem as they should, by the eigenvalues of its Jacobian.
 
 Formulas that are not A-stable make oscillations grow whose eigenvalue λ is near the imaginary axis, where `|h λ|` is of
 order one to ten: lightly damped vibrations of stiff springs. An error estimate shows such oscillations only when they
 are as large as the tolerance; then it keeps steps as short as those of an explicit method. The eigenvalues tell before.
+
+The formulas that are A-stable make components small that should grow, where `h λ` is large, and error estimates with
+them. The equation of such a step has other solutions than the near one, and what Newton's method found may be one.
 """
 
 import functools
@@ -26,6 +29,8 @@ _THETA = np.geomspace(1e-3, np.pi, 4000)
 # Eigenvalues this much to the right of the imaginary axis, as a part of their size, are on it: what rounding makes of
 # undamped vibrations. Beyond, the motion itself grows.
 _RIGHT = 1e-3
+# By which power of e a component may grow in a step.
+_FOLDS = 2.0
 
 
 @functools.cache
@@ -82,3 +87,11 @@ def are_damped(
     limits = jnp.asarray(sectors(family), dtype)[jnp.asarray(points)[:, None], bins]
     grows = jnp.real(spectrum) > jnp.asarray(_RIGHT, dtype) * jnp.abs(spectrum)
     return jnp.all(grows[None] | (angle[None] <= limits), axis=1)
+
+
+def is_resolved(step: Float[Array, ""], spectrum: Complex[Array, " n"]) -> Bool[Array, ""]:
+    """Whether what grows is followed by a step of this length, rather than damped."""
+    growth, size = jnp.real(spectrum), jnp.max(jnp.abs(spectrum))
+    # Less is what rounding makes of the eigenvalue 0.
+    grows = growth > jnp.asarray(jnp.finfo(growth.dtype).eps ** 0.5, growth.dtype) * size
+    return jnp.all(~grows | (jnp.abs(step) * growth <= _FOLDS))

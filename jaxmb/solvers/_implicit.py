@@ -28,8 +28,13 @@ _MAX_ITERATIONS = 10
 _SLOW = 0.2
 # After a matrix has failed that was made for another step, so many steps make their own.
 _DISTRUST = 10
-# How often Newton's method is begun for a step; and what stands for success.
-_ATTEMPTS, _DONE = 3, 9
+# Where a correction is larger than this part of the state and its change, the matrix tells nothing about its end.
+_FAR = 0.1
+# How many matrices Newton's method may use for a step; and what stands for success.
+_ATTEMPTS, _DONE = 4, 9
+# The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps: with
+# longer ones the stiffness in what is left out slows Newton's method, with shorter ones the rounding in what is there.
+_AHEAD = 0.4
 
 
 class Derivatives(NamedTuple):
@@ -82,71 +87,80 @@ def _warn():
 class Linearization(eqx.Module):
     """How a state and its derivatives in time change with the free components.
 
-    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held, None where
-    that is left out and `J²` is all of it, with J the free rows of `rate`; `spectrum`: the eigenvalues of J, None where
-    they are not asked for; `renewals`: how many steps are still to make a matrix of their own.
+    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held; `spectrum`:
+    the eigenvalues of J, the free rows of `rate`; `renewals`: how many steps are still to make a matrix of their own.
     """
 
     state: Float[Array, "n free"]
     rate: Float[Array, "n free"]
-    acceleration: Float[Array, "n free"] | None
-    spectrum: Complex[Array, " free"] | None
+    acceleration: Float[Array, "n free"]
+    spectrum: Complex[Array, " free"]
     renewals: Int[Array, ""]
 
 
 def linearize(
-    field: Field, t: Any, y: Float[Array, " n"], free: Int[Array, " free"], exact: bool, spectrum: bool
+    field: Field,
+    t: Any,
+    y: Float[Array, " n"],
+    rate: Float[Array, " n"],
+    h: Any,
+    free: Int[Array, " free"],
 ) -> Linearization:
-    """The derivatives of a field with respect to the free components; if asked for, those of g at a held rate, and the
-    spectrum.
+    """The derivatives of a field with respect to the free components, for a step h and a `rate` that is held.
+
+    That of g is the derivative of the Jacobian along the motion. A difference is exact enough for Newton's method, and
+    third derivatives of all that the field consists of would take longer to compile than the rest.
     """
-
-    def held(t, y):
-        (y, f), push, _ = jax.linearize(field, t, y, has_aux=True)
-        return y, f, push(jnp.ones_like(t), lax.stop_gradient(f))[1]
-
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
-    zero = jnp.zeros_like(t)
-    _, push = jax.linearize(held if exact else lambda t, y: field(t, y)[0], t, y)
-    state, *others = jax.vmap(lambda along: push(zero, along), out_axes=-1)(unit)
+
+    def columns(place):
+        _, push = jax.linearize(lambda t, y: field(t, y)[0], *place)
+        return jax.vmap(lambda along: push(jnp.zeros_like(t), along), out_axes=-1)(unit)
+
+    ahead = jnp.asarray(jnp.finfo(y.dtype).eps ** _AHEAD, y.dtype) * h
+    later = t + ahead.astype(t.dtype), y + ahead * rate
+    # A loop, so that the field is compiled once for both places.
+    states, rates = lax.map(columns, jax.tree.map(lambda *x: jnp.stack(x), (t, y), later))
     return Linearization(
-        state,
-        others[0],
-        others[1] if exact else None,
-        eigenvalues(others[0][free]) if spectrum else None,
+        states[0],
+        rates[0],
+        (rates[1] - rates[0]) / ahead,
+        eigenvalues(rates[0][free]),
         jnp.array(0, jnp.int32),
     )
 
 
 class Inverses(NamedTuple):
-    """With `P = 1 - a J - b J²`, less b times the derivative of g at a held rate where that is known: `newton`, its
-    inverse; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of J² in P is less than the one asked for.
+    """What solves `(P - c) x = r`, with `P = 1 - a J - b J²`, and c the b of the derivative of g at a held rate.
+
+    **Fields:** `square`: the inverse of P; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of J² in P is less than the
+    one asked for; `rest`: what is to be applied after P⁻¹, for that and for c. Where the rate is wrong it can be so
+    small as to hide errors: what decides about a step is measured by P⁻¹ alone.
     """
 
-    newton: Float[Array, "free free"]
+    square: Float[Array, "free free"]
     rate: Float[Array, "free free"]
     beyond: Float[Array, ""]
+    rest: Float[Array, "free free"]
 
 
-def inverses_of(jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
-    """The inverses that Newton's method needs, each as accurate as if it were one with a single J."""
+def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
+    """The inverses that Newton's method needs, each as accurate as if it were one with a single J; `held` is the
+    derivative of g at a held rate.
+    """
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
     # complex for all formulas with equal steps; should they become real, those of the nearest complex ones do.
-    square, least = -b - a**2 / 4, a**2 / 1000
-    real, imaginary = a / 2, jnp.sqrt(jnp.maximum(square, least))
+    product, least = -b - a**2 / 4, a**2 / 1000
+    real, imaginary = a / 2, jnp.sqrt(jnp.maximum(product, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
     rate = a * along + (real**2 - imaginary**2) * across
-    return Inverses(along + real * across, rate, jnp.maximum(least - square, jnp.zeros_like(square)))
-
-
-def inverses_with(held: Float[Array, "free free"], jacobian: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
-    """The same with `held`, the derivative of g at a held rate."""
-    inverses, identity = inverses_of(jacobian, a, b), jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
-    rest = inverse(identity - inverses.newton @ (b * held + inverses.beyond * jacobian @ jacobian))
-    return Inverses(rest @ inverses.newton, rest @ inverses.rate, jnp.zeros_like(inverses.beyond))
+    square = along + real * across
+    beyond = jnp.maximum(least - product, jnp.zeros_like(product))
+    rest = inverse(identity - square @ (b * held + beyond * jacobian @ jacobian))
+    return Inverses(square, rate, beyond, rest)
 
 
 # One member of a batch after the other; see `jaxmb.elimination`.
@@ -180,7 +194,9 @@ class Solved(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """`change` is the correction that comes next, `size` its norm, and `rate` that over the norm of the one before."""
+    """`change` is the correction that comes next, `size` its norm, with or without the derivative of g at a held rate,
+    whichever is larger, and `rate` that over the one before.
+    """
 
     end: Derivatives
     change: Float[Array, " free"]
@@ -196,26 +212,32 @@ def solve(
     a: Any,
     b: Any,
     predicted: Float[Array, " n"],
-    before: Float[Array, " n"],
+    before: tuple[Float[Array, " n"], Float[Array, " n"]],
     free: Int[Array, " free"],
     matrix: Linearization,
     size: Callable[[Array], Any],
     tol: float,
-    renew: Callable[[Float[Array, " n"]], Linearization],
+    renew: Callable[[Float[Array, " n"], Float[Array, " n"]], Linearization],
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 
-    With the matrix that is there from the `predicted` y; failing that, with a new one from there, and from the state
-    `before` the step.
+    From the `predicted` y, with the matrix that is there. Where its iterations would cost more than a new one, that is
+    made at the nearest y so far, for the rate there. The prediction is not near enough where the direction of a stiff
+    spring turns: what a rate that is off by the stiffness does to the matrix is not small.
 
-    **Arguments:** `matrix`: the one that is there; `size`: the norm of a correction in units of the tolerance, and
-    `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is there: what is left
-    of it would be multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state.
+    **Arguments:** `before`: the state before the step and its rate. For that rate the first matrix is made, and there
+    Newton's method is begun anew where the field was not finite; `matrix`: the one that is there; `size`: the norm of a
+    correction in units of the tolerance, and `tol`: of the last one, which is not applied to y, and to f and g only
+    with the matrix that is there: what is left of it would be multiplied by the stiffness in them, and spoil
+    predictions; `renew`: makes a matrix at a state, for a rate.
 
     After the first evaluation g is taken along the rate that the correction before has made of f. In f what is left of
     y's error is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times
     the square of the step: Newton's method would converge from near by only, on Robertson's reaction from nearer than
     rounding allows.
+
+    After a prediction that is as wrong as the state is large, as at the end of a fast transient, the matrix there may
+    be so much too large that the second correction seems to be nothing, far from any solution. It is not asked for one.
     """
 
     shapes = eqx.filter_eval_shape(derivatives, field, t, predicted)
@@ -229,29 +251,29 @@ def solve(
         g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
-        change = inverses.newton @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
+        without = inverses.square @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
+        change = inverses.rest @ without
         corrected = f - matrix.rate @ change
-        g = g + matrix.rate @ (corrected - along)[free]
-        if matrix.acceleration is not None:
-            g = g - matrix.acceleration @ change
-        now = size(matrix.state @ change)
+        g = g + matrix.rate @ (corrected - along)[free] - matrix.acceleration @ change
+        now = jnp.maximum(size(matrix.state @ change), size(matrix.state @ without))
         return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
+    # A new matrix costs about as much as half an iteration for each column, and two or three follow.
+    patience = 2 + free.size // 2
+    far = jnp.maximum(_FAR * (size(before[0]) + size(a * before[1])), 1.0)
+
     def proceed(carry: _Iterate) -> Bool[Array, ""]:
-        hopeful = (carry.iterations < 3) | (carry.rate < 2.0)
+        hopeful = (carry.iterations < 2) | (carry.size * carry.rate**patience <= tol)
+        hopeful = hopeful & ((carry.iterations < 1) | (carry.size <= far))
         # Before the first iteration the size is infinite.
         return ~(carry.size <= tol) & (carry.iterations < _MAX_ITERATIONS) & hopeful
 
     def attempt(carry):
-        k, matrix, _, _, work = carry
-        start = jnp.where(k < 2, predicted, before)
+        k, (start, rate), matrix, _, _, work = carry
         anew = (matrix.renewals > 0) | (k > 0)
-        renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start), old.renewals)
+        renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start, rate), old.renewals)
         matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
-        if matrix.acceleration is None:
-            inverses = inverses_of(matrix.rate[free], a, b)
-        else:
-            inverses = inverses_with(matrix.acceleration[free], matrix.rate[free], a, b)
+        inverses = inverses_of(matrix.rate[free], matrix.acceleration[free], a, b)
         first = _Iterate(nothing._replace(y=start), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol
@@ -259,13 +281,18 @@ def solve(
         renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
         renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
         matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
-        # A matrix made for the prediction is not made for it again.
-        k = jnp.where(converged, _DONE, jnp.where(anew & (k == 0), 2, k + 1)).astype(jnp.int32)
-        return k, matrix, inverses, last.end, work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
+        # A matrix is not made for the same place again.
+        farther = jnp.where(anew, last.end.y, start)
+        nearest = jnp.where(last.rate < 1, last.end.y - matrix.state @ last.change, farther)
+        finite = jnp.isfinite(last.size)
+        place = jnp.where(finite, nearest, before[0]), jnp.where(finite, last.end.f, before[1])
+        work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
+        return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
     square = jnp.zeros((free.size, free.size), past.dtype)
-    carry = none, matrix, Inverses(square, square, square[0, 0]), nothing, jnp.zeros(2, jnp.int32)
-    k, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
+    inverses = Inverses(square, square, square[0, 0], square)
+    carry = none, (predicted, before[1]), matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
+    k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
 
 
@@ -303,18 +330,15 @@ def _differentiable_jvp(primals, tangents):
     moved = push(dvalues, dense(dt, t), still)
     zeros = jax.tree.map(jnp.zeros_like, (values, t))
     columns = jax.vmap(lambda change: push(*zeros, change), out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
-    # The matrix of the equation is P, as in `Inverses`, minus b times what g changes by at a held rate.
-    jacobian, identity = columns[1][free], jnp.eye(still.size, dtype=still.dtype)
-    inverses = inverses_of(jacobian, a, b)
-    beyond = b * columns[2][free]
-    rest = inverse(identity - inverses.newton @ (beyond + inverses.beyond * jacobian @ jacobian))
+    jacobian, held = columns[1][free], columns[2][free]
+    inverses = inverses_of(jacobian, held, a, b)
     load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + b * moved[2])[free]
 
     def correction(change):
         # What is large is kept together as in `solve`, and nothing rests on the last digits of an inverse.
         rate = moved[1][free] + jacobian @ change
-        mismatch = change - load - beyond @ change - inverses.beyond * jacobian @ rate
-        return rest @ (inverses.newton @ mismatch - inverses.rate @ rate), rate
+        mismatch = change - load - b * held @ change - inverses.beyond * jacobian @ rate
+        return inverses.rest @ (inverses.square @ mismatch - inverses.rate @ rate), rate
 
     change = -correction(still)[0]
     left, rate = correction(change)

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Chart
-from ._damping import are_damped
+from ._damping import are_damped, is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
@@ -71,7 +71,8 @@ class Hermite(AbstractMultistep):
 
     Formulas that are not A-stable make lightly damped vibrations grow when a step covers a few radians of them. They
     are only chosen for steps with which no eigenvalue of the Jacobian does that, as computed whenever Newton's method
-    needs a new one; unless `points` leaves no A-stable formula to choose instead.
+    needs a new one; unless `points` leaves no A-stable formula to choose instead. In large steps implicit
+    formulas damp what should grow: none covers more than two e-foldings of it.
 
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives are as there. Derivatives go through the implicit equation
@@ -98,7 +99,6 @@ class Hermite(AbstractMultistep):
     tolerances: Tolerances
     family: str = eqx.field(static=True)
     points: tuple[int, ...] = eqx.field(static=True)
-    matrix: str = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
 
@@ -107,7 +107,6 @@ class Hermite(AbstractMultistep):
         family: Literal["E", "B", "H", "Y"] = "E",
         points: Sequence[int] | None = None,
         *,
-        matrix: Literal["square", "exact"] = "square",
         rtol: Any = None,
         atol: Any = None,
         norm: Callable[[PyTree], Any] = optx.rms_norm,
@@ -118,9 +117,6 @@ class Hermite(AbstractMultistep):
         - `points`: the numbers $k$ of points of the past to choose from, increasing; default all that are of use. A
             pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a single
             one fixes the order. The first of them is approached from $k = 1$.
-        - `matrix`: what Newton's method takes for the derivative of $g$: the `"square"` of that of $f$, so that one
-            complex matrix is inverted (W. H. Enright), or the `"exact"` one, which needs third derivatives. On
-            mechanisms whose stiff directions turn it saves a third of the evaluations and is about as fast.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
             leave them out.
@@ -130,8 +126,6 @@ class Hermite(AbstractMultistep):
         """
         if family not in FAMILIES:
             raise ValueError(f"`Hermite` has the families {', '.join(FAMILIES)}; got `family={family!r}`.")
-        if matrix not in ("square", "exact"):
-            raise ValueError(f"`Hermite` takes `matrix='square'` or `'exact'`; got `matrix={matrix!r}`.")
         highest = FAMILIES[family].highest
         points = tuple(range(1, highest + 1) if points is None else points)
         increasing = list(points) == sorted(set(points))
@@ -143,7 +137,6 @@ class Hermite(AbstractMultistep):
         self.tolerances = tolerances_of("Hermite", rtol, atol, norm)
         self.family = family
         self.points = points
-        self.matrix = matrix
 
     @property
     def interpolation_cls(self) -> Callable[..., MultistepInterpolation]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -161,9 +154,8 @@ class Hermite(AbstractMultistep):
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         free = free_components(terms, flat, chart)
         none = jnp.zeros((flat.size, free.size), flat.dtype)
-        exact = none if self.matrix == "exact" else None
-        spectrum = None if self._stable is None else lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
-        matrix = Linearization(none, none, exact, spectrum, jnp.asarray(1, jnp.int32))
+        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
+        matrix = Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         if before is None:
@@ -196,10 +188,11 @@ class Hermite(AbstractMultistep):
         field = field_of(terms, t1, y0, state.chart, args)
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.scale(before, before)
-        newton = self._newton(field, t1, past, a, b, predicted, before, free, state.matrix, scale, y0)
+        latest = before, state.slope[-n:]
+        newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, y0)
         y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
         chart, broken = newton.end.rest
-        failed = ~newton.converged | broken
+        failed = ~newton.converged | broken | ~is_resolved(h, newton.matrix.spectrum)
 
         ends = coefficients.past @ history.differences[:, :n]
         ends = (
@@ -261,10 +254,10 @@ class Hermite(AbstractMultistep):
         }
         return y1, estimate, dense_info, new_state, failed
 
-    def _newton(self, field, t, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
+    def _newton(self, field, t, h, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
-        field, t, past, a, b, predicted, before = freeze((field, t, past, a, b, predicted, before))
-        renew = lambda y: linearize(field, t, y, free, self.matrix == "exact", self._stable is not None)
+        field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
+        renew = lambda y, rate: linearize(field, t, y, rate, h, free)
         return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
@@ -275,7 +268,7 @@ class Hermite(AbstractMultistep):
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = changes[:, free] @ (matrix.state @ inverses.newton).T
+        errors = changes[:, free] @ (matrix.state @ inverses.square).T
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     @property
