@@ -1,6 +1,7 @@
 """Trains: draft gears, chains of vehicles of any length, and the cost of them."""
 
 import functools
+import time
 
 import diffrax
 import jax
@@ -440,3 +441,28 @@ def test_program_and_memory_of_long_trains(coupler):
     (few, small), (many, large) = measure(20), measure(80)
     assert few == many
     assert large <= 4.2 * small
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute])
+def test_time_of_long_trains(coupler):
+    """Ten times as many vehicles take ten times as long: the bound leaves room for caches that overflow."""
+    times = {}
+    for n in (1000, 10000):
+        mechanism = mb.mechanisms.train(n=n, coupler=coupler)
+        road = BlockMultipliers() if mechanism.system.constraints else Multipliers()
+        repeats = 200000 // n
+
+        @jax.jit
+        def several(system, q, u, road=road, repeats=repeats):
+            again = lambda _, u: u + 1e-9 * accelerations(system, road, 0.1, q, u)[0]
+            return jax.lax.fori_loop(0, repeats, again, u)
+
+        arguments = mechanism.system, mechanism.state.q, mechanism.state.u
+        several(*arguments).block_until_ready()
+        times[n] = np.inf
+        for _ in range(7):
+            start = time.perf_counter()
+            several(*arguments).block_until_ready()
+            times[n] = min(times[n], (time.perf_counter() - start) / repeats)
+    assert times[10000] <= 12 * times[1000]
