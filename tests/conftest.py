@@ -3,6 +3,7 @@ import os
 import equinox as eqx
 import jax
 import pytest
+from compiling import compile_quickly
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -10,7 +11,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config):
-    """Let all modules, workers and notebooks, and the next run, share the programs that are compiled."""
+    """Let all modules, workers and notebooks, and the next run, share the programs that are compiled.
+
+    A test that runs alone has the programs that users have.
+    """
+    if config.getoption("numprocesses", default=None):
+        compile_quickly()
     settings = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("programs")),
         "jax_persistent_cache_min_compile_time_secs": 0.1,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from compiling import jit_as_users_do
 from stiff_problems import PROBLEMS, solve, van_der_pol
 
 from jaxmb.solvers import Hermite, MultistepController
@@ -170,8 +171,8 @@ def _end(mu, t1, rtol, adjoint):
 def test_forward_reverse_and_central_differences(t1, mus, rtol, same, h):
     """Before the first jump, and after one or two."""
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
-    forward = jax.jit(jax.vmap(jax.jacfwd(lambda mu: _end(mu, t1, rtol, diffrax.ForwardMode()))))
-    reverse = jax.jit(jax.vmap(jax.grad(lambda mu: _end(mu, t1, rtol, adjoint))))
+    forward = jit_as_users_do(jax.vmap(jax.jacfwd(lambda mu: _end(mu, t1, rtol, diffrax.ForwardMode()))))
+    reverse = jit_as_users_do(jax.vmap(jax.grad(lambda mu: _end(mu, t1, rtol, adjoint))))
     mus = jnp.array(mus)
     along, against = forward(mus), reverse(mus)
     np.testing.assert_allclose(against, along, rtol=same)
@@ -190,10 +191,10 @@ def test_derivatives_of_a_reaction_over_eleven_decades():
         return jnp.log(solve(problem, 1e-8, args=rates, adjoint=adjoint, max_steps=1024).ys[-1][:2])
 
     exact = np.array([[-2.0, 2.0, -1.0], [-1.0, 1.0, -1.0]])
-    along = jax.jit(jax.jacfwd(lambda x: logarithms(x, diffrax.ForwardMode())))(jnp.zeros(3))
+    along = jit_as_users_do(jax.jacfwd(lambda x: logarithms(x, diffrax.ForwardMode())))(jnp.zeros(3))
     np.testing.assert_allclose(along, exact, rtol=1e-5)
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
-    against = jax.jit(jax.jacrev(lambda x: logarithms(x, adjoint)))(jnp.zeros(3))
+    against = jit_as_users_do(jax.jacrev(lambda x: logarithms(x, adjoint)))(jnp.zeros(3))
     np.testing.assert_allclose(against, along, rtol=1e-6)
 
 
