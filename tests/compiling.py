@@ -28,7 +28,7 @@ def jit_as_users_do(function: Callable) -> Callable:
     """`jax.jit` with XLA's own options.
 
     For comparisons of two programs, forward and reverse mode, to less than the tolerance of their solutions: these
-    agree where both take the same steps, so where both round alike. Unoptimised programs do not.
+    agree where both take the same steps, so where both round alike. Unoptimised programs need not.
     """
     quickly = os.environ.get("XLA_FLAGS") == QUICKLY
     options = {"xla_cpu_use_fusion_emitters": True, "xla_backend_optimization_level": 3} if quickly else None
