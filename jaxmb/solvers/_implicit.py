@@ -211,7 +211,7 @@ def solve(
     past: Float[Array, " n"],
     a: Any,
     b: Any,
-    predicted: Float[Array, " n"],
+    predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
     before: tuple[Float[Array, " n"], Float[Array, " n"]],
     free: Int[Array, " free"],
     matrix: Linearization,
@@ -221,33 +221,33 @@ def solve(
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 
-    From the `predicted` y, with the matrix that is there. Where its iterations would cost more than a new one, that is
-    made at the nearest y so far, for the rate there. The prediction is not near enough where the direction of a stiff
-    spring turns: what a rate that is off by the stiffness does to the matrix is not small.
+    From the `predicted` y and rate, with the matrix that is there. Where its iterations would cost more than a new one,
+    that is made at the nearest y so far, for the rate there. The prediction is not near enough where the direction of a
+    stiff spring turns: what a rate that is off by the stiffness does to the matrix is not small.
 
-    **Arguments:** `before`: the state before the step and its rate. For that rate the first matrix is made, and there
-    Newton's method is begun anew where the field was not finite; `matrix`: the one that is there; `size`: the norm of a
-    correction in units of the tolerance, and `tol`: of the last one, which is not applied to y, and to f and g only
-    with the matrix that is there: what is left of it would be multiplied by the stiffness in them, and spoil
-    predictions; `renew`: makes a matrix at a state, for a rate.
+    **Arguments:** `before`: the state before the step and its rate, where Newton's method is begun anew if the field
+    was not finite; `matrix`: the one that is there; `size`: the norm of a correction in units of the tolerance, and
+    `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is there: what is left
+    of it would be multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state, for a
+    rate.
 
-    After the first evaluation g is taken along the rate that the correction before has made of f. In f what is left of
-    y's error is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times
-    the square of the step: Newton's method would converge from near by only, on Robertson's reaction from nearer than
-    rounding allows.
+    g is taken along the rate that was predicted, then along what each correction makes of f. In f itself the error of y
+    is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the square
+    of the step: Newton's method would converge from near by only, on Robertson's reaction from nearer than rounding
+    allows.
 
     After a prediction that is as wrong as the state is large, as at the end of a fast transient, the matrix there may
     be so much too large that the second correction seems to be nothing, far from any solution. It is not asked for one.
     """
 
-    shapes = eqx.filter_eval_shape(derivatives, field, t, predicted)
+    shapes = eqx.filter_eval_shape(derivatives, field, t, predicted[0])
     blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
     nothing = jax.tree.map(blank, shapes)
     none, one = jnp.zeros((), jnp.int32), jnp.ones((), past.dtype)
 
     def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
         (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
-        along = jnp.where(carry.iterations == 0, f, carry.end.f)
+        along = carry.end.f
         g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
@@ -274,7 +274,7 @@ def solve(
         renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start, rate), old.renewals)
         matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
         inverses = inverses_of(matrix.rate[free], matrix.acceleration[free], a, b)
-        first = _Iterate(nothing._replace(y=start), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
+        first = _Iterate(nothing._replace(y=start, f=rate), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol
         slow = (last.iterations > 2) & (last.rate > _SLOW)
@@ -291,7 +291,7 @@ def solve(
 
     square = jnp.zeros((free.size, free.size), past.dtype)
     inverses = Inverses(square, square, square[0, 0], square)
-    carry = none, (predicted, before[1]), matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
+    carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
     k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
 

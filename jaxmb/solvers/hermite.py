@@ -171,14 +171,17 @@ class Hermite(AbstractMultistep):
         nodes = family.multiplicity * k
         index = np.arange(family.length, dtype=np.int32)
 
-        # The prediction extrapolates y, not f: what Newton's method leaves of stiff components is large in f. It is
-        # of the order of the formula, if there are points enough: Newton's method converges from near by only.
+        # The prediction extrapolates y, not f: what Newton's method leaves of stiff components is large in f. It is of
+        # the order of the formula, if there are points enough: Newton's method converges from near by only. Its slope
+        # comes from the logarithmic derivatives of the basis.
         end = step_end(history, t1)
         h = (end - history.mesh[0]).astype(dtype)
         values = basis(history.mesh, end[None])[:, 0].astype(dtype)
-        partial_sums = (jnp.asarray(before_each(family.length), dtype) * values[None]) @ history.differences
+        before_own = jnp.asarray(before_each(family.length), dtype)
+        partial_sums = (before_own * values[None]) @ history.differences
         recent = jnp.where(index <= nodes + 2, values, jnp.zeros((), dtype))
-        predicted = recent @ history.differences[:, -n:]
+        slopes = recent * (before_own @ (1 / (end - history.mesh)).astype(dtype))
+        predicted = recent @ history.differences[:, -n:], slopes @ history.differences[:, -n:]
 
         # y = past + a f + b g, by the formula with k points.
         coefficients = formulas(family, history, end)

@@ -150,31 +150,46 @@ def test_what_grows_is_not_stepped_over(points):
 # Derivatives
 
 
-def _end(mu, t1, rtol, adjoint):
+def _end(mu, t1, rtol, adjoint, mesh=None):
+    """With the step sizes that the tolerance asks for, or on a given mesh."""
+    if mesh is None:
+        solver, controller = Hermite(), MultistepController(rtol, rtol)
+    else:
+        solver, controller = Hermite(rtol=rtol, atol=rtol), diffrax.StepTo(mesh)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: van_der_pol(t, y, mu)),
-        Hermite(),
+        solver,
         0.0,
         t1,
         None,
         jnp.array([2.0, 0.0]),
-        stepsize_controller=MultistepController(rtol, rtol),
+        stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=2048,
     )
     return solution.ys[-1] @ jnp.array([1.0, 100.0])
 
 
-@pytest.mark.parametrize(
-    "t1, mus, rtol, same, h", [(70.0, (100.0, 120.0), 1e-9, 1e-10, 0.1), (100.0, (100.0, 55.0), 1e-11, 1e-8, 0.01)]
-)
-def test_forward_reverse_and_central_differences(t1, mus, rtol, same, h):
-    """Before the first jump, and after one or two."""
+def _both(mus, *args):
+    """The derivatives with respect to μ by forward and by reverse mode."""
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
-    forward = jit_as_users_do(jax.vmap(jax.jacfwd(lambda mu: _end(mu, t1, rtol, diffrax.ForwardMode()))))
-    reverse = jit_as_users_do(jax.vmap(jax.grad(lambda mu: _end(mu, t1, rtol, adjoint))))
+    forward = jit_as_users_do(jax.vmap(jax.jacfwd(lambda mu: _end(mu, *args[:2], diffrax.ForwardMode(), *args[2:]))))
+    reverse = jit_as_users_do(jax.vmap(jax.grad(lambda mu: _end(mu, *args[:2], adjoint, *args[2:]))))
+    return forward(mus), reverse(mus)
+
+
+def test_forward_and_reverse_on_the_same_mesh():
+    """To rounding: step sizes that follow from error estimates feel the rounding by which two programs differ."""
+    mesh = np.append(0.0, np.geomspace(1e-5, 70.0, 150))
+    along, against = _both(jnp.array([100.0, 120.0]), 70.0, 1e-11, mesh)
+    np.testing.assert_allclose(against, along, rtol=1e-13)
+
+
+@pytest.mark.parametrize("t1, mus, same, h", [(70.0, (100.0, 120.0), 1e-9, 0.1), (100.0, (100.0, 55.0), 1e-8, 0.01)])
+def test_forward_reverse_and_central_differences(t1, mus, same, h):
+    """Before the first jump, and after one or two."""
     mus = jnp.array(mus)
-    along, against = forward(mus), reverse(mus)
+    along, against = _both(mus, t1, 1e-11)
     np.testing.assert_allclose(against, along, rtol=same)
     tight = jax.jit(jax.vmap(lambda mu: _end(mu, t1, 1e-13, diffrax.ForwardMode())))
     values = [tight(mus + k * h) for k in (1.0, -1.0, 2.0, -2.0)]
