@@ -63,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     report = commands.add_parser(
         "report",
         help="measure error against run time for several solvers and ways to integrate, or what each formulation costs",
+        epilog="Without --set also for the machines that belong beside this one, such as two coupled tracked vehicles.",
     )
     report.add_argument(
         "mechanism", nargs="+", help="a name from `jaxmb mechanisms`; after the word `formulations`, the cost of those"
@@ -138,7 +139,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    from .report import formulation_costs, method_costs, work_precision
+    from .report import formulation_costs
 
     *words, arguments.mechanism = arguments.mechanism
     if words not in ([], ["formulations"]):
@@ -148,10 +149,22 @@ def _report(arguments: argparse.Namespace) -> None:
     if words:
         print(formulation_costs(_mechanism(arguments), repeats=arguments.repeats))
         return
-    mechanism = _mechanism(arguments)
+    mechanism, out = _mechanism(arguments), _folder(arguments)
+    _measure(mechanism, arguments, out)
+    if not arguments.set:
+        for parameters in mechanism.beside:
+            arguments.set = list(parameters.items())
+            shown = ",".join(f"{name}={value}" for name, value in arguments.set)
+            print(f"\nThe same with {shown}:\n")
+            (out / shown).mkdir(exist_ok=True)
+            _measure(_mechanism(arguments), arguments, out / shown)
+
+
+def _measure(mechanism: "Mechanism", arguments: argparse.Namespace, out: Path) -> None:
+    from .report import method_costs, work_precision
+
     precision = work_precision(mechanism, tolerances=arguments.tolerances, repeats=arguments.repeats)
     print(precision)
-    out = _folder(arguments)
     (out / "work_precision.json").write_text(json.dumps(precision.to_dict(), indent=1))
     written = [out / "work_precision.json"]
     if mechanism.system.acceleration_rows:

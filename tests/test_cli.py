@@ -1,5 +1,6 @@
 """The command line, run in this process."""
 
+import dataclasses
 import importlib
 import json
 import subprocess
@@ -45,7 +46,11 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
 
 
-def test_report(capsys, tmp_path):
+def test_report(capsys, tmp_path, monkeypatch):
+    """Of a mechanism, and of the one beside it."""
+    get = mb.mechanisms.get
+    heavier = lambda *args, **kwargs: dataclasses.replace(get(*args, **kwargs), beside=({"mass": 2.0},))
+    monkeypatch.setattr(mb.mechanisms, "get", heavier)
     words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -56,6 +61,8 @@ def test_report(capsys, tmp_path):
     assert {cost["bound"] for cost in costs} == {1e-3, 1e-5, 1e-7} and "multipliers, Baumgarte" in out
     for cost in costs:
         assert 0 < cost["error"] <= cost["bound"] and cost["evaluations"] > 0 and cost["flops"] > 0
+    assert "The same with mass=2.0:" in out
+    assert (tmp_path / "mass=2.0" / "method_costs.json").exists()
 
 
 @pytest.mark.parametrize(

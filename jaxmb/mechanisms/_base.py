@@ -77,6 +77,7 @@ class Mechanism:
     - `description`: what it is and where its data come from.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
     - `start(system, guess)`: how the state was made, or None where it was assembled and no more.
+    - `beside`: keyword arguments of other machines of this name that belong beside it in a report.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Mechanism:
     fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     start: Callable[[Any, State], State] | None = None
+    beside: tuple[Mapping[str, Any], ...] = ()
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
@@ -191,13 +193,14 @@ def build(
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
     start: Callable[[Any, State], State] | None = None,
+    beside: tuple[Mapping[str, Any], ...] = (),
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
-    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start, beside)
 
 
 def of_bodies(model: Model, **defaults: bool) -> bool:
