@@ -148,7 +148,7 @@ def tracked_vehicle(
         references=_REFERENCES[units],
         fix={"hull.x": 0.0},
         start=lambda system, guess: _rolling(system, guess, speed),
-        beside=({"units": 2},),
+        beside=({"units": 3 - units},),
     )
 
 
