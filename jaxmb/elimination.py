@@ -177,15 +177,27 @@ def _sweep(B: Float[Array, "r n"]) -> Float[Array, "r n"]:
     return (_sweep_in_place if B.shape[0] > _ROTATING_SIZE else _sweep_rotating)(B)
 
 
+@jax.custom_batching.custom_vmap
 def _sweep_rotating(B):
+    return _rotate(B)
+
+
+@_sweep_rotating.def_vmap
+def _sweep_rotating_batch(size, batched, B):
+    # With the members along the last axis every operation is one long vector, where theirs would be short loops.
+    del size, batched
+    return jnp.moveaxis(_rotate(jnp.moveaxis(B, 0, -1)), -1, 0), True
+
+
+def _rotate(B):
     r = B.shape[0]
 
     def step(_, B):
         # The pivot stands in the corner, always: its row moves to the bottom and its column to the end of the square.
-        row = B[0] / B[0, 0]
+        row = B[0] / B[:1, 0]
         row = jnp.concatenate([row[1:r], 1 / B[0, :1], row[r:]])
-        rest = jnp.concatenate([B[1:, 1:r], jnp.zeros((r - 1, 1), B.dtype), B[1:, r:]], axis=1)
-        return jnp.concatenate([rest - B[1:, :1] * row[None, :], row[None, :]])
+        rest = jnp.concatenate([B[1:, 1:r], jnp.zeros_like(B[1:, :1]), B[1:, r:]], axis=1)
+        return jnp.concatenate([rest - B[1:, :1] * row[None], row[None]])
 
     return lax.fori_loop(0, r, step, B)
 

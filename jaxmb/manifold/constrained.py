@@ -99,8 +99,10 @@ def evaluate(
 def _evaluate(system, formulation, t, q, u, order):
     jacobian = system.jacobian(t, q, u)
     solved = factor(jacobian, order, system.velocity_rank)
-    residual = jacobian @ u if system.linear and system.homogeneous else system.velocity_residual(t, q, u)
-    u = u - solved.correction @ residual
+    if system.linear and system.homogeneous:
+        u = solved.basis @ u[order.columns[system.velocity_rank :]]
+    else:
+        u = u - solved.correction @ system.velocity_residual(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     udot, _ = formulation.solve(system.inertia(t, q, u), system.force(t, q, u), jacobian, gamma, solved)
     return Evaluation(u, udot, solved)

@@ -152,12 +152,16 @@ class Adams(AbstractMultistep):
 
         end = step_end(history, t1)
         ahead = extrapolate(history, end)
-        weights = jnp.where(order > INDEX, ahead.means, jnp.zeros((), dtype))
-        predicted = before + h * (weights @ history.differences)
+        # The mean over the step of the polynomial through the last k derivatives, and where those through the last
+        # k - 1, k and k + 1 end.
+        lengths = order + np.array([0, -1, 0, 1], np.int32)
+        table = jnp.stack([ahead.means, ahead.values, ahead.values, ahead.values])
+        rows = jnp.where(lengths[:, None] > INDEX[None], table, jnp.zeros((), dtype)) @ history.differences
+        predicted = before + h * rows[0]
         first = evaluate(terms, t1, predicted, y0, chart, args)
 
-        # What the new derivative adds to the polynomials through the last k - 1, k and k + 1, and its integral.
-        defects = first.f[None] - lax.dynamic_slice_in_dim(ahead.partial_sums, order - 1, 3)
+        # What the new derivative adds to these polynomials, and its integral.
+        defects = first.f[None] - rows[1:]
         integrals = ahead.means / ahead.values
         last = integrals[order]
         padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
@@ -192,7 +196,7 @@ class Adams(AbstractMultistep):
             "y1": y1,
             "differences": jnp.where(used, new_state.history.differences, jnp.zeros((), dtype)),
             "mesh": new_state.history.mesh,
-            "mismatch": predicted + h * last * (f - ahead.partial_sums[order]) - after,
+            "mismatch": predicted + h * last * (f - rows[2]) - after,
         }
         if self.stiffness == "stop" and state.stiffness is not None:
             failed = failed | state.stiffness.found
