@@ -11,6 +11,8 @@ Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Di
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,10 @@ from jaxtyping import Array, Float, Int
 # twice as fast as the one in place, up to the second that one is faster than LAPACK's blocked elimination.
 _ROTATING_SIZE = 18
 _LOOP_SIZE = 40
+
+
+# Indices that are places of the matrix, or of no use; gathers clamp them anyway.
+_KNOWN: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 
 
 class Order(eqx.Module):
@@ -146,7 +152,7 @@ def full_pivot(
     )
     _, row_order, column_order, smallest, largest, rank = start if m == 0 else lax.fori_loop(0, min(m, n), step, start)
     rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
-    packed = jnp.concatenate([rows, columns, jnp.argsort(rows), jnp.argsort(columns)])
+    packed = jnp.concatenate([rows, columns, jnp.argsort(rows), jnp.argsort(columns)]).astype(np.int32)
     return Pivots(rank, Order(packed, m, n), smallest, largest)
 
 
@@ -163,10 +169,10 @@ def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
     # Gathers by pairs of indices: one kernel each, in the layout that comes next.
-    swept = gauss_jordan(A[rows[:, None], order.columns[None, :]], rank)
+    swept = gauss_jordan(A.at[rows[:, None], order.columns[None, :]].get(**_KNOWN), rank)
     dependent = column < rank
-    correction = jnp.where(dependent & (row < rank), swept.at[column, row].get(mode="clip"), 0.0)
-    basis = jnp.where(dependent, -swept.at[column, free].get(mode="clip"), identity)
+    correction = jnp.where(dependent & (row < rank), swept.at[column, row].get(**_KNOWN), 0.0)
+    basis = jnp.where(dependent, -swept.at[column, free].get(**_KNOWN), identity)
     return Factor(correction, basis, rows)
 
 

@@ -150,8 +150,9 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
         """Poses of the bodies and of the ground, as parts take them."""
-        ground = jnp.asarray(self.layout.space.ground, q.dtype)
-        return jax.vmap(self.layout.space.prepare)(jnp.concatenate([self.poses(q), ground[None]]))
+        prepare = self.layout.space.prepare
+        ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
+        return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
         """Velocities of the bodies and of the ground."""
