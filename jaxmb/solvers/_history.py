@@ -24,7 +24,6 @@ LENGTH = HIGHEST_ORDER + 1
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(7)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 INDEX = np.arange(LENGTH, dtype=np.int32)
-_SUM_BEFORE = np.tril(np.ones((LENGTH + 1, LENGTH)), -1)
 
 
 class History(eqx.Module):
@@ -40,21 +39,6 @@ class History(eqx.Module):
     differences: Float[Array, "length n"]
     mesh: Float[Array, " length"]
     points: Int[Array, ""]
-
-
-class Extrapolation(eqx.Module):
-    """What Newton's polynomial gives for one step from `t_n` to `t`, for all orders at once.
-
-    **Fields:**
-
-    - `values`: `basis_i(t)`.
-    - `means`: the mean of `basis_i` over the step.
-    - `partial_sums`: row `i` is the polynomial through the last `i` derivatives, evaluated at `t`; `i <= LENGTH`.
-    """
-
-    values: Float[Array, " length"]
-    means: Float[Array, " length"]
-    partial_sums: Float[Array, "length+1 n"]
 
 
 def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
@@ -104,15 +88,6 @@ def step_end(history: History, t: Any) -> Any:
     """
     latest = history.mesh[0]
     return jnp.where(t > latest, t, latest + spans(history.mesh)[0])
-
-
-def extrapolate(history: History, t: Any) -> Extrapolation:
-    """Newton's polynomials of every order at `t`, and the means of their basis over the step that ends there."""
-    dtype = history.differences.dtype
-    means, values = basis_means(history.mesh, history.mesh[0], t)
-    means, values = means.astype(dtype), values.astype(dtype)
-    partial_sums = (jnp.asarray(_SUM_BEFORE, dtype) * values[None]) @ history.differences
-    return Extrapolation(values, means, partial_sums)
 
 
 def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float[Array, "length n"]) -> History:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Chart
 from ._evaluation import controlled_components, evaluate, next_chart, ravel, restore, unravel_like
-from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, extrapolate, start, step_end
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, start, step_end
 from ._interpolation import RateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, choose_order
@@ -151,18 +151,20 @@ class Adams(AbstractMultistep):
         h = (t1 - history.mesh[0]).astype(dtype)
 
         end = step_end(history, t1)
-        ahead = extrapolate(history, end)
-        # The mean over the step of the polynomial through the last k derivatives, and where those through the last
-        # k - 1, k and k + 1 end.
-        lengths = order + np.array([0, -1, 0, 1], np.int32)
-        table = jnp.stack([ahead.means, ahead.values, ahead.values, ahead.values])
-        rows = jnp.where(lengths[:, None] > INDEX[None], table, jnp.zeros((), dtype)) @ history.differences
-        predicted = before + h * rows[0]
+        means, values = basis_means(history.mesh, history.mesh[0], end)
+        means, values = means.astype(dtype), values.astype(dtype)
+        # In one product, at the end of the step: the polynomials through the last 0, 1, 2, ... derivatives, and those
+        # through the last k - 1, k and k + 1; and the mean over the step of that through the last k.
+        lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
+        terms_of = jnp.concatenate([jnp.broadcast_to(values, (LENGTH + 3, LENGTH)), means[None]])
+        sums = jnp.where(lengths[:, None] > INDEX[None], terms_of, jnp.zeros((), dtype)) @ history.differences
+        partial_sums, neighbours, mean = sums[:LENGTH], sums[LENGTH:-1], sums[-1]
+        predicted = before + h * mean
         first = evaluate(terms, t1, predicted, y0, chart, args)
 
         # What the new derivative adds to these polynomials, and its integral.
-        defects = first.f[None] - rows[1:]
-        integrals = ahead.means / ahead.values
+        defects = first.f[None] - neighbours
+        integrals = means / values
         last = integrals[order]
         padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
         differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
@@ -185,7 +187,7 @@ class Adams(AbstractMultistep):
         )
         y1 = unravel_like(y0, after)
         new_state = AdamsState(
-            history=advance(history, end, f, ahead.partial_sums[:-1]),
+            history=advance(history, end, f, partial_sums),
             order=order + change,
             tally=state.tally + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, second.chart, args),
@@ -196,7 +198,7 @@ class Adams(AbstractMultistep):
             "y1": y1,
             "differences": jnp.where(used, new_state.history.differences, jnp.zeros((), dtype)),
             "mesh": new_state.history.mesh,
-            "mismatch": predicted + h * last * (f - rows[2]) - after,
+            "mismatch": predicted + h * last * (f - neighbours[1]) - after,
         }
         if self.stiffness == "stop" and state.stiffness is not None:
             failed = failed | state.stiffness.found
