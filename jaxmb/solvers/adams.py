@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._base import Chart
 from ._evaluation import controlled_components, evaluate, next_chart, ravel, restore, unravel_like
-from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, start, step_end
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
 from ._interpolation import RateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, choose_order
@@ -155,9 +155,10 @@ class Adams(AbstractMultistep):
         means, values = means.astype(dtype), values.astype(dtype)
         # In one product, at the end of the step: the polynomials through the last 0, 1, 2, ... derivatives, and those
         # through the last k - 1, k and k + 1; and the mean over the step of that through the last k.
-        lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
-        terms_of = jnp.concatenate([jnp.broadcast_to(values, (LENGTH + 3, LENGTH)), means[None]])
-        sums = jnp.where(lengths[:, None] > INDEX[None], terms_of, jnp.zeros((), dtype)) @ history.differences
+        lengths = order + np.array([-1, 0, 1, 0], np.int32)
+        near = jnp.where(lengths[:, None] > INDEX[None], jnp.stack([values, values, values, means]), jnp.zeros((), dtype))
+        all_ = jnp.asarray(before_each(LENGTH), dtype) * values[None]
+        sums = jnp.concatenate([all_, near]) @ history.differences
         partial_sums, neighbours, mean = sums[:LENGTH], sums[LENGTH:-1], sums[-1]
         predicted = before + h * mean
         first = evaluate(terms, t1, predicted, y0, chart, args)
