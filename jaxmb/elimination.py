@@ -164,7 +164,7 @@ def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     m, n = A.shape
     rows = order.rows[:rank]
     row, column = order.row_place[None, :], order.column_place[:, None]
-    free = np.arange(rank, n)[None, :]
+    free = np.arange(rank, n, dtype=np.int32)[None, :]
     identity = (column == free).astype(A.dtype)
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
