@@ -11,8 +11,6 @@ Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Di
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,10 +22,6 @@ from jaxtyping import Array, Float, Int
 # twice as fast as the one in place, up to the second that one is faster than LAPACK's blocked elimination.
 _ROTATING_SIZE = 18
 _LOOP_SIZE = 40
-
-
-# Indices that are places of the matrix, or of no use; gathers clamp them anyway.
-_KNOWN: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 
 
 class Order(eqx.Module):
@@ -169,11 +163,15 @@ def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
     # Gathers by pairs of indices: one kernel each, in the layout that comes next.
-    swept = gauss_jordan(A.at[rows[:, None], order.columns[None, :]].get(**_KNOWN), rank)
+    swept = gauss_jordan(_gather(A, rows[:, None], order.columns[None, :], "promise_in_bounds"), rank)
     dependent = column < rank
-    correction = jnp.where(dependent & (row < rank), swept.at[column, row].get(**_KNOWN), 0.0)
-    basis = jnp.where(dependent, -swept.at[column, free].get(**_KNOWN), identity)
+    correction = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
+    basis = jnp.where(dependent, -_gather(swept, column, free, "clip"), identity)
     return Factor(correction, basis, rows)
+
+
+def _gather(A, row, column, mode):
+    return A.at[row, column].get(mode=mode, wrap_negative_indices=False)
 
 
 @jax.custom_jvp

@@ -75,6 +75,25 @@ def test_jit_vmap_equal_loop():
         np.testing.assert_array_equal(together.order.packed[k], alone.order.packed)
 
 
+@pytest.mark.parametrize(("m", "n"), [(8, 9), (3, 5), (1, 2), (20, 22)])
+def test_batches_are_eliminated_as_their_members_are(m, n):
+    """With derivatives; each member in an order of its own, and batches of batches."""
+    batch = jnp.asarray(RNG.normal(size=(2, 6, m, n)))
+    weights = jnp.asarray(RNG.normal(size=(n, n)))
+
+    @jax.value_and_grad
+    def single(A):
+        solved = factor(A, full_pivot(A).order, m)
+        return jnp.sum(weights * jnp.concatenate([solved.correction, solved.basis], axis=1) ** 2)
+
+    assert len({tuple(np.asarray(full_pivot(A).order.columns)) for A in batch[0]}) > 1
+    found = jax.jit(jax.vmap(jax.vmap(single)))(batch)
+    alone = jax.jit(single)
+    for place in np.ndindex(2, 6):
+        for together, expected in zip(found, alone(batch[place]), strict=True):
+            np.testing.assert_allclose(together[place], expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
+
+
 @pytest.mark.parametrize("n", [3, 8, 30])
 def test_gauss_jordan_values_and_derivatives(n):
     B = jnp.asarray(RNG.normal(size=(n, n + 3)) + np.eye(n, n + 3) * 10)

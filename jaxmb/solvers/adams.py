@@ -156,9 +156,10 @@ class Adams(AbstractMultistep):
         # In one product, at the end of the step: the polynomials through the last 0, 1, 2, ... derivatives, and those
         # through the last k - 1, k and k + 1; and the mean over the step of that through the last k.
         lengths = order + np.array([-1, 0, 1, 0], np.int32)
-        near = jnp.where(lengths[:, None] > INDEX[None], jnp.stack([values, values, values, means]), jnp.zeros((), dtype))
-        all_ = jnp.asarray(before_each(LENGTH), dtype) * values[None]
-        sums = jnp.concatenate([all_, near]) @ history.differences
+        near = jnp.stack([values, values, values, means])
+        near = jnp.where(lengths[:, None] > INDEX[None], near, jnp.zeros((), dtype))
+        every = jnp.asarray(before_each(LENGTH), dtype) * values[None]
+        sums = jnp.concatenate([every, near]) @ history.differences
         partial_sums, neighbours, mean = sums[:LENGTH], sums[LENGTH:-1], sums[-1]
         predicted = before + h * mean
         first = evaluate(terms, t1, predicted, y0, chart, args)
