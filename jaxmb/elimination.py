@@ -162,7 +162,8 @@ def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     identity = (column == free).astype(A.dtype)
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
-    # Gathers by pairs of indices: one kernel each, in the layout that comes next.
+    # Gathers by pairs of indices: one kernel each, in the layout that comes next. Those of the pivots are places of A;
+    # of the others only what is dependent has a place, and the rest is not used.
     swept = gauss_jordan(_gather(A, rows[:, None], order.columns[None, :], "promise_in_bounds"), rank)
     dependent = column < rank
     correction = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
