@@ -147,21 +147,31 @@ def _check_locked(system, jacobian):
 def _connected(system):
     """Bodies that joints connect other than through the ground, with their rows; none that are driven in time."""
     ground, row = system.layout.bodies, 0
-    label = list(range(ground))
+    above = list(range(ground))
+
+    def first(body):
+        """The body that stands for all that are connected with this one."""
+        while above[body] != body:
+            above[body] = above[above[body]]
+            body = above[body]
+        return body
+
     parts = []
     for g in system.constraints:
         for own in g.group.bodies:
             moving = [k for k in own if k != ground]
-            label = [label[moving[0]] if x in [label[k] for k in moving] else x for x in label] if moving else label
+            for k in moving[1:]:
+                above[first(k)] = first(moving[0])
             parts.append((moving, range(row, row + g.rows), g.group.part.rheonomic))
             row += g.rows
-    out = []
-    for first in dict.fromkeys(label):
-        bodies = [k for k, x in enumerate(label) if x == first]
-        mine = [(rows, driven) for moving, rows, driven in parts if moving and moving[0] in bodies]
-        if mine and not any(driven for _, driven in mine):
-            out.append((bodies, [r for rows, _ in mine for r in rows]))
-    return out
+    bodies, rows, driven = ([[] for _ in above] for _ in range(3))
+    for k in range(ground):
+        bodies[first(k)].append(k)
+    for moving, mine, rheonomic in parts:
+        if moving:
+            rows[first(moving[0])] += mine
+            driven[first(moving[0])].append(rheonomic)
+    return [(b, r) for b, r, moved in zip(bodies, rows, driven, strict=True) if moved and not any(moved)]
 
 
 def _check_determined(system, implied):

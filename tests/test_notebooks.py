@@ -6,7 +6,6 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
-from compiling import as_users_do
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +45,7 @@ def test_lint(path):
 def test_runs(path):
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}})
-    client.execute(env=as_users_do())
+    client.execute()
 
 
 def test_readme_example(capsys):

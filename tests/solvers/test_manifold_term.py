@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_as_users_do
 
 from jaxmb.solvers import AbstractManifoldTerm, Adams, ManifoldEvaluation, MultistepController
 
@@ -147,8 +148,8 @@ def test_batch_with_charts_and_failures_equals_loop():
         solution = _solve(Circle(rate, fail=0.1), 4.0)
         return solution.ys[-1], solution.stats["num_steps"], solution.solver_state.chart["changes"]
 
-    batch = jax.jit(jax.vmap(run))(rates)
-    single = jax.jit(run)
+    batch = jit_as_users_do(jax.vmap(run))(rates)
+    single = jit_as_users_do(run)
     loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(rate) for rate in rates])
     # Rounding makes steps a little longer or shorter.
     np.testing.assert_allclose(batch[0], loop[0], rtol=0, atol=1e-9)
@@ -178,8 +179,8 @@ def test_gradients_through_charts():
     end = lambda rate, adjoint: _solve(Circle(rate), 4.0, 1e-10, adjoint=adjoint).ys[-1]
     loss = lambda rate, adjoint: jnp.sum(end(rate, adjoint) * jnp.array([1.0, 0.5]))
     rate = jnp.array(1.0)
-    forward = jax.jit(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
-    reverse = jax.jit(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
+    forward = jit_as_users_do(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
+    reverse = jit_as_users_do(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
     angle_rate = 4.0 + 0.5 * (1 - np.cos(4.0))
     x, y = _exact(4.0)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
