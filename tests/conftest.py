@@ -18,7 +18,7 @@ def pytest_configure(config):
     """
     if config.getoption("numprocesses", default=None):
         compile_quickly()
-    # Tracing makes and drops many objects, few of them in cycles: collecting as often as usual takes a quarter of it.
+    # Tracing makes and drops many objects, few of them in cycles: to collect as often as usual takes a tenth of it.
     gc.set_threshold(100_000, 20, 20)
     settings = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("programs")),
