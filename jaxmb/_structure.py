@@ -147,13 +147,13 @@ def _check_locked(system, jacobian):
 def _connected(system):
     """Bodies that joints connect other than through the ground, with their rows; none that are driven in time."""
     ground, row = system.layout.bodies, 0
-    above = list(range(ground))
+    # A union-find forest: the root of a body's tree stands for all that are connected with it.
+    parent = list(range(ground))
 
-    def first(body):
-        """The body that stands for all that are connected with this one."""
-        while above[body] != body:
-            above[body] = above[above[body]]
-            body = above[body]
+    def root(body):
+        while parent[body] != body:
+            parent[body] = parent[parent[body]]
+            body = parent[body]
         return body
 
     parts = []
@@ -161,17 +161,17 @@ def _connected(system):
         for own in g.group.bodies:
             moving = [k for k in own if k != ground]
             for k in moving[1:]:
-                above[first(k)] = first(moving[0])
+                parent[root(k)] = root(moving[0])
             parts.append((moving, range(row, row + g.rows), g.group.part.rheonomic))
             row += g.rows
-    bodies, rows, driven = ([[] for _ in above] for _ in range(3))
+    bodies, rows, driven = ([[] for _ in parent] for _ in range(3))
     for k in range(ground):
-        bodies[first(k)].append(k)
-    for moving, mine, rheonomic in parts:
+        bodies[root(k)].append(k)
+    for moving, own, rheonomic in parts:
         if moving:
-            rows[first(moving[0])] += mine
-            driven[first(moving[0])].append(rheonomic)
-    return [(b, r) for b, r, moved in zip(bodies, rows, driven, strict=True) if moved and not any(moved)]
+            rows[root(moving[0])] += own
+            driven[root(moving[0])].append(rheonomic)
+    return [(b, r) for b, r, d in zip(bodies, rows, driven, strict=True) if d and not any(d)]
 
 
 def _check_determined(system, implied):

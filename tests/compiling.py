@@ -12,7 +12,7 @@ QUICKLY = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
     " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
 )
-
+# What undoes it in one program; into how many pieces its machine code is cut does not matter.
 AS_USERS_DO = {
     "xla_cpu_use_fusion_emitters": True,
     "xla_backend_optimization_level": 3,
@@ -34,5 +34,15 @@ def jit_as_users_do(function: Callable) -> Callable:
     For comparisons of two programs, forward and reverse mode, to less than the tolerance of their solutions: these
     agree where both take the same steps, so where both round alike. Unoptimised programs need not.
     """
+    return _jit(function, AS_USERS_DO)
+
+
+def jit_to_run_long(function: Callable) -> Callable:
+    """`jax.jit` for what runs longer than it compiles: quickly still, but half as long or less to run."""
+    return _jit(function, {"xla_backend_optimization_level": 1})
+
+
+def _jit(function, options):
+    """With other options than those by which the tests compile, if they do."""
     quickly = os.environ.get("XLA_FLAGS") == QUICKLY
-    return jax.jit(function, compiler_options=AS_USERS_DO if quickly else None)
+    return jax.jit(function, compiler_options=options if quickly else None)

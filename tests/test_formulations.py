@@ -1,6 +1,5 @@
 """Every road to the same accelerations: on matrices against NumPy, on the library's mechanisms against each other."""
 
-import functools
 from typing import ClassVar
 
 import diffrax
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_to_run_long
 
 import jaxmb as mb
 from jaxmb.elimination import factor, full_pivot
@@ -272,10 +272,9 @@ def test_formulations_agree(name):
     mechanism = mb.mechanisms.get(name, **LIBRARY[name])
     system, state = mechanism.system, mechanism.state
     roads = ROADS if system.regular else WITHOUT_INVERSE_OF_MASS
-    # Eliminations of many rows take longer than to compile them well.
-    options = {"xla_backend_optimization_level": 1} if system.acceleration_rows > 20 else None
 
-    @functools.partial(jax.jit, compiler_options=options)
+    # Eliminations of many rows take longer than to compile them.
+    @(jit_to_run_long if system.acceleration_rows > 20 else jax.jit)
     def solve(q, u, change):
         y = mb.manifold.project(system, 0.0, mb.State(q, u))
         motion, (multipliers, jacobian, basis) = motion_by(system, roads, y.q, y.u)
