@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._parts import AbstractForce, AbstractPart, number, optional_number
@@ -37,7 +38,7 @@ def generalized_force(space, coordinates, poses, velocities, law):
 
 def fill_points(part, space):
     """The part with its points, the mass centres where none are given, checked."""
-    zero = jnp.zeros(space.dimension)
+    zero = np.zeros(space.dimension)
     for field in ("point_a", "point_b"):
         part = fill(part, field, zero)
         vector(part, field, getattr(part, field), space.dimension)
@@ -166,7 +167,7 @@ class PointForce(AbstractForce):
 
     def resolve(self, space, poses):
         vector(self, "force", self.force, space.dimension)
-        part = fill(self, "point", jnp.zeros(space.dimension))
+        part = fill(self, "point", np.zeros(space.dimension))
         vector(part, "point", part.point, space.dimension)
         return part
 

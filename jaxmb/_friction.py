@@ -48,7 +48,7 @@ class Friction(AbstractNonIdeal):
             raise ValueError(f"{label(self)}: {joint.name!r} is between more than two bodies; use NonIdeal.")
         own = getattr(joint, "point_b", None)
         own = getattr(joint, "point", None) if own is None else own
-        part = fill(self, "point", jnp.zeros(space.dimension) if own is None else own)
+        part = fill(self, "point", np.zeros(space.dimension) if own is None else own)
         vector(part, "point", part.point, space.dimension)
         part._check_slip(space, joint, poses)
         return part

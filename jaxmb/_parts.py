@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ._space import AbstractSpace
@@ -29,14 +30,26 @@ Wrenches = Float[Array, "k v"]
 GROUND = "ground"
 
 
-def number(value: Any) -> Array:
-    """A strongly typed float array."""
-    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
+def number(value: Any) -> Any:
+    """A strongly typed float array: JAX's of a traced value, otherwise a constant one of NumPy's, so that nothing is
+    compiled to build a scene.
+    """
+    if isinstance(value, Tracer):
+        return jnp.asarray(value, dtype=jnp.result_type(float))
+    given = np.asarray(value)
+    if given.dtype.kind not in "fiub":
+        raise ValueError(f"expected a real number or an array of real numbers, got {value!r}")
+    constant = np.array(given, dtype=jax.dtypes.canonicalize_dtype(float))
+    constant.flags.writeable = False
+    return constant
+
+
+def array(value: Any) -> Array:
+    """The same as an array of JAX's: for functions that may index it by what is traced."""
+    if isinstance(value, Array) and value.dtype == jax.dtypes.canonicalize_dtype(float) and not value.aval.weak_type:
         return value
-    array = np.asarray(value) if not isinstance(value, Array) else value
-    if not (np.issubdtype(array.dtype, np.number) or np.issubdtype(array.dtype, np.bool_)):
-        raise ValueError(f"expected a number or an array of numbers, got {value!r}")
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+    value = number(value)
+    return value if isinstance(value, Tracer) else jax.device_put(value)
 
 
 def optional_number(value: Any) -> Any:

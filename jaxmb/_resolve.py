@@ -3,11 +3,10 @@ the part.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from ._parts import AbstractPart
+from ._parts import AbstractPart, number
 from ._space import AbstractSpace
 
 
@@ -71,10 +70,10 @@ def axis_pair(part, space: AbstractSpace, poses: Float[Array, "k p"]):
     return eqx.tree_at(lambda p: (p.axis_a, p.axis_b, p.axis), part, (*axes, None), is_leaf=lambda x: x is None)
 
 
-def fill(part, field: str, value: Array):
+def fill(part, field: str, value: ArrayLike):
     """Give a missing number its value at the given poses."""
     if getattr(part, field) is None:
-        part = eqx.tree_at(lambda p: getattr(p, field), part, jnp.asarray(value), is_leaf=lambda x: x is None)
+        part = eqx.tree_at(lambda p: getattr(p, field), part, number(value), is_leaf=lambda x: x is None)
     return part
 
 

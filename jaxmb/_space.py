@@ -9,16 +9,9 @@ A `pose` is what positions a body, a `velocity` what moves it, a `wrench` what d
 """
 
 import abc
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
-import equinox as eqx
 from jaxtyping import Array, Float
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
-
 
 Pose = Float[Array, "p"]
 Velocity = Float[Array, "v"]
@@ -26,13 +19,19 @@ Wrench = Float[Array, "v"]
 Point = Float[Array, "d"]
 
 
-class AbstractSpace(eqx.Module):
-    """Kinematics of one rigid body in the plane or in space; without data."""
+class AbstractSpace(abc.ABC):
+    """Kinematics of one rigid body in the plane or in space; without data, so that all of a kind are equal."""
 
-    dimension: AbstractVar[int]
-    pose_size: AbstractVar[int]
-    velocity_size: AbstractVar[int]
-    ground: AbstractVar[tuple[float, ...]]
+    dimension: ClassVar[int]
+    pose_size: ClassVar[int]
+    velocity_size: ClassVar[int]
+    ground: ClassVar[tuple[float, ...]]
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
 
     @abc.abstractmethod
     def point(self, pose: Pose, s: Point) -> Point:

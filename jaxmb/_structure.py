@@ -49,10 +49,11 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
         )
     for what in ("velocities", "accelerations"):
         _check_left_over(system, what, *map(np.asarray, found[what]))
-    _check_locked(system, np.asarray(found["jacobian"])[: system.position_rows])
-    position, velocity = int(found["position rank"]), int(found["everything"].rank)
+    jacobian, scale = np.asarray(found["jacobian"]), np.asarray(found["scale"])
+    _check_locked(system, jacobian[: system.position_rows] * scale)
+    position, velocity = int(found["position rank"]), int(found["rank"])
     coordinate = position + system.coordinate_rows - system.position_rows
-    implied = _implied(system, np.asarray(found["jacobian"]), np.asarray(found["everything"].order.rows), velocity)
+    implied = _implied(system, jacobian, np.asarray(found["rows"]), velocity)
     _check_determined(system, implied)
     return Ranks(position, coordinate, velocity, int(found["acceleration rank"])), implied
 
@@ -79,16 +80,21 @@ def _analyse(system):
         residual = residual_size(system, t, q, near)
     jacobian = system.velocity_jacobian(t, q, u)
     stage = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
+    every = full_pivot(jacobian, scale=scale, stage=stage)
+    holonomic = system.velocity_rows == system.position_rows
+    positions = every if holonomic else full_pivot(jacobian[: system.position_rows], scale=scale)
     out = {
         "q": q,
         "residual": residual,
         "jacobian": jacobian,
-        "position rank": full_pivot(jacobian[: system.position_rows], scale=scale).rank,
-        "everything": full_pivot(jacobian, scale=scale, stage=stage),
+        "scale": scale,
+        "position rank": positions.rank,
+        "rank": every.rank,
+        "rows": every.order.rows,
         "velocities": (jnp.zeros(0), jnp.zeros(0)),
         "accelerations": (jnp.zeros(0), jnp.zeros(0)),
     }
-    out["acceleration rank"] = out["everything"].rank
+    out["acceleration rank"] = every.rank
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.homogeneous):
@@ -125,9 +131,10 @@ def _check_locked(system, jacobian):
 
     Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
     if at all, where they lock. No row is implied there, but some nearly are.
+
+    **Arguments:** `jacobian` (position rows × nu), its columns scaled.
     """
-    scaled = jacobian * np.asarray(system.velocity_scale())[None, :]
-    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
+    scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
     for bodies, rows in _connected(system):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = columns[columns < system.nu]

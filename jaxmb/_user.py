@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._parts import AbstractConstraint, AbstractForce, AbstractNonIdeal, AbstractVelocityConstraint, number
+from ._parts import AbstractConstraint, AbstractForce, AbstractNonIdeal, AbstractVelocityConstraint, array
 
 
 def names(bodies: Any) -> tuple[str, ...]:
@@ -17,7 +17,7 @@ def names(bodies: Any) -> tuple[str, ...]:
 
 
 def numbers(parameters: dict[str, Any]) -> dict[str, Array]:
-    return {key: number(value) for key, value in parameters.items()}
+    return {key: array(value) for key, value in parameters.items()}
 
 
 class Constraint(AbstractConstraint):

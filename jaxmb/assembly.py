@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from . import _chain_assembly
+from ._namespace import as_array, is_traced
 from ._types import Scalar, State, VectorLike
 from .elimination import full_pivot
 from .rotations import normalize
@@ -61,21 +61,21 @@ def assemble(
     coordinates that cannot be fixed together. Under `jit` the same as a run-time error without the names.
     """
     guess = system.guess if guess is None else guess
-    t = jnp.asarray(t, guess.q.dtype)
+    t = as_array(t, guess.q.dtype)
     u, fixed_rates = prescribe("rate", system.rate_names(), rates or {}, guess.u)
-    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, guess, fix, u, t)))
+    concrete = not is_traced((system, guess, fix, u, t))
     if concrete:
         _check_finite(u, "rates")
     q, _, ok = configuration(system, guess.q, fix, t, throw)
-    if concrete and system.homogeneous and not np.any(u) and not np.any(fixed_rates):
-        # At rest, and nothing asks for motion: there is nothing to compile.
-        ok_rates = jnp.array(True)
-    else:
-        u, ok_rates = velocities(system, t, q, u, tuple(fixed_rates.tolist()))
-    if concrete and throw and not bool(ok_rates):
-        raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
+    # At rest, where nothing asks for motion, there is nothing to compile.
+    at_rest = concrete and system.homogeneous and not np.any(np.asarray(u)) and not np.any(fixed_rates)
+    u, ok_rates = (u, True) if at_rest else velocities(system, t, q, u, tuple(fixed_rates.tolist()))
+    if concrete and throw:
+        if not ok_rates:
+            raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
+        return State(q, u)
     ok = ok & ok_rates
-    if throw and not concrete:
+    if throw:
         q = eqx.error_if(
             q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are open."
         )
@@ -91,7 +91,7 @@ def configuration(
     """
     names = system.coordinate_names()
     q, fixed = prescribe("coordinate", names, fix or {}, guess)
-    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, q, t)))
+    concrete = not is_traced((system, q, t))
     if concrete:
         _check_finite(q, "coordinates")
     whole = 0

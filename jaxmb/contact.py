@@ -10,6 +10,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._parts import AbstractForce, number, optional_number
@@ -207,7 +208,7 @@ class Contact(AbstractForce):
                 raise ValueError(f"{label(self)}: {field} must be a law from {where}, got {getattr(self, field)!r}.")
 
     def resolve(self, space, poses):
-        part = fill(self, "points", jnp.zeros(space.dimension))
+        part = fill(self, "points", np.zeros(space.dimension))
         n, d = len(self.bodies), space.dimension
         for field, shapes in {"radius": ((), (n,)), "points": ((d,), (n, d))}.items():
             shape = getattr(part, field).shape

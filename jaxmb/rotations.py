@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ._namespace import namespace
 from ._types import Scalar, VectorLike
 
 # Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would
@@ -37,22 +38,23 @@ def _tables():
 _CROSS, _MULTIPLY, _CONJUGATE, _ROTATION, _RATES = _tables()
 
 
-def _constant(table: np.ndarray, like: Array) -> Array:
-    return jnp.asarray(table, like.dtype)
+def _constant(table: np.ndarray, like: Array) -> np.ndarray:
+    return table.astype(like.dtype, copy=False)
 
 
 def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
     """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
     # Pairs as one axis: under a few `vmap`s, arrays of rank seven and more are what jaxlib 0.10.2 and 0.11.0 hang on.
     pairs = (a[:, None] * b[None, :]).reshape(-1)
-    return jnp.sum(_constant(table.reshape(-1, pairs.size), a) * pairs[None, :], axis=1)
+    return (_constant(table.reshape(-1, pairs.size), a) * pairs[None, :]).sum(axis=1)
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     """Euclidean norm over the last axis, with derivative zero (not NaN) at the zero vector."""
-    square = jnp.sum(x * x, axis=-1)
+    xp = namespace(x)
+    square = (x * x).sum(axis=-1)
     positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
 
 
 def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -68,12 +70,12 @@ def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """World components of the body vector `v`."""
-    return jnp.sum(rotation_matrix(p) * v[None, :], axis=1)
+    return (rotation_matrix(p) * v[None, :]).sum(axis=1)
 
 
 def unrotate(p: Float[Array, "4"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
     """Body components of the world vector `v_W`."""
-    return jnp.sum(rotation_matrix(p) * v_W[:, None], axis=0)
+    return (rotation_matrix(p) * v_W[:, None]).sum(axis=0)
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -83,7 +85,7 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def skew(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The matrix `ã` of the vector product, `ã b = a × b`."""
-    return jnp.sum(_constant(_CROSS, a) * a[None, :, None], axis=1)
+    return (_constant(_CROSS, a) * a[None, :, None]).sum(axis=1)
 
 
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:

@@ -30,7 +30,15 @@ from .spatial._space import SPACE
 from .system import RigidBodySystem
 from .system._base import Ranks
 from .system.describe import Description
-from .system.groups import ConstraintGroup, ForceGroup, NonIdealGroup, VelocityConstraintGroup, servo_group, stack
+from .system.groups import (
+    ConstraintGroup,
+    ForceGroup,
+    NonIdealGroup,
+    VelocityConstraintGroup,
+    anonymous,
+    servo_group,
+    stack,
+)
 from .system.layout import Layout
 
 _BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
@@ -76,10 +84,10 @@ class Scene(eqx.Module):
         layout = Layout(space, tuple(body.rotates for body in self.bodies))
         index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
         guess = State(
-            jnp.asarray(np.concatenate([body.pose() for body in self.bodies])),
-            jnp.asarray(np.concatenate([body.velocities() for body in self.bodies])),
+            jax.device_put(np.concatenate([body.pose() for body in self.bodies])),
+            jax.device_put(np.concatenate([body.velocities() for body in self.bodies])),
         )
-        given: Any = np.append(guess.q, np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
+        given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):
@@ -102,11 +110,11 @@ class Scene(eqx.Module):
         kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
         of_joint = {law.name: law.joint for law, _ in laws}
         system = RigidBodySystem(
-            mass=jnp.asarray(np.stack([body.mass for body in self.bodies])),
-            rotary=jnp.asarray(
+            mass=jax.device_put(np.stack([body.mass for body in self.bodies])),
+            rotary=jax.device_put(
                 np.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies])
             ),
-            gravity=None if gravity is None else gravity.acceleration,
+            gravity=None if gravity is None else jax.device_put(gravity.acceleration),
             constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
             velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
             servos=tuple(map(servo_group, kind(Servo))),
@@ -194,20 +202,27 @@ def _check_rotation(part, own, layout, poses):
         return
     space = layout.space
     for component in part.components():
-        if isinstance(component, AbstractForce):
-            velocities = jnp.ones((len(own), space.velocity_size))
-            felt = component.wrenches(space, poses, velocities, 0.0)
-        else:
-            rows = rows_of(component.program if isinstance(component, Servo) else component, space, poses)
-            felt = jnp.sum(jnp.abs(rows), axis=0)
-        if np.any(np.abs(felt[np.array(points), space.dimension :]) > 0):
+        felt = np.asarray(_felt(anonymous(component), space, poses))
+        if np.any(felt[points, space.dimension :] > 0):
             raise ValueError(
                 f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, "
                 "or use a Body."
             )
 
 
+@eqx.filter_jit
+def _felt(part, space, poses):
+    """How strongly a part acts on the velocities of its bodies, or holds on to them."""
+    if isinstance(part, AbstractForce):
+        velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
+        return jnp.abs(part.wrenches(space, poses, velocities, jnp.zeros((), poses.dtype)))
+    rows = rows_of(part.program if isinstance(part, Servo) else part, space, poses)
+    return jnp.sum(jnp.abs(rows), axis=0)
+
+
 def _check_finite(part):
+    if all(np.isfinite(item).all() for item in jax.tree.leaves(part) if eqx.is_inexact_array(item)):
+        return
     for field in part.__dataclass_fields__:
         for item in jax.tree.leaves(getattr(part, field)):
             if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
@@ -227,4 +242,4 @@ def _length(parts, guess, layout):
         dimension = layout.space.dimension
         position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[:-1]])
         size = float(np.max(np.abs(position)))
-    return jnp.asarray(size if size > 0 else 1.0)
+    return jax.device_put(np.asarray(size if size > 0 else 1.0, guess.q.dtype))

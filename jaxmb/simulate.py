@@ -12,6 +12,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
+from ._namespace import as_array
 from ._results import RESULTS
 from ._types import Scalar, State
 from .elimination import full_pivot
@@ -102,15 +103,15 @@ def simulate(
             f"{state.u.shape}."
         )
     # Numbers become arrays, so that other tolerances and times do not compile anew.
-    number = lambda x: jnp.asarray(x, dtype=state.q.dtype)
-    rtol = number(_checked_tolerance(rtol, atol, state.q.dtype))
-    atol = rtol / 100 if atol is None else number(atol)
+    number = lambda x: as_array(x, state.q.dtype)
+    relative: Any = number(_checked_tolerance(rtol, atol, state.q.dtype))
+    absolute: Any = relative / 100 if atol is None else number(atol)
     times = number(t0), number(t1), None if dt0 is None else number(dt0)
     choice = solver
     solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
-        stepsize_controller = controller(rtol=rtol, atol=atol)
+        stepsize_controller = controller(rtol=relative, atol=absolute)
     if adjoint is None:
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
@@ -123,7 +124,7 @@ def simulate(
     def motion(solver):
         policy = _manifold(system, solver, formulation) if manifold is None else manifold
         road = _formulation(system, policy) if formulation is None else formulation
-        term, prepared = policy.prepare(system, road, solver, rtol)
+        term, prepared = policy.prepare(system, road, solver, relative)
         return _integrate(
             system,
             road,
@@ -140,10 +141,10 @@ def simulate(
             restore=_way_back(policy, interpolated),
         )
 
-    trajectory = motion(solver)
+    trajectory, failed = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory = motion(Hermite())
+        trajectory, failed = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -151,13 +152,11 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
-    if throw:
-        result = trajectory.result
-        bad = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+    if throw and (isinstance(failed, Tracer) or failed):
         # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
-        spoiled = lambda y: y * jnp.where(bad, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
+        spoiled = lambda y: y * jnp.where(failed, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
         trajectory = eqx.tree_at(lambda trajectory: trajectory.ys, trajectory, jax.tree.map(spoiled, trajectory.ys))
-        trajectory = result.error_if(trajectory, bad)
+        trajectory = trajectory.result.error_if(trajectory, failed)
     return trajectory.trimmed()
 
 
@@ -201,16 +200,18 @@ def _integrate(
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     if isinstance(saved, State) and restore is not None:
         saved = _restore(system, ts, saved, restore)
-    return Trajectory(
+    result = _diagnose(system, state, end, solution)
+    trajectory = Trajectory(
         system=system,
         formulation=formulation,
         ts=ts,
         ys=saved,
         stats=_statistics(solution),
-        result=_diagnose(system, state, end, solution),
+        result=result,
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
+    return trajectory, _failed(result)
 
 
 def _named(name: str, state: State) -> Adams:
@@ -250,10 +251,10 @@ def _save_at(saveat) -> diffrax.SaveAt:
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
         return saveat
-    ts = jnp.asarray(saveat, dtype=jnp.result_type(float))
+    ts = as_array(saveat, jnp.result_type(float))
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
-    return diffrax.SaveAt(ts=ts)
+    return diffrax.SaveAt(ts=jax.device_put(ts))
 
 
 def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
@@ -297,7 +298,7 @@ def _diagnose(system, start, end, solution):
     """Diffrax's outcome, made precise where mechanics knows more."""
     result = RESULTS.promote(solution.result)
     finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
-    stuck = ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+    stuck = _failed(result)
     result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
     if system.velocity_rows == 0 or not isinstance(_chart(solution), Chart):
         return result
@@ -314,6 +315,10 @@ def _diagnose(system, start, end, solution):
     result = RESULTS.where(singular, RESULTS.singular_configuration, result)
     newton = stuck & ~singular & (solution.result == diffrax.RESULTS.dt_min_reached)
     return RESULTS.where(newton, RESULTS.newton_failed, result)
+
+
+def _failed(result) -> Any:
+    return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
 
 
 def _chart(solution) -> Any:

@@ -7,16 +7,16 @@ where it would be balanced. Derivatives are those of the balance, by the implici
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from ._namespace import as_array, is_traced
 from ._types import Scalar, State, VectorLike
 from .assembly import configuration, tangent_solve, tolerance
 from .rotations import norm
@@ -63,22 +63,30 @@ def equilibrium(
     if not system.plain:
         raise ValueError("Equilibria are of systems whose constraints are ideal and bind positions or velocities.")
     guess = system.guess if guess is None else guess
-    t = jnp.asarray(t, guess.q.dtype)
-    start, fixed, assembled = configuration(system, guess.q, fix, t, throw)
+    time: Any = as_array(t, guess.q.dtype)
+    start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
     held = tuple(np.flatnonzero(fixed).tolist())
-    u = jnp.zeros(system.nu, start.dtype)
-    speeds = jnp.concatenate([system.velocity_residual(t, start, u), system.rates(t, start, u)])
-    still = jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(start.dtype)
-    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((system, start, t)))
+    u = jax.device_put(np.zeros(system.nu, start.dtype))
+    still = _still(system, time, start, u)
+    concrete = not is_traced((system, start, time))
     if concrete and throw and not bool(still):
         raise ValueError("Something is driven at this time, and moves; give a time t at which it stands.")
-    q, unbalanced, ok = _balanced(system, t, start, held)
+    q, unbalanced, ok = _balanced(system, time, start, held)
     if concrete and throw and not bool(ok):
         raise ValueError(_not_found(system, unbalanced))
+    if throw and concrete:
+        return State(q, u)
     ok = ok & still & assembled
-    if throw and not concrete:
+    if throw:
         q = eqx.error_if(q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see what is loose.")
     return State(q if throw else jnp.where(ok, q, jnp.nan), u)
+
+
+@eqx.filter_jit
+def _still(system, t, q, u):
+    """Whether nothing is driven."""
+    speeds = jnp.concatenate([system.velocity_residual(t, q, u), system.rates(t, q, u)])
+    return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(q.dtype)
 
 
 class _Balance(eqx.Module):

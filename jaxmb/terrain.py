@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ._parts import number
+from ._parts import array, number
 from ._smooth import step
 from ._user import numbers
 
@@ -117,8 +117,8 @@ class Spline(AbstractTerrain):
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """
 
-    x: Float[Array, "n"] = eqx.field(converter=number, kw_only=True)
-    heights: Float[Array, "n"] = eqx.field(converter=number, kw_only=True)
+    x: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
+    heights: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
 
     def __check_init__(self):
         if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:

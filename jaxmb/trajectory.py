@@ -92,13 +92,14 @@ class Trajectory(eqx.Module):
             raise unknown("body", body, system.body_names)
         k = system.body_names.index(body)
         d = system.layout.space.dimension
-        pose = self.ys.q[:, [i for i in system.layout.pose_index[k] if i < system.nq]]
-        velocity = self.ys.u[:, [i for i in system.layout.velocity_index[k] if i < system.nu]]
+        # Entries of a body follow one another.
+        i, j = int(system.layout.pose_index[k][0]), int(system.layout.velocity_index[k][0])
+        position, velocity = self.ys.q[:, i : i + d], self.ys.u[:, j : j + d]
         if not system.layout.rotates[k]:
-            return BodyMotion(pose, velocity, None, None, None)
+            return BodyMotion(position, velocity, None, None, None)
         if d == 2:
-            return BodyMotion(pose[:, :2], velocity[:, :2], pose[:, 2], None, velocity[:, 2])
-        return BodyMotion(pose[:, :3], velocity[:, :3], None, pose[:, 3:], velocity[:, 3:])
+            return BodyMotion(position, velocity, self.ys.q[:, i + 2], None, self.ys.u[:, j + 2])
+        return BodyMotion(position, velocity, None, self.ys.q[:, i + 3 : i + 7], self.ys.u[:, j + 3 : j + 6])
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints."""

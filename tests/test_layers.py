@@ -11,7 +11,7 @@ ROOT = Path(jaxmb.__file__).parent
 
 # Lowest first; a layer may import from those before it, and from itself.
 LAYERS = [
-    ["_types", "_space", "_names", "_results", "rotations"],
+    ["_types", "_space", "_names", "_namespace", "_results", "rotations"],
     ["_smooth", "elimination", "orthogonal", "block_tridiagonal"],
     ["_parts", "_resolve"],
     ["_forces", "_friction", "_servo", "_user", "terrain", "contact", "planar", "spatial"],

@@ -1,10 +1,14 @@
 """A scene traces nothing that it does not need, and its program does not grow with the number of its bodies."""
 
+import contextlib
+import logging
+import re
 from collections import Counter
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.extend import core
 
@@ -136,3 +140,56 @@ def test_program_does_not_grow_with_the_number_of_bodies(what, manifold):
 
     few, many = lines(5), lines(50)
     assert abs(many - few) <= 0.1 * few, (few, many)
+
+
+class _Names(logging.Handler):
+    """Names of the programs that are compiled."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def emit(self, record):
+        found = re.match(r"Finished XLA compilation of (?:jit\()?(\w+)", record.getMessage())
+        if found:
+            self.names.add(found[1])
+
+
+@contextlib.contextmanager
+def compiled():
+    handler, logger = _Names(), logging.getLogger("jax._src.dispatch")
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield handler.names
+    finally:
+        logger.removeHandler(handler)
+
+
+def test_building_a_scene_compiles_nothing_but_its_analysis():
+    """Numbers of parts are worked out by NumPy: thousands of small programs would take minutes."""
+    jax.clear_caches()
+    axis = np.array([0.0, 0.6, 0.8])
+    with compiled() as names:
+        body = spatial.Body(
+            "rod",
+            mass=2.0,
+            inertia=spatial.cylinder(2.0, 0.1, 1.5, "x"),
+            position=(0.75, 0.0, 0.0),
+            orientation=(0.8, 0.0, 0.6, 0.0),
+        )
+        tip = spatial.PointMass("tip", mass=0.5, position=(1.0, 2.0, 0.5))
+        joints = [
+            spatial.Revolute("pin", "ground", "rod", point=(0.1, 0.2, 0.3), axis=axis),
+            spatial.Distance("wire", "rod", "tip", point_a=(0.5, 0.0, 0.0)),
+        ]
+        forces = [
+            mb.Gravity((0.0, 0.0, -9.81)),
+            spatial.SpringDamper("spring", "ground", "tip", stiffness=10.0),
+            spatial.TorsionalSpringDamper("coil", "ground", "rod", axis=axis, stiffness=3.0),
+        ]
+        system = mb.Scene([body, tip], joints=joints, forces=forces).compile()
+        stiffness = mb.parameters(mb.with_parameters(system, {"coil.stiffness": 4.0}))["coil.stiffness"]
+    assert float(stiffness) == 4.0
+    # Whether its joint and its spring turn the point mass is asked of themselves.
+    assert names == {"_analyse", "_felt"}

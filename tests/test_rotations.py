@@ -27,6 +27,17 @@ def test_against_scipy(p):
     )
 
 
+@pytest.mark.parametrize("name", ["cross", "rotate", "unrotate", "multiply", "rates", "pull_back"])
+def test_known_numbers_are_left_to_numpy(name):
+    function = getattr(rot, name)
+    sizes = {"cross": (3, 3), "multiply": (4, 4), "pull_back": (4, 4)}.get(name, (4, 3))
+    for _ in range(5):
+        a, b = (RNG.normal(size=size) for size in sizes)
+        known, traced = function(a, b), jax.jit(function)(a, b)
+        assert isinstance(known, np.ndarray)
+        np.testing.assert_allclose(known, traced, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize("p", UNIT[:3])
 def test_rates_and_angular_velocity(p):
     omega = jnp.asarray(RNG.normal(size=3))
@@ -56,6 +67,7 @@ def test_from_matrix_where_a_formula_degenerates(angles):
 
 def test_norm_at_zero():
     zero = jnp.zeros(3)
-    assert float(rot.norm(zero)) == 0.0
+    assert float(rot.norm(zero)) == float(rot.norm(np.zeros(3))) == 0.0
+    assert float(rot.norm(np.array([3.0, 0.0, -4.0]))) == 5.0
     np.testing.assert_array_equal(jax.grad(rot.norm)(zero), 0.0)
     np.testing.assert_allclose(jax.grad(rot.norm)(jnp.array([3.0, 0.0, 4.0])), [0.6, 0.0, 0.8], rtol=0, atol=1e-15)

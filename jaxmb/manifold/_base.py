@@ -1,10 +1,13 @@
 """What a manifold policy is: how the state stays on the constraints while it is integrated."""
 
 import abc
+from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 
+from .._namespace import as_array, namespace
 from .._types import Scalar
 from ..formulations import AbstractFormulation
 from ..system import AbstractSystem
@@ -21,3 +24,13 @@ class AbstractManifold(eqx.Module):
 
         **Raises:** `ValueError` for a solver that the policy cannot work with.
         """
+
+
+def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
+    """Size of the last Newton correction of positions relative to the system's size: as given, or tied to the tolerance
+    of integration.
+    """
+    dtype = jnp.result_type(float)
+    if given is not None:
+        return as_array(given, dtype)
+    return namespace(rtol).clip(1e-3 * rtol, 64 * float(jnp.finfo(dtype).eps), 1e-6)

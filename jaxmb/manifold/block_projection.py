@@ -12,7 +12,7 @@ from ..solvers import AbstractManifoldTerm, AbstractMultistep, Adams, ManifoldEv
 from ..system import AbstractSystem
 from ..system.chain import chain_of
 from ..system.corrector import corrector
-from ._base import AbstractManifold
+from ._base import AbstractManifold, newton_tolerance
 from .free import VectorField
 from .nearest import nearest
 from .projection import ProjectedSolver
@@ -52,9 +52,7 @@ class BlockProjection(AbstractManifold):
                 f"BlockProjection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() "
                 "with it."
             )
-        least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
-        tol = jnp.clip(1e-3 * rtol, least, 1e-6) if self.newton_tol is None else jnp.asarray(self.newton_tol)
-        return BlockTerm(system, formulation, tol), solver
+        return BlockTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
 
 
 class BlockTerm(AbstractManifoldTerm):

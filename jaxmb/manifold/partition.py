@@ -19,7 +19,7 @@ from ..formulations._base import check_mass, stages
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
-from ._base import AbstractManifold
+from ._base import AbstractManifold, newton_tolerance
 from .constrained import (
     Evaluation,
     Split,
@@ -80,9 +80,7 @@ class Partition(AbstractManifold):
             raise ValueError(
                 f"{type(formulation).__name__} finds no independent coordinates; use BlockProjection() with it."
             )
-        least = 64 * float(jnp.finfo(jnp.result_type(float)).eps)
-        tol = jnp.clip(1e-3 * rtol, least, 1e-6) if self.newton_tol is None else jnp.asarray(self.newton_tol)
-        return PartitionTerm(system, formulation, self.max_influence, tol), solver
+        return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
 
 
 class Chart(eqx.Module):

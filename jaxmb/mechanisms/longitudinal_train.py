@@ -1,13 +1,13 @@
 """Trains on a straight track in relative coordinates."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._parts import number
 from .._types import State, VectorLike
 from ..planar._space import PLANE
 from ._base import Mechanism, build, mechanism
@@ -54,11 +54,13 @@ def longitudinal_train(
     **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.
     """
     check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
+    array = lambda value: jnp.asarray(value, jnp.result_type(float))
     mass, speed, brake = (
-        number(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
+        array(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
     )
-    extension = number(of_each("extension", extension, n - 1))
-    gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, jnp.zeros((2, 3)))
+    extension = array(of_each("extension", extension, n - 1))
+    apart: Any = np.zeros((2, 3))
+    gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, apart)
     numbers = {
         "resistance": davis(resistance) | {"transition": transition},
         "brake": {
@@ -73,10 +75,10 @@ def longitudinal_train(
         mass=mass,
         couplers=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n - 1, *leaf.shape)), gear),
         law=_law,
-        numbers=jax.tree.map(number, numbers),
-        slope=number(gravity * np.sin(np.arctan(grade))),
+        numbers=jax.tree.map(array, numbers),
+        slope=array(gravity * np.sin(np.arctan(grade))),
         guess=State(jnp.append(0.0, extension), jnp.concatenate([speed[:1], speed[:-1] - speed[1:]])),
-        length=number(spacing),
+        length=array(spacing),
     )
     return build(
         "longitudinal_train",

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import planar
 from .._forces import Gravity
-from .._parts import AbstractForce, number
+from .._parts import AbstractForce, array, number
 from .._types import VectorLike
 from .._user import Force
 from ..scene import Scene
@@ -88,8 +88,8 @@ def train(
         for name, m, j, x, v in zip(names, mass, inertia, place, speed, strict=True)
     ]
     # Numbers that all vehicles share are made arrays once.
-    shared = lambda **numbers: {name: number(value) for name, value in numbers.items()}
-    ends = shared(point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
+    shared = lambda kind, **numbers: {name: kind(value) for name, value in numbers.items()}
+    ends = shared(number, point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
     couplers = [
         coupler(f"coupler{k}", front, rear, **ends) for k, (front, rear) in enumerate(itertools.pairwise(names), 1)
     ]
@@ -100,7 +100,9 @@ def train(
     if suspension > 0 or grade:
         forces.append(Gravity((-gravity * np.sin(slope), -gravity * np.cos(slope) if suspension > 0 else 0.0)))
     if suspension > 0:
-        spring = shared(stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0)
+        spring = shared(
+            number, stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0
+        )
         ahead, behind = number((wheelbase / 2, 0.0)), number((-wheelbase / 2, 0.0))
         free = mass * gravity * np.cos(slope) / (2 * suspension)
         forces += [
@@ -116,10 +118,10 @@ def train(
             for end, point in (("a", ahead), ("b", behind))
         ]
     if np.any(resistance):
-        numbers = shared(**davis(resistance), transition=transition)
+        numbers = shared(array, **davis(resistance), transition=transition)
         forces += [Force(f"resistance{k}", name, _resistance, parameters=numbers) for k, name in enumerate(names, 1)]
     if np.any(brake):
-        numbers = shared(rise=brake_rise, transition=transition)
+        numbers = shared(array, rise=brake_rise, transition=transition)
         forces += [
             Force(
                 f"brake{k}",

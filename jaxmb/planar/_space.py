@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from .._namespace import namespace
 from .._space import AbstractSpace
 
 
@@ -61,17 +62,18 @@ def _prepared(pose):
 
 
 def _cos_sin(pose):
-    return (pose[3], pose[4]) if _prepared(pose) else (jnp.cos(pose[2]), jnp.sin(pose[2]))
+    xp = namespace(pose)
+    return (pose[3], pose[4]) if _prepared(pose) else (xp.cos(pose[2]), xp.sin(pose[2]))
 
 
 def _turned(pose, v):
     c, s = _cos_sin(pose)
-    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+    return namespace(pose, v).stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
 def _turned_back(pose, v):
     c, s = _cos_sin(pose)
-    return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
+    return namespace(pose, v).stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
 
 
 PLANE = PlanarSpace()

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._parts import AbstractPart, number
@@ -37,10 +37,10 @@ class Body(AbstractPart):
             vector(self, field, getattr(self, field)[None], 1)
 
     def pose(self):
-        return jnp.concatenate([self.position, self.angle[None]])
+        return np.append(self.position, self.angle)
 
     def velocities(self):
-        return jnp.concatenate([self.velocity, self.angular_velocity[None]])
+        return np.append(self.velocity, self.angular_velocity)
 
 
 class PointMass(AbstractPart):

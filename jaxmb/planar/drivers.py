@@ -5,6 +5,7 @@ from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._parts import AbstractConstraint, optional_number
@@ -55,7 +56,7 @@ class Driver(AbstractConstraint):
             return self
         part = self
         for field in ("point_a", "point_b"):
-            part = fill(part, field, jnp.zeros(2))
+            part = fill(part, field, np.zeros(2))
             vector(part, field, getattr(part, field), 2)
         return part
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from .._parts import AbstractConstraint, number, optional_number
 from .._resolve import fill, label, point_pair, positive, unit, vector
 from .._types import Scalar
+from .._user import numbers
 from ..rotations import norm
 
 
@@ -202,9 +203,7 @@ class PointOnCurve(AbstractConstraint):
     body_b: str = eqx.field(static=True)
     curve: Callable[[Float[Array, "2"], Any], Scalar] = eqx.field(static=True)
     point_b: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    parameters: dict[str, Array] = eqx.field(
-        converter=lambda d: {k: number(v) for k, v in d.items()}, default_factory=dict, kw_only=True
-    )
+    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 

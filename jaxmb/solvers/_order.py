@@ -9,9 +9,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-# How much of the deviation from the target the next step is to make up for. From measuring evaluations against true
-# error, on Kepler's problem, the Pleiades and Arenstorf's orbit; it matters little over wide ranges, but a strong
-# preference for an unchanged step costs 10-20%.
+# The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
+# orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
+# How the step of the order below, and of the order above, counts against that of the present order.
+LOWER, _UPPER = 0.98, 0.95
+# How much of the deviation from the target the next step is to make up for.
 GAIN = 0.85
 
 
@@ -52,7 +54,6 @@ def choose_order(
     may_rise: Bool[Array, ""],
     known: Bool[Array, ""],
     target: float,
-    preference: tuple[float, float],
     work: Int[Array, "2"],
     limit: Any = np.inf,
     bounded: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None,
@@ -68,7 +69,6 @@ def choose_order(
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
     - `known`: whether there are points enough for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
-    - `preference`: how the step that the lower, and the higher formula allows counts against that of the present one.
     - `work`, `limit`: as in `StepEstimate`.
     - `bounded`: makes factors by which steps may grow, for the three formulas, those that stability allows.
 
@@ -80,9 +80,9 @@ def choose_order(
     retry = factors[1]
     factors = factors if bounded is None else bounded(factors)
     zero = jnp.zeros((), dtype)
-    lower = jnp.where(may_fall, preference[0] * factors[0], zero)
+    lower = jnp.where(may_fall, LOWER * factors[0], zero)
     same = factors[1]
-    higher = jnp.where(may_rise & known, preference[1] * factors[2], zero)
+    higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
     # With every point since the start in use there is no estimate for the next order, but it is better as a rule.
     opening = may_rise & ~known & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))

@@ -20,10 +20,8 @@ from ._order import GAIN, choose_order
 from ._stiffness import Stiffness, none_found, observed
 from ._tolerances import Tolerances, norm_of
 
-# The error that a step aims at, in units of the tolerance, and how the steps that the orders below and above allow count
-# against that of the present order: from measuring evaluations against true error, on a four-bar, Kepler's problem, the
-# Pleiades and Arenstorf's orbit. They matter little over wide ranges; a strong preference for low orders costs 10-20%.
-_TARGET, _PREFERENCE = 0.1, (0.97, 0.97)
+# The error that a step aims at, in units of the tolerance.
+_TARGET = 0.2
 # Evaluations and matrices of a step.
 _WORK = np.array([2, 0], np.int32)
 # The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
@@ -187,7 +185,6 @@ class Adams(AbstractMultistep):
             may_rise=order < self.max_order,
             known=order < history.points,
             target=_TARGET,
-            preference=_PREFERENCE,
             work=jnp.asarray(_WORK),
         )
         y1 = unravel_like(y0, after)

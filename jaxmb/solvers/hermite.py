@@ -21,14 +21,13 @@ from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
-from ._order import GAIN, choose_order, growth_factors
+from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._tolerances import Tolerances
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
 _NEWTON = 0.01
-# The error that a step aims at, in units of the tolerance, and how the steps that the formulas below and above allow
-# count against that of the present one.
-_TARGET, _PREFERENCE = 0.05, (0.98, 0.95)
+# The error that a step aims at, in units of the tolerance.
+_TARGET = 0.05
 
 
 class HermiteState(eqx.Module):
@@ -218,7 +217,6 @@ class Hermite(AbstractMultistep):
             may_rise=(k < self.points[-1]) & (family.multiplicity * (around[2] - 1) <= history.points),
             known=family.multiplicity * (around[2] + 1) <= history.points,
             target=_TARGET,
-            preference=_PREFERENCE,
             work=newton.work,
             limit=jnp.asarray((1.0, *family.growth), dtype)[k],
             bounded=bounded,
@@ -226,7 +224,7 @@ class Hermite(AbstractMultistep):
         points = around[1 + change]
         if self._stable is not None:
             # Between here and there may be formulas for which this step is of just the wrong length.
-            growth = _PREFERENCE[0] * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
+            growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
             better = (k > self._stable) & (growth > estimate.growth)
             points = jnp.where(better, candidates[3], points)
             estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))

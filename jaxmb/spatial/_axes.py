@@ -5,11 +5,11 @@ Quantities "in A" are components in the axes of the first body of the part.
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .. import rotations as rot
+from .._namespace import namespace
 from .._resolve import fill, label, unit, vector
 
 Vector3 = Float[Array, "3"]
@@ -21,11 +21,12 @@ def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     They are worked out from `axis` wherever they are needed, so that derivatives with respect to `axis` are right.
     """
     # The coordinate axis least parallel to `axis` (no single one serves them all): a choice without derivative.
-    k = jnp.argmin(jnp.abs(jax.lax.stop_gradient(axis)))
+    xp = namespace(axis)
+    k = xp.argmin(abs(axis if xp is np else jax.lax.stop_gradient(axis)))
     skew = rot.skew(axis)
-    u = jnp.sum(skew * (jnp.arange(3) == k).astype(axis.dtype)[:, None], axis=0)
-    u = u / jnp.sqrt(jnp.sum(u * u))
-    return jnp.stack([u, jnp.sum(skew * u[None, :], axis=1)])
+    u = (skew * (np.arange(3) == k).astype(axis.dtype)[:, None]).sum(axis=0)
+    u = u / xp.sqrt((u * u).sum())
+    return xp.stack([u, (skew * u[None, :]).sum(axis=1)])
 
 
 def direction_in_a(space, poses: Float[Array, "k p"], v_b: Vector3) -> Vector3:
@@ -56,14 +57,14 @@ def cosine_sine(space, part, poses: Float[Array, "k p"]) -> tuple[Float[Array, "
     """
     x = direction_in_a(space, poses, part.x_b)
     y_a = rot.cross(part.axis_a, part.x_a)
-    return jnp.dot(rot.cross(y_a, part.axis_a), x), jnp.dot(y_a, x)
+    return rot.cross(y_a, part.axis_a) @ x, y_a @ x
 
 
 def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
     """The angle [rad] from `x_a` to `x_b` about `axis_a`, in (−π, π]; zero where it is undefined."""
     c, s = cosine_sine(space, part, poses)
-    defined = c * c + s * s > 0
-    return jnp.where(defined, jnp.arctan2(s, jnp.where(defined, c, 1.0)), 0.0)
+    defined, xp = c * c + s * s > 0, namespace(c, s)
+    return xp.where(defined, xp.arctan2(s, xp.where(defined, c, 1.0)), 0.0)
 
 
 def resolve_axis(part, space, poses: Float[Array, "k p"]):
@@ -90,7 +91,7 @@ def resolve_references(part, space, poses: Float[Array, "k p"]):
         part = fill(part, "x_a", x_a)
         return fill(part, "x_b", space.body_direction(poses[1], space.direction(poses[0], x_a)))
     x_a, x_b = unit(part, "x_a", part.x_a, 3), unit(part, "x_b", part.x_b, 3)
-    if abs(float(jnp.dot(x_a, part.axis_a))) > 1e-6:
+    if abs(float(x_a @ part.axis_a)) > 1e-6:
         raise ValueError(f"{label(part)}: x_a must be perpendicular to axis_a, got {np.asarray(x_a)}.")
     return eqx.tree_at(lambda p: (p.x_a, p.x_b), part, (x_a, x_b))
 

@@ -66,11 +66,11 @@ def _matrix(pose):
 
 def _turned(pose, v):
     # Written out: a batched dot of 3 × 3 blocks costs a library call, a sum of products fuses.
-    return jnp.sum(_matrix(pose) * v[None, :], axis=1)
+    return (_matrix(pose) * v[None, :]).sum(axis=1)
 
 
 def _turned_back(pose, v):
-    return jnp.sum(_matrix(pose) * v[:, None], axis=0)
+    return (_matrix(pose) * v[:, None]).sum(axis=0)
 
 
 SPACE = SpatialSpace()

@@ -3,11 +3,11 @@
 from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .. import rotations as rot
+from .._namespace import namespace
 from .._parts import AbstractPart, number
 from .._resolve import label, positive, vector
 from ._axes import unit_euler
@@ -18,7 +18,7 @@ Axis = Literal["x", "y", "z"]
 def inertia_matrix(value: Any) -> Array:
     """An inertia matrix from itself or from its diagonal."""
     value = number(value)
-    return jnp.diag(value) if value.shape == (3,) else value
+    return namespace(value).diag(value) if value.shape == (3,) else value
 
 
 class Body(AbstractPart):
@@ -54,10 +54,10 @@ class Body(AbstractPart):
         unit_euler(self, "orientation", self.orientation)
 
     def pose(self):
-        return jnp.concatenate([self.position, rot.normalize(self.orientation)])
+        return np.append(self.position, rot.normalize(self.orientation))
 
     def velocities(self):
-        return jnp.concatenate([self.velocity, self.angular_velocity])
+        return np.append(self.velocity, self.angular_velocity)
 
 
 def _check_inertia(body: Body) -> None:
@@ -114,7 +114,8 @@ def _axial(along: Any, across: Any, axis: Axis) -> Float[Array, "3 3"]:
         raise ValueError(f"axis must be one of {get_args(Axis)}, got {axis!r}.")
     moments = [number(across)] * 3
     moments["xyz".index(axis)] = number(along)
-    return jnp.diag(jnp.stack(moments))
+    xp = namespace(*moments)
+    return xp.diag(xp.stack(moments))
 
 
 def rod(mass: float, length: float, axis: Axis = "x", *, radius: float = 0.0) -> Float[Array, "3 3"]:
@@ -134,12 +135,14 @@ def disc(mass: float, radius: float, axis: Axis = "z") -> Float[Array, "3 3"]:
 def box(mass: float, x: float, y: float, z: float) -> Float[Array, "3 3"]:
     """Inertia [kg m²] of a uniform box with edges of lengths `x`, `y`, `z` [m] along the axes, about its centre."""
     x2, y2, z2 = number(x) ** 2, number(y) ** 2, number(z) ** 2
-    return jnp.diag(number(mass) / 12 * jnp.stack([y2 + z2, z2 + x2, x2 + y2]))
+    moments = number(mass) / 12 * namespace(x2, y2, z2).stack([y2 + z2, z2 + x2, x2 + y2])
+    return namespace(moments).diag(moments)
 
 
 def sphere(mass: float, radius: float) -> Float[Array, "3 3"]:
     """Inertia [kg m²] of a uniform solid sphere about its centre, `2 m r² / 5`."""
-    return jnp.diag(jnp.full(3, 2 * number(mass) * number(radius) ** 2 / 5))
+    moment = 2 * number(mass) * number(radius) ** 2 / 5
+    return moment * np.eye(3, dtype=moment.dtype)
 
 
 def cylinder(mass: float, radius: float, length: float, axis: Axis = "z") -> Float[Array, "3 3"]:

@@ -5,6 +5,7 @@ from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._parts import AbstractConstraint, optional_number
@@ -69,7 +70,7 @@ class Driver(AbstractConstraint):
             return resolve_references(resolve_axis(self, space, poses), space, poses)
         part = self
         for field in ("point_a", "point_b"):
-            part = fill(part, field, jnp.zeros(3))
+            part = fill(part, field, np.zeros(3))
             vector(part, field, getattr(part, field), 3)
         return part
 

@@ -138,7 +138,7 @@ class Universal(AbstractConstraint):
             else:
                 axes.append(space.body_direction(poses[k], unit(part, field + "_W", world, 3)))
         if part.axis_a_W is not None and part.axis_b_W is not None:
-            cosine = float(jnp.dot(part.axis_a_W, part.axis_b_W))
+            cosine = float(part.axis_a_W @ part.axis_b_W)
             if abs(cosine) > 1e-6:
                 raise ValueError(
                     f"{label(part)}: axis_a_W and axis_b_W must be perpendicular, their product is {cosine:.6g}."
@@ -220,7 +220,7 @@ class Screw(AbstractConstraint):
             raise ValueError(f"{label(self)}: pitch must not be zero; use Revolute for a screw that does not advance.")
         part = resolve_references(axis_pair(point_pair(self, space, poses), space, poses), space, poses)
         advance = part.pitch * angle(space, part, poses) / (2 * np.pi)
-        return fill(part, "offset", jnp.dot(part.axis_a, shift_in_a(space, part, poses)) - advance)
+        return fill(part, "offset", part.axis_a @ shift_in_a(space, part, poses) - advance)
 
     def residual(self, space, poses, t):
         shift = shift_in_a(space, self, poses)

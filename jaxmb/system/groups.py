@@ -42,20 +42,20 @@ def stack(parts: Sequence[tuple[AbstractPart, tuple[int, ...]]], layout: Layout)
     """Group parts that share type, static fields and shapes; order of first appearance."""
     groups: dict[Any, list] = {}
     for part, bodies in parts:
-        leaves, structure = jtu.tree_flatten(_anonymous(part))
+        leaves, structure = jtu.tree_flatten(anonymous(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
         groups.setdefault(key, []).append((leaves, part.name, bodies))
     out = []
     for (structure, _, _), members in groups.items():
         # By NumPy: thousands of operands make a program of their own for XLA.
         columns = zip(*(member[0] for member in members), strict=True)
-        leaves = [jnp.asarray(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
+        leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
         out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout))
     return tuple(out)
 
 
-def _anonymous(part: AbstractPart) -> AbstractPart:
+def anonymous(part: AbstractPart) -> AbstractPart:
     """The part without the names that tell it from its siblings."""
     out = object.__new__(type(part))
     for field in part.__dataclass_fields__:
@@ -65,7 +65,7 @@ def _anonymous(part: AbstractPart) -> AbstractPart:
         elif field == "bodies":
             value = ("",) * len(value)
         elif isinstance(value, AbstractPart):
-            value = _anonymous(value)
+            value = anonymous(value)
         object.__setattr__(out, field, value)
     return out
 

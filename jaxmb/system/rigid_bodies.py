@@ -356,7 +356,7 @@ class RigidBodySystem(AbstractSystem):
         for body in index[:-1]:
             for k in body[: self.layout.space.dimension]:
                 translation[k] = True
-        return jnp.where(jnp.array(translation), length, 1.0)
+        return jnp.where(np.array(translation), length, 1.0)
 
 
 class _MixedInertia(AbstractInertia):
