@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ._namespace import is_traced
 from ._space import AbstractSpace
 from ._types import Scalar
 
@@ -34,7 +35,7 @@ def number(value: Any) -> Any:
     """A strongly typed float array: JAX's of a traced value, otherwise a constant one of NumPy's, so that nothing is
     compiled to build a scene.
     """
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return jnp.asarray(value, dtype=jnp.result_type(float))
     given = np.asarray(value)
     if given.dtype.kind not in "fiub":

@@ -2,17 +2,21 @@
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
 components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p`
-are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`.
+are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`. What is made of NumPy's
+arrays alone is NumPy's.
 
 Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the Dynamic Analysis of Three-Dimensional
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
 """
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ._namespace import namespace
+from ._namespace import as_array, namespace
 from ._types import Scalar, VectorLike
 
 # Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would
@@ -137,23 +141,25 @@ def normalize(p: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
 
 def from_axis_angle(axis: VectorLike, angle: Scalar) -> Float[Array, "4"]:
     """Euler parameters of a turn by `angle` [rad] about the unit vector `axis`."""
-    axis, half = jnp.asarray(axis, float), jnp.asarray(angle, float) / 2
-    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+    dtype = jnp.result_type(float)
+    axis, half = as_array(axis, dtype), as_array(angle, dtype) / 2
+    xp = namespace(axis, half)
+    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * axis]))
 
 
 def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
     """Euler parameters of a rotation matrix (body to world), with the best conditioned of the four formulas."""
-    R = jnp.asarray(R, float)
-    t = jnp.trace(R)
-    squares = jnp.concatenate([(1.0 + t)[None], 1.0 + 2.0 * jnp.diag(R) - t])  # 4 e_k²
-    antisymmetric = jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    symmetric = R + R.T
-    columns = jnp.zeros((4, 4), R.dtype)  # columns[k] = 4 e_k (e0, e1, e2, e3)
-    columns = columns.at[0, 1:].set(antisymmetric).at[1:, 0].set(antisymmetric)
-    columns = columns.at[1:, 1:].set(symmetric - jnp.diag(jnp.diag(symmetric)))
-    columns = columns + jnp.diag(squares)
-    k = jnp.argmax(squares)
-    return normalize(columns[k])
+    matrix: Any = as_array(R, jnp.result_type(float))
+    xp, t = namespace(matrix), matrix.trace()
+    squares = xp.concatenate([(1.0 + t)[None], 1.0 + 2.0 * xp.diag(matrix) - t])  # 4 e_k²
+    difference = matrix - matrix.T
+    antisymmetric = xp.stack([difference[2, 1], difference[0, 2], difference[1, 0]])
+    symmetric = matrix + matrix.T
+    symmetric = symmetric + xp.diag(squares[1:] - xp.diag(symmetric))
+    # columns[k] = 4 e_k (e0, e1, e2, e3)
+    columns = xp.concatenate([antisymmetric[:, None], symmetric], axis=1)
+    columns = xp.concatenate([xp.concatenate([squares[:1], antisymmetric])[None], columns])
+    return jax.device_put(normalize(columns[xp.argmax(squares)]))
 
 
 def to_xyzw(p: Float[ArrayLike, "... 4"]) -> Float[Array, "... 4"]:

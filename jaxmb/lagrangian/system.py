@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from .._parts import array
 from .._types import Scalar, State, VectorLike
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system._base import Ranks
@@ -93,7 +95,6 @@ class LagrangianSystem(AbstractSystem):
         coordinates: Sequence[str] | None = None,
         length: VectorLike = 1.0,
     ):
-        number = lambda x: jnp.asarray(x, jnp.result_type(float))
         self.lagrangian = _lagrangian(lagrangian, kinetic, potential)
         self.applied = force
         # Φ, then the rest of ψ, then rows that bind accelerations only.
@@ -101,15 +102,15 @@ class LagrangianSystem(AbstractSystem):
         self.nonideal = tuple(nonideal)
         self.kinematics = Rates() if kinematics is None else kinematics
         self.equations = Projected() if equations is None else equations
-        self.parameters = {name: number(value) for name, value in (parameters or {}).items()}
-        self.length = number(length)
+        self.parameters = {name: array(value) for name, value in (parameters or {}).items()}
+        self.length = array(length)
         check_names(self.constraints)
 
-        q = number(q)
+        q = array(q)
         if q.ndim != 1:
             raise ValueError(f"q is a vector, got shape {q.shape}.")
         nu = self.kinematics.count(q.size)
-        self.guess = State(q, jnp.zeros(nu, q.dtype) if u is None else number(u))
+        self.guess = State(q, array(np.zeros(nu)) if u is None else array(u))
         if self.guess.u.shape != (nu,):
             raise ValueError(f"The system has {nu} velocities, got u of shape {self.guess.u.shape}.")
         self.coordinates = tuple(f"q{k}" for k in range(q.size)) if coordinates is None else tuple(coordinates)
@@ -303,6 +304,7 @@ class LagrangianSystem(AbstractSystem):
 
     # Energy
 
+    @eqx.filter_jit
     def kinetic_energy(self, t, q, u):
         """`q̇ · ∂L/∂q̇ − L` without the potential energy: the kinetic energy, if L is quadratic in q̇."""
         t = jnp.asarray(t, q.dtype)
@@ -310,6 +312,7 @@ class LagrangianSystem(AbstractSystem):
         energy = v @ self.momentum(t, q, v) - self.lagrangian(t, q, v, self.parameters)
         return energy - self.potential_energy(t, q)
 
+    @eqx.filter_jit
     def potential_energy(self, t, q):
         """`−L(t, q, 0)`."""
         return -self.lagrangian(t, q, jnp.zeros_like(q), self.parameters)

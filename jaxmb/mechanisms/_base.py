@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -200,6 +201,7 @@ def build(
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
+    observe = eqx.filter_jit(observe)
     return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start, beside)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import planar
+from .._parts import array
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
 from ..scene import Scene
 from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
@@ -50,12 +51,11 @@ def three_platform_snake(
         raise ValueError(f"The forms are connection, constraints; got {form!r}.")
     rigid = of_bodies(model, form=form == "connection", equations=equations is None)
     parameters = {"mass": mass, "inertia": inertia, "half": half}
-    numbers = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in parameters.items()}
-    shape, turning = jnp.asarray(angles, jnp.result_type(float)), jnp.asarray(rates, jnp.result_type(float))
+    numbers = {name: array(value) for name, value in parameters.items()}
+    shape, turning = array(angles), array(rates)
     if gait is not None:
         shape, turning = jax.jvp(gait, (jnp.zeros(()),), (jnp.ones(()),))
-    q = jnp.concatenate([jnp.zeros(3), shape])
-    v = jnp.concatenate([-_connection(0.0, q, numbers) @ turning, turning])
+    q, v = _without_slip(shape, turning, numbers)
     if rigid:
         system = _bodies(numbers, q, v, gait)
     else:
@@ -134,6 +134,13 @@ def _platforms(q, half):
     along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=1)
     steps = half * (along[:-1] + along[1:])
     return jnp.stack([q[:2] - steps[0], q[:2], q[:2] + steps[1]]), headings
+
+
+@jax.jit
+def _without_slip(shape, turning, p):
+    """Coordinates and their rates, the middle platform at the origin."""
+    q = jnp.concatenate([jnp.zeros(3, shape.dtype), shape])
+    return q, jnp.concatenate([-_connection(0.0, q, p) @ turning, turning])
 
 
 def _kinetic(t, q, v, p):

@@ -313,9 +313,11 @@ class RigidBodySystem(AbstractSystem):
 
     # Energy and momentum
 
+    @eqx.filter_jit
     def kinetic_energy(self, t, q, u):
         return 0.5 * jnp.dot(u, self.inertia(t, q, u).product(u))
 
+    @eqx.filter_jit
     def potential_energy(self, t, q):
         poses = self.prepared_poses(q)
         energy = sum((g.energy(t, poses) for g in self.forces), start=jnp.zeros((), q.dtype))
