@@ -170,31 +170,40 @@ def _end(mu, t1, rtol, adjoint, mesh=None):
     return solution.ys[-1] @ jnp.array([1.0, 100.0])
 
 
-def _both(mus, *args):
-    """The derivatives with respect to μ by forward and by reverse mode."""
+def _by_both_modes(mesh=None):
+    """Functions of several μ, the end and the tolerance: the derivatives with respect to μ, with the values, by forward
+    mode, and the derivatives by reverse mode.
+    """
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
-    forward = jit_as_users_do(jax.vmap(jax.jacfwd(lambda mu: _end(mu, *args[:2], diffrax.ForwardMode(), *args[2:]))))
-    reverse = jit_as_users_do(jax.vmap(jax.grad(lambda mu: _end(mu, *args[:2], adjoint, *args[2:]))))
-    return forward(mus), reverse(mus)
+    twice = lambda mu, *args: (_end(mu, *args, diffrax.ForwardMode(), mesh),) * 2
+    single = lambda mu, *args: _end(mu, *args, adjoint, mesh)
+    of_each = lambda function: jit_as_users_do(jax.vmap(function, in_axes=(0, None, None)))
+    return of_each(jax.jacfwd(twice, has_aux=True)), of_each(jax.grad(single))
+
+
+@pytest.fixture(scope="module")
+def by_both_modes():
+    return _by_both_modes()
 
 
 def test_forward_and_reverse_on_the_same_mesh():
     """To rounding: step sizes that follow from error estimates feel the rounding by which two programs differ."""
     mesh = np.append(0.0, np.geomspace(1e-5, 70.0, 150))
-    along, against = _both(jnp.array([100.0, 120.0]), 70.0, 1e-11, mesh)
+    forward, reverse = _by_both_modes(mesh)
+    motions = np.array([100.0, 120.0]), 70.0, 1e-11
+    along, against = forward(*motions)[0], reverse(*motions)
     np.testing.assert_allclose(against, along, rtol=1e-13)
 
 
 @pytest.mark.parametrize(
     "t1, mus, rtol, same, h", [(70.0, (100.0, 120.0), 3e-13, 1e-10, 0.1), (100.0, (100.0, 55.0), 1e-11, 1e-8, 0.01)]
 )
-def test_forward_reverse_and_central_differences(t1, mus, rtol, same, h):
+def test_forward_reverse_and_central_differences(by_both_modes, t1, mus, rtol, same, h):
     """Before the first jump, and after one or two."""
-    mus = jnp.array(mus)
-    along, against = _both(mus, t1, rtol)
+    (forward, reverse), mus = by_both_modes, np.array(mus)
+    along, against = forward(mus, t1, rtol)[0], reverse(mus, t1, rtol)
     np.testing.assert_allclose(against, along, rtol=same)
-    tight = jax.jit(jax.vmap(lambda mu: _end(mu, t1, 1e-13, diffrax.ForwardMode())))
-    values = [tight(mus + k * h) for k in (1.0, -1.0, 2.0, -2.0)]
+    values = [forward(mus + k * h, t1, 1e-13)[1] for k in (1.0, -1.0, 2.0, -2.0)]
     central = (8 * (values[0] - values[1]) - (values[2] - values[3])) / (12 * h)
     np.testing.assert_allclose(along, central, rtol=1e-5)
 
