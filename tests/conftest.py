@@ -1,6 +1,5 @@
 import gc
 import os
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -34,19 +33,9 @@ def pytest_configure(config):
         os.environ[name.upper()] = str(value)
 
 
-# A process may have 65530 memory maps, some for each compiled program, and each stands for a quarter of a megabyte.
-_MANY_MAPS = 15_000
-
-
-def memory_maps() -> int:
-    maps = Path("/proc/self/maps")
-    return maps.read_bytes().count(b"\n") if maps.exists() else _MANY_MAPS
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _forget_programs():
-    """Forget the compiled programs of other modules before there are too many."""
+    """Give back the memory maps of a module's compiled programs: a process may have 65530 of them and no more."""
     yield
-    if memory_maps() >= _MANY_MAPS:
-        eqx.clear_caches()
-        jax.clear_caches()
+    eqx.clear_caches()
+    jax.clear_caches()

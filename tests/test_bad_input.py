@@ -44,6 +44,7 @@ REFUSED = {
     "spatial body in the plane": (lambda: mb.Scene([bar(), SPATIAL]), "body.*is spatial.*scene is planar"),
     "mass": (lambda: mb.Scene([bar(mass=0.0)]).compile(), "bar.*mass must be positive"),
     "inertia": (lambda: mb.Scene([bar(inertia=-1.0)]).compile(), "bar.*inertia must be positive"),
+    "complex mass": (lambda: bar(mass=1.0 + 1.0j), "expected a real number"),
     "not finite": (lambda: mb.Scene([bar(position=(np.nan, 0.0))]).compile(), "bar.*position must be finite"),
     "triangle inequality": (
         lambda: mb.Scene([spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 3.0))]).compile(),
