@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 
 def namespace(*arrays: Any) -> ModuleType:
@@ -20,5 +21,17 @@ def is_traced(tree: Any) -> bool:
 
 
 def as_array(value: Any, dtype: Any) -> Any:
-    """An array of NumPy's, or one of JAX's if anything in it is traced."""
-    return (jnp if is_traced(value) else np).asarray(value, dtype)
+    """A new array of NumPy's, or one of JAX's if anything in it is traced.
+
+    New, since `jax.device_put` shares the memory of what it is given: what its owner changes later must not follow.
+    """
+    return jnp.asarray(value, dtype) if is_traced(value) else np.array(value, dtype)
+
+
+def replaced(array: Array, index: Any, value: Any) -> Array:
+    """The array with other entries at an index."""
+    if is_traced((array, value)):
+        return array.at[index].set(value)
+    new = np.array(array)
+    new[index] = value
+    return jax.device_put(new)

@@ -12,10 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ._namespace import is_traced
+from ._namespace import as_array, is_traced
 from ._space import AbstractSpace
 from ._types import Scalar
 
@@ -35,22 +34,20 @@ def number(value: Any) -> Any:
     """A strongly typed float array: JAX's of a traced value, otherwise a constant one of NumPy's, so that nothing is
     compiled to build a scene.
     """
-    if is_traced(value):
-        return jnp.asarray(value, dtype=jnp.result_type(float))
-    given = np.asarray(value)
-    if given.dtype.kind not in "fiub":
+    if not is_traced(value) and np.asarray(value).dtype.kind not in "fiub":
         raise ValueError(f"expected a real number or an array of real numbers, got {value!r}")
-    constant = np.array(given, dtype=jax.dtypes.canonicalize_dtype(float))
-    constant.flags.writeable = False
-    return constant
+    out = as_array(value, jnp.result_type(float))
+    if isinstance(out, np.ndarray):
+        out.flags.writeable = False
+    return out
 
 
 def array(value: Any) -> Array:
     """The same as an array of JAX's: for functions that may index it by what is traced."""
-    if isinstance(value, Array) and value.dtype == jax.dtypes.canonicalize_dtype(float) and not value.aval.weak_type:
+    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
         return value
     value = number(value)
-    return value if isinstance(value, Tracer) else jax.device_put(value)
+    return value if isinstance(value, Array) else jax.device_put(value)
 
 
 def optional_number(value: Any) -> Any:

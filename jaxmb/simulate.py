@@ -12,7 +12,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-from ._namespace import as_array
+from ._namespace import as_array, is_traced
 from ._results import RESULTS
 from ._types import Scalar, State
 from .elimination import full_pivot
@@ -217,7 +217,7 @@ def _integrate(
 def _named(name: str, state: State) -> Adams:
     if name not in ("auto", "switch"):
         raise ValueError(f"A solver is an object, or one of the words 'auto' and 'switch'; got {name!r}.")
-    if name == "switch" and any(isinstance(x, Tracer) for x in jax.tree.leaves(state)):
+    if name == "switch" and is_traced(state):
         raise ValueError(
             "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
             "once with solver='auto', outside, and then choose Adams() or Hermite()."

@@ -65,6 +65,24 @@ def test_from_matrix_where_a_formula_degenerates(angles):
     np.testing.assert_allclose(rot.rotation_matrix(rot.from_matrix(R)), R, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("function", [rot.from_matrix, lambda x: rot.from_axis_angle(x[0], x[1, 0])])
+@pytest.mark.parametrize("largest", range(4))
+def test_derivatives_of_euler_parameters(function, largest):
+    """Forward and reverse mode and central differences, with each formula for a rotation matrix."""
+    p = rot.normalize(jnp.eye(4)[largest] + 0.3 * UNIT[largest])
+    R, along = rot.rotation_matrix(p), jnp.asarray(RNG.normal(size=(3, 3)))
+    assert np.argmax(np.abs(rot.from_matrix(R))) == largest
+    forward = jax.jit(lambda R: jax.jvp(function, (R,), (along,))[1])(R)
+    reverse = jnp.sum(jax.jit(jax.jacrev(function))(R) * along[None], axis=(1, 2))
+    h = 1e-3
+    value = lambda k: np.asarray(function(R + k * h * along))
+    central = (8 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / (12 * h)
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(central, forward, rtol=0, atol=1e-9)
+    batch = jax.jit(jax.vmap(function))(jnp.stack([R, R + h * along]))
+    np.testing.assert_allclose(batch, np.stack([value(0.0), value(1.0)]), rtol=0, atol=1e-15)
+
+
 def test_norm_at_zero():
     zero = jnp.zeros(3)
     assert float(rot.norm(zero)) == float(rot.norm(np.zeros(3))) == 0.0

@@ -114,6 +114,32 @@ def test_other_numbers_do_not_compile_anew(rod):
     assert len(traces) == 1 and np.all(np.isfinite(values))
 
 
+def test_what_was_given_may_change_later(rod):
+    """Arrays that start where JAX could share their memory instead of copying them."""
+
+    def shareable(values):
+        raw = np.zeros(8 * len(values) + 64, np.uint8)
+        start = -raw.ctypes.data % 64
+        out = raw[start : start + 8 * len(values)].view(float)
+        out[:] = values
+        return out
+
+    gravity, place, times, q = map(shareable, ([0.0, -5.0], [1.0, 0.0], [0.1, 0.2], [0.3]))
+    heavy = mb.with_parameters(rod, {"gravity.acceleration": gravity})
+    body = planar.Body("body", mass=1.0, inertia=1.0, position=place)
+    points = mb.lagrangian.LagrangianSystem(kinetic=lambda t, q, v, p: v @ v, q=q, parameters={"k": place})
+    trajectory = mb.simulate(rod, mb.assemble(rod), t1=0.2, saveat=times, throw=False)
+    for given in (gravity, place, times, q):
+        given[:] = np.nan
+    np.testing.assert_array_equal(mb.parameters(heavy)["gravity.acceleration"], [0.0, -5.0])
+    np.testing.assert_array_equal(body.position, [1.0, 0.0])
+    np.testing.assert_array_equal(points.guess.q, [0.3])
+    np.testing.assert_array_equal(points.parameters["k"], [1.0, 0.0])
+    np.testing.assert_array_equal(trajectory.ts, [0.1, 0.2])
+    with pytest.raises(ValueError, match="read-only"):
+        body.position[0] = 2.0
+
+
 def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
     """Taken alone, without the value that the error goes with."""
 

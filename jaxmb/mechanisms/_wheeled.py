@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
+from .._parts import array
 from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
 from ..scene import Scene
 from ..system import parameters as parameters_of
@@ -101,10 +102,9 @@ def observe_bodies(trajectory: Trajectory) -> Observation:
 
 def _start(parameters, angle, speed, rate):
     """Numbers, coordinates, speed and turning rate, and rates of the coordinates."""
-    number = lambda x: jnp.asarray(x, jnp.result_type(float))
-    parameters = {name: number(value) for name, value in parameters.items()}
-    q = jnp.stack([number(0.0), number(0.0), number(0.0), number(angle)])
-    u = jnp.stack([number(speed), number(rate)])
+    parameters = {name: array(value) for name, value in parameters.items()}
+    q = jnp.stack([array(0.0), array(0.0), array(0.0), array(angle)])
+    u = jnp.stack([array(speed), array(rate)])
     return parameters, q, u, frame(0.0, q, parameters) @ u
 
 

@@ -5,6 +5,7 @@ import numpy as np
 
 from .. import spatial
 from .._forces import Gravity
+from .._parts import array
 from .._user import VelocityConstraint
 from ..lagrangian import LagrangianSystem, Nonholonomic
 from ..scene import Scene
@@ -34,8 +35,7 @@ def appell_hamel(
 
     **Labels:** `x`, `y`, `z` [m]; `u0`, `u1`, `u2` [m/s].
     """
-    number = lambda x: jnp.asarray(x, jnp.result_type(float))
-    along = number(speed) * jnp.stack([jnp.cos(number(heading)), jnp.sin(number(heading)), number(slope)])
+    along = array(speed) * jnp.stack([jnp.cos(array(heading)), jnp.sin(array(heading)), array(slope)])
     rigid = of_bodies(model)
     if rigid:
         cone = lambda poses, velocities, t, p: _excess(velocities[0], p["slope"])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
+from .._parts import array
 from .._types import State, VectorLike
 from ..planar._space import PLANE
 from ._base import Mechanism, build, mechanism
@@ -54,7 +55,6 @@ def longitudinal_train(
     **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.
     """
     check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
-    array = lambda value: jnp.asarray(value, jnp.result_type(float))
     mass, speed, brake = (
         array(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
     )

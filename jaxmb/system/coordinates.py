@@ -1,14 +1,12 @@
 """Coordinates and rates by name: which entries of q and u a name such as `"crank.angle"` stands for."""
 
 from collections.abc import Mapping
-from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._names import unknown
-from .._namespace import as_array, is_traced
+from .._namespace import as_array, replaced
 from .._types import VectorLike
 from .layout import Layout
 
@@ -57,8 +55,6 @@ def prescribe(
     **Raises:** `ValueError` for unknown names and wrong shapes.
     """
     fixed = np.zeros(vector.shape[0], bool)
-    traced = is_traced((vector, dict(values)))
-    out: Any = vector if traced else np.array(vector)
     for name, value in values.items():
         if name not in names:
             raise unknown(what, name, names)
@@ -66,9 +62,6 @@ def prescribe(
         value = as_array(value, vector.dtype)
         if value.shape not in ((), (len(index),)) or (value.shape == () and len(index) > 1):
             raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {value.shape}.")
-        if traced:
-            out = out.at[np.array(index)].set(value)
-        else:
-            out[index] = value
+        vector = replaced(vector, np.array(index), value)
         fixed[index] = True
-    return out if traced else jax.device_put(out), fixed
+    return vector, fixed

@@ -1,16 +1,16 @@
 """The numbers of a system by name, `"part.field"`."""
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._names import unknown
-from .._namespace import as_array, is_traced
+from .._namespace import is_traced, replaced
+from .._parts import array
 from .._types import VectorLike
 from ._base import AbstractSystem
 
@@ -44,25 +44,15 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
     for name, value in values.items():
         if name not in places:
             raise unknown("parameter", name, places)
-        value = as_array(value, jnp.result_type(float))
+        value = array(value)
         for where, index in places[name]:
             old = where(system)
             shape = old.shape if index is None else old.shape[1:]
             if value.shape != shape:
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
-            system = eqx.tree_at(where, system, _with(old, index, value))
+            system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
     return system
 
 
 def _of(values: Array, index: int) -> Array:
-    return values[index] if is_traced(values) else jax.device_put(np.asarray(values)[index])
-
-
-def _with(old: Array, index: int | None, value: Any) -> Array:
-    if index is None:
-        return value if is_traced(value) else jax.device_put(value)
-    if is_traced((old, value)):
-        return old.at[index].set(value)
-    new = np.array(old)
-    new[index] = value
-    return jax.device_put(new)
+    return values[index] if is_traced(values) else jax.device_put(np.array(np.asarray(values)[index]))
