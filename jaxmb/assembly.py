@@ -63,14 +63,15 @@ def assemble(
     guess = system.guess if guess is None else guess
     t = as_array(t, guess.q.dtype)
     u, fixed_rates = prescribe("rate", system.rate_names(), rates or {}, guess.u)
-    concrete = not is_traced((system, guess, fix, u, t))
-    if concrete:
+    if not is_traced(u):
         _check_finite(u, "rates")
     q, _, ok = configuration(system, guess.q, fix, t, throw)
     # At rest, where nothing asks for motion, there is nothing to compile.
-    at_rest = concrete and system.homogeneous and not np.any(np.asarray(u)) and not np.any(fixed_rates)
+    known = not is_traced((system, guess, fix, u, t))
+    at_rest = known and system.homogeneous and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else velocities(system, t, q, u, tuple(fixed_rates.tolist()))
-    if concrete and throw:
+    # Under a trace what comes of known numbers is traced as well.
+    if throw and not is_traced((ok, ok_rates)):
         if not ok_rates:
             raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
         return State(q, u)
@@ -91,14 +92,13 @@ def configuration(
     """
     names = system.coordinate_names()
     q, fixed = prescribe("coordinate", names, fix or {}, guess)
-    concrete = not is_traced((system, q, t))
-    if concrete:
+    if not is_traced(q):
         _check_finite(q, "coordinates")
     whole = 0
     if isinstance(system, RigidBodySystem):
         q, whole = _normalize_fixed(system, q, fixed)
     q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
-    if concrete and throw and not bool(ok):
+    if throw and not is_traced(ok) and not ok:
         raise ValueError(_cannot_assemble(system, t, q, fixed, names))
     return q, fixed, ok
 

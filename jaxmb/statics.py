@@ -68,7 +68,7 @@ def equilibrium(
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
     still = _still(system, time, start, u)
-    concrete = not is_traced((system, start, time))
+    concrete = not is_traced(still)
     if concrete and throw and not bool(still):
         raise ValueError("Something is driven at this time, and moves; give a time t at which it stands.")
     q, unbalanced, ok = _balanced(system, time, start, held)
