@@ -257,5 +257,5 @@ _REFERENCES = References(
         ]
     ),
     source="equations of its own in NumPy, Runge-Kutta of order 8 with steps below a millisecond",
-    tolerance=1e-12,
+    tolerance=1e-10,
 )
