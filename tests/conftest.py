@@ -12,7 +12,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config):
-    """Let all modules, workers and notebooks, and the next run, share the programs that are compiled.
+    """Let all modules, workers and notebooks, and the next run, share the programs that take long to compile.
 
     A test that runs alone has the programs that users have.
     """
@@ -22,7 +22,7 @@ def pytest_configure(config):
     gc.set_threshold(100_000, 20, 20)
     settings = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("programs")),
-        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        "jax_persistent_cache_min_compile_time_secs": 1.0,
         # With a bound on its size the cache is locked while it is written.
         "jax_compilation_cache_max_size": 2**30,
         # Where in the source each instruction comes from, which is a tenth of the time to lower and compile.

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from compiling import jit_as_users_do
 from oracles import linkages
 
 import jaxmb as mb
@@ -177,16 +176,15 @@ def test_a_force_that_jumps():
 # Derivatives
 
 
-# Mechanism: stiffnesses, dampings, how far [s], tolerance of derivatives, steps of differences in logarithms, compiler.
+# Mechanism: stiffnesses, dampings, how far [s], tolerance of derivatives, steps of differences in logarithms.
 DIFFERENTIATED = {
-    "stiff_four_bar": (["D.stiffness"], ["D.damping"], 0.02, 1e-11, (1e-3, 1e-1), jit_as_users_do),
+    "stiff_four_bar": (["D.stiffness"], ["D.damping"], 0.02, 1e-11, (1e-3, 1e-1)),
     "flyball": (
         ["spring1.stiffness", "spring2.stiffness"],
         ["spring1.damping", "spring2.damping"],
         0.1,
         1e-9,
         (1e-2,) * 2,
-        jax.jit,
     ),
 }
 
@@ -194,7 +192,7 @@ DIFFERENTIATED = {
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_forward_reverse_and_central_differences(name):
     """With respect to logarithms of stiffness and damping, while the four-bar's bushing vibrates."""
-    mechanism, (stiffnesses, dampings, t1, rtol, steps, compiled) = library(name), DIFFERENTIATED[name]
+    mechanism, (stiffnesses, dampings, t1, rtol, steps) = library(name), DIFFERENTIATED[name]
     start = mb.parameters(mechanism.system)
     weights = jnp.cos(jnp.arange(mechanism.system.nq + mechanism.system.nu).astype(float))
 
@@ -209,8 +207,8 @@ def test_forward_reverse_and_central_differences(name):
 
     # One program for derivatives and, at a tighter tolerance, for differences; in a batch, as the other one is.
     twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
-    derivatives_and_value = compiled(jax.vmap(jax.jacfwd(twice, has_aux=True), in_axes=(0, None)))
-    reverse = compiled(jax.vmap(jax.grad(lambda x: loss(x, rtol, None))))(np.zeros((1, 2)))[0]
+    derivatives_and_value = jax.jit(jax.vmap(jax.jacfwd(twice, has_aux=True), in_axes=(0, None)))
+    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(x, rtol, None))))(np.zeros((1, 2)))[0]
     forward = derivatives_and_value(np.zeros((1, 2)), rtol)[0][0]
     assert np.all(forward != 0)
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)

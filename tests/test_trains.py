@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import jit_as_users_do
 from oracles import trains as oracle
 
 import jaxmb as mb
@@ -178,9 +177,9 @@ def collision():
 
 def test_derivatives_of_the_largest_force_in_a_collision(collision):
     peak, numbers = collision
-    value, reverse = jit_as_users_do(jax.value_and_grad(lambda numbers: peak(numbers, 1e-10)))(numbers)
+    value, reverse = jax.jit(jax.value_and_grad(lambda numbers: peak(numbers, 1e-10)))(numbers)
     along = lambda numbers: peak(numbers, 1e-10, adjoint=diffrax.ForwardMode())
-    forward = jit_as_users_do(jax.jacfwd(along))(numbers)
+    forward = jax.jit(jax.jacfwd(along))(numbers)
     tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
     assert 1e5 < value < 1e7
     for name, number in numbers.items():

@@ -3,7 +3,8 @@
 A step asks twice. `evaluate` takes predicted coordinates close to the manifold and factors the Jacobian there: the one
 elimination of the step. `restore` takes the corrected state, keeps its independent coordinates and velocities, solves
 `Φ = 0` and `ψ = 0` for the dependent ones, and finds the accelerations there by one Newton correction of those that
-were evaluated: no Jacobian and no elimination, a fifth of the cost.
+were evaluated: no Jacobian and no elimination, a fifth of the cost. Where nothing near has been evaluated,
+`restore_positions` is followed by `evaluate`.
 
 Their derivatives do not follow the algorithm but the equations (implicit function theorem): they are cheap, independent
 of the formulation, and cannot pick up a frozen iterate. The factors' own derivatives are part of the rule, so higher

@@ -23,6 +23,7 @@ from ._base import AbstractManifold, newton_tolerance
 from .constrained import (
     Evaluation,
     Split,
+    coordinate_factor,
     correct_positions,
     evaluate,
     evaluate_general,
@@ -138,42 +139,54 @@ class PartitionTerm(AbstractManifoldTerm):
         return Chart(split, fresh, fresh, jnp.stack([0, 0, 0, 1, singular.astype(int)]))
 
     def evaluate(self, t, y, chart, args):
+        q = correct_positions(self.system, t, y.q, lax.stop_gradient(chart.split))
+        return self._evaluate(t, q, y.u, chart, self.system.plain)
+
+    def _evaluate(self, t, q, u, chart, plain):
         system, split, quality = self.system, chart.split, chart.quality
-        q = correct_positions(system, t, y.q, lax.stop_gradient(split))
         if system.acceleration_rows == 0:
-            u, udot, factors = y.u, system.inertia(t, q, y.u).solve(system.force(t, q, y.u)), None
+            udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
-            if system.plain:
-                out = evaluate(system, self.formulation, t, q, y.u, split.velocity)
+            if plain:
+                out = evaluate(system, self.formulation, t, q, u, split.velocity)
             else:
-                out = evaluate_general(system, self.formulation, t, q, y.u, split)
+                out = evaluate_general(system, self.formulation, t, q, u, split)
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
                 split = Split(split.velocity, split.acceleration, None, factors.correction)
-        f = State(system.rates(t, q, u), udot)
         chart = Chart(split, quality, chart.fresh, chart.counters)
-        return ManifoldEvaluation(State(q, u), f, chart, chart.singular, factors)
+        return ManifoldEvaluation(State(q, u), State(system.rates(t, q, u), udot), chart, chart.singular, factors)
 
     def restore(self, t, y, near, args):
         system, chart = self.system, near.chart
-        if system.acceleration_rows == 0:
-            q, iterations, failed = restore_positions(system, t, y.q, chart.split, self.newton_tol)
-            u, udot = y.u, system.inertia(t, q, y.u).solve(system.force(t, q, y.u))
-        elif not system.plain:
-            q, iterations, failed = restore_positions(system, t, y.q, chart.split, self.newton_tol)
-            again = evaluate_general(system, self.formulation, t, q, y.u, lax.stop_gradient(chart.split))
-            u, udot = again.u, again.udot
-        else:
-            before = lax.stop_gradient((near.y.u, near.f.u))
-            before = Evaluation(*before, near.factors)
-            out: Any = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
-            q, u, udot, iterations, failed = out.q, out.u, out.udot, out.iterations, out.failed
-        age, _, newton, charts, singular = chart.counters
-        counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
-        chart = Chart(chart.split, chart.quality, chart.fresh, counters)
-        f = State(system.rates(t, q, u), udot)
-        return ManifoldEvaluation(State(q, u), f, chart, failed | chart.singular, None)
+        if system.acceleration_rows == 0 or not system.plain:
+            return self._settle(t, y, chart, chart.split)
+        before = lax.stop_gradient((near.y.u, near.f.u))
+        before = Evaluation(*before, near.factors)
+        out: Any = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+        f = State(system.rates(t, out.q, out.u), out.udot)
+        chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
+        return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
+
+    def settle(self, t, y, chart, args):
+        split = chart.split
+        if split.coordinate is None:
+            # The chart's matrix is of the state before the step.
+            system, at, q = lax.stop_gradient((self.system, t, y.q))
+            split = eqx.tree_at(lambda s: s.correction, split, coordinate_factor(system, at, q, split).correction)
+        return self._settle(t, y, chart, split)
+
+    def _settle(self, t, y, chart, split):
+        """Positions restored with the matrix of a split, then evaluated there."""
+        system = self.system
+        q, iterations, failed = restore_positions(system, t, y.q, split, self.newton_tol)
+        out = self._evaluate(t, q, y.u, _counted(chart, iterations), system.plain and system.linear)
+        if not system.linear:
+            # What is left of velocities whose rows are not linear in them.
+            left = jnp.max(jnp.abs(out.factors.correction @ system.velocity_residual(t, q, out.y.u)))
+            failed = failed | ~(left <= jnp.sqrt(self.newton_tol) * (1.0 + jnp.max(jnp.abs(out.y.u))))
+        return out._replace(failed=failed | out.failed)
 
     def controlled(self, chart):
         # All components, the dependent ones as well: where these turn fast, the error of the independent ones alone
@@ -191,6 +204,13 @@ class PartitionTerm(AbstractManifoldTerm):
     def update_chart(self, t, y, chart, args):
         del args
         return _updated(*lax.stop_gradient((self.system, t, y, chart)), self.max_influence)
+
+
+def _counted(chart, iterations):
+    """The chart after a Newton iteration for positions."""
+    age, _, newton, charts, singular = chart.counters
+    counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
+    return Chart(chart.split, chart.quality, chart.fresh, counters)
 
 
 @eqx.filter_jit

@@ -73,6 +73,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
 
+    # A program in the program, so that it is traced once.
+    @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         solver = self.solver
         if self.scan_kind is not None:

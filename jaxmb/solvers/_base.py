@@ -67,6 +67,17 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         evaluation of the prediction that `y` corrects, at the same time; its `factors` may make this one cheap.
         """
 
+    def settle(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
+        """`restore` where nothing near the state has been evaluated yet; `y` is a first guess from anywhere around.
+
+        A manifold that can do so with a single evaluation, of the restored state, has a method of its own.
+        """
+        # Where the state is restored from does not matter to its derivative.
+        manifold, *at = jax.tree.map(stop, (self, t, y, args))
+        near = manifold.evaluate(at[0], at[1], chart, at[2])
+        out = self.restore(t, y, near, args)
+        return out._replace(failed=out.failed | near.failed)
+
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
         """A mask with the structure of `y`: true for the components that the local error is measured on."""
@@ -81,3 +92,8 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
         Its result only counts if the step that led there is accepted. It is also asked before a restart after a jump.
         """
+
+
+def stop(x: Any) -> Any:
+    """An array without its derivative; anything else as it is."""
+    return jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x

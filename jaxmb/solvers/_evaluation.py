@@ -14,7 +14,7 @@ from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around ter
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._base import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation
+from ._base import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):
@@ -109,12 +109,8 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
 
     def constrained(t, flat):
         assert manifold is not None
-        y = unravel_like(like, flat)
-        # Its derivative is that of the restored state; where that was found from does not matter.
-        frozen = jax.tree.map(_stop, (manifold, t * term.direction, y, args))
-        near = frozen[0].evaluate(frozen[1], frozen[2], chart, frozen[3])
-        out = _raveled(term, manifold.restore(t * term.direction, y, near, args), flat.dtype)
-        return (out.y, out.f), (out.chart, out.failed | near.failed)
+        out = _raveled(term, manifold.settle(t * term.direction, unravel_like(like, flat), chart, args), flat.dtype)
+        return (out.y, out.f), (out.chart, out.failed)
 
     return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)
 
@@ -149,8 +145,4 @@ def _manifold(term: Any) -> AbstractManifoldTerm | None:
 def freeze(tree: Any) -> Any:
     """The same numbers, without derivatives."""
     # Index sets and factors steer how the constraints are solved; the solution does not depend on them.
-    return jax.tree.map(_stop, tree)
-
-
-def _stop(x):
-    return jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x
+    return jax.tree.map(stop, tree)

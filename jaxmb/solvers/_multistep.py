@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import diffrax
+import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         check_real(y0)
         return self._start(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
+    # A program in the program: it is traced once, not anew in each loop and each transformation around it.
+    @eqx.filter_jit
     def step(
         self,
         terms: PyTree[diffrax.AbstractTerm],

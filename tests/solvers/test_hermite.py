@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from compiling import jit_as_users_do
 from stiff_problems import PROBLEMS, solve, van_der_pol
 
 from jaxmb.solvers import Hermite, MultistepController
@@ -177,7 +176,7 @@ def _by_both_modes(mesh=None):
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=2048)
     twice = lambda mu, *args: (_end(mu, *args, diffrax.ForwardMode(), mesh),) * 2
     single = lambda mu, *args: _end(mu, *args, adjoint, mesh)
-    of_each = lambda function: jit_as_users_do(jax.vmap(function, in_axes=(0, None, None)))
+    of_each = lambda function: jax.jit(jax.vmap(function, in_axes=(0, None, None)))
     return of_each(jax.jacfwd(twice, has_aux=True)), of_each(jax.grad(single))
 
 
@@ -217,10 +216,10 @@ def test_derivatives_of_a_reaction_over_eleven_decades():
         return jnp.log(solve(problem, 1e-8, args=rates, adjoint=adjoint, max_steps=1024).ys[-1][:2])
 
     exact = np.array([[-2.0, 2.0, -1.0], [-1.0, 1.0, -1.0]])
-    along = jit_as_users_do(jax.jacfwd(lambda x: logarithms(x, diffrax.ForwardMode())))(jnp.zeros(3))
+    along = jax.jit(jax.jacfwd(lambda x: logarithms(x, diffrax.ForwardMode())))(jnp.zeros(3))
     np.testing.assert_allclose(along, exact, rtol=1e-5)
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
-    against = jit_as_users_do(jax.jacrev(lambda x: logarithms(x, adjoint)))(jnp.zeros(3))
+    against = jax.jit(jax.jacrev(lambda x: logarithms(x, adjoint)))(jnp.zeros(3))
     np.testing.assert_allclose(against, along, rtol=1e-6)
 
 

@@ -179,8 +179,8 @@ def test_gradients_through_charts():
     end = lambda rate, adjoint: _solve(Circle(rate), 4.0, 1e-10, adjoint=adjoint).ys[-1]
     loss = lambda rate, adjoint: jnp.sum(end(rate, adjoint) * jnp.array([1.0, 0.5]))
     rate = jnp.array(1.0)
-    forward = jit_as_users_do(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
-    reverse = jit_as_users_do(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
+    forward = jax.jit(jax.jacfwd(lambda r: loss(r, diffrax.ForwardMode())))(rate)
+    reverse = jax.jit(jax.grad(lambda r: loss(r, diffrax.RecursiveCheckpointAdjoint())))(rate)
     angle_rate = 4.0 + 0.5 * (1 - np.cos(4.0))
     x, y = _exact(4.0)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
