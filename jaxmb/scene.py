@@ -79,13 +79,13 @@ class Scene(eqx.Module):
         poses, and for constraints that contradict each other; the message names the parts.
         """
         for body in self.bodies:
-            body.check()
+            _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
         layout = Layout(space, tuple(body.rotates for body in self.bodies))
         index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
         guess = State(
-            jax.device_put(np.concatenate([body.pose() for body in self.bodies])),
-            jax.device_put(np.concatenate([body.velocities() for body in self.bodies])),
+            jax.device_put(np.concatenate([_call(body, "pose") for body in self.bodies])),
+            jax.device_put(np.concatenate([_call(body, "velocities") for body in self.bodies])),
         )
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
@@ -102,10 +102,10 @@ class Scene(eqx.Module):
                 continue
             own = tuple(index[name] for name in part.bodies)
             poses = given[list(own)]
-            resolved = part.resolve(space, poses)
+            resolved = _call(part, "resolve", space, poses)
             _check_rotation(resolved, own, layout, poses)
             joints[part.name] = resolved, own
-            parts += [(component, own) for component in resolved.components()]
+            parts += [(component, own) for component in _call(resolved, "components")]
 
         kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
         of_joint = {law.name: law.joint for law, _ in laws}
@@ -130,6 +130,11 @@ class Scene(eqx.Module):
         )
         ranks, implied = find_structure(system)
         return dataclasses.replace(system, ranks=ranks, implied=implied)
+
+
+def _call(part, name, *arguments):
+    """A method of a part. Bound methods of modules are modules, too many of them for scenes of thousands of parts."""
+    return getattr(type(part), name)(part, *arguments)
 
 
 def _no_inertia(space):

@@ -274,7 +274,7 @@ def test_formulations_agree(name):
     roads = ROADS if system.regular else WITHOUT_INVERSE_OF_MASS
 
     # Eliminations of many rows take longer than to compile them.
-    @(jit_to_run_long if system.acceleration_rows > 20 else jax.jit)
+    @(jit_to_run_long if system.acceleration_rows > 16 else jax.jit)
     def solve(q, u, change):
         y = mb.manifold.project(system, 0.0, mb.State(q, u))
         motion, (multipliers, jacobian, basis) = motion_by(system, roads, y.q, y.u)

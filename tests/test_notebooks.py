@@ -6,12 +6,14 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
+from compiling import flags_to_run_long
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 2 * 2**20
+RUN_LONG = {"04_vehicles"}
 # What a notebook must not hold: paths of somebody's machine, downloads, and shell commands.
 FORBIDDEN = re.compile(
     r"/(home|root|tmp|Users|work|workspace)/|[A-Z]:\\\\|https?://|urllib|requests|^[!%](?!matplotlib inline)", re.M
@@ -42,7 +44,9 @@ def test_lint(path):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 # Of the kernel's own files, which this package does not touch.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-def test_runs(path):
+def test_runs(path, monkeypatch):
+    for name, value in flags_to_run_long().items() if path.stem in RUN_LONG else ():
+        monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}})
     client.execute()

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_to_run_long
 from oracles import tracked_vehicle as oracle
 
 import jaxmb as mb
@@ -123,7 +124,7 @@ def test_derivatives_of_the_ride():
     """With respect to torsion bars, dampers and the obstacle: of the same steps forward and back, and of finer ones."""
     state = vehicle(1).state
     twice = lambda x, dt: (ride_at(x, state, dt, diffrax.ForwardMode()),) * 2
-    derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
+    derivatives_and_value = jit_to_run_long(jax.jacfwd(twice, has_aux=True))
     forward, _ = derivatives_and_value(START, 5e-4)
     reverse = jax.jit(jax.grad(lambda x: ride_at(x, state, 5e-4, None)))(START)
     assert np.all(np.abs(forward) * START > 1e-3)
