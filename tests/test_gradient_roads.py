@@ -91,6 +91,7 @@ ROADS = {
     ),
     "event": (pendulum, {"event": HANGING}, when_it_happens),
     "nonlinear in velocity": (steady_particle, {}, at_the_end),
+    "nonlinear in velocity, implicit": (steady_particle, {"solver": mb.solvers.Hermite()}, at_the_end),
     "fully driven": (driven_pendulum, {"saveat": TIMES}, at_all_times),
 }
 
