@@ -85,6 +85,20 @@ def test_backsolve_adjoint(forward):
     np.testing.assert_allclose(gradient, forward[0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "adjoint, derivative", [(diffrax.ForwardMode(), jax.jacfwd), (diffrax.RecursiveCheckpointAdjoint(), jax.grad)]
+)
+def test_what_a_vector_field_closes_over_is_differentiated(adjoint, derivative):
+    def end(rate):
+        controller = MultistepController(1e-9, 1e-12)
+        term = diffrax.ODETerm(lambda t, y, args: -rate * y)
+        options = {"stepsize_controller": controller, "adjoint": adjoint, "max_steps": 512}
+        return diffrax.diffeqsolve(term, Adams(), 0.0, 1.0, None, jnp.ones(1), **options).ys[-1][0]
+
+    rates = jnp.array([2.0, 3.0])
+    np.testing.assert_allclose(jax.jit(jax.vmap(derivative(end)))(rates), -np.exp(-rates), rtol=1e-8)
+
+
 def test_gradient_of_dense_output_and_saved_times():
     ts = jnp.array([0.5, 1.3, 2.9])
 
