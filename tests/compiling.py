@@ -20,9 +20,11 @@ PASSES = (
 # A fifth of the time to compile, which nine tenths of the tests' time was, for three times the time to run.
 QUICKLY = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
-    f" --xla_disable_hlo_passes={','.join(PASSES)}"
+    f" --xla_cpu_enable_concurrency_optimized_scheduler=false --xla_disable_hlo_passes={','.join(PASSES)}"
 )
-# What undoes it in one program; into how many pieces its machine code is cut does not matter.
+# Threads of XLA in one process, of several side by side: more of them hand small kernels to each other.
+THREADS = {"NPROC": "1"}
+# What undoes it in one program; neither the order of its kernels nor how its machine code is cut changes results.
 AS_USERS_DO = {
     "xla_cpu_use_fusion_emitters": True,
     "xla_backend_optimization_level": 3,
@@ -32,7 +34,7 @@ AS_USERS_DO = {
 
 def compile_quickly():
     """Let the processes that start from here compile quickly: unless told otherwise, or if this XLA has no such way."""
-    options = os.environ | {"XLA_FLAGS": QUICKLY}
+    options = os.environ | THREADS | {"XLA_FLAGS": QUICKLY}
     start = [sys.executable, "-c", "import jax; jax.devices()"]
     if "XLA_FLAGS" not in os.environ and not subprocess.run(start, env=options, capture_output=True).returncode:
         os.environ.update(options)
