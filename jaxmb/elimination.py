@@ -233,8 +233,12 @@ def _sweep_jvp(primals, tangents):
     (B,), (dB,) = primals, tangents
     r = B.shape[0]
     swept = _sweep(B)
-    inverse, right = swept[:, :r], swept[:, r:]
-    return swept, jnp.concatenate([-inverse @ dB[:, :r] @ inverse, inverse @ (dB[:, r:] - dB[:, :r] @ right)], axis=1)
+    inverse = swept[:, :r]
+    dinverse = -inverse @ dB[:, :r] @ inverse
+    if B.shape[1] == r:
+        # No arrays without entries: after one, jaxlib (0.10.2) forgets how to call LAPACK in the same program.
+        return swept, dinverse
+    return swept, jnp.concatenate([dinverse, inverse @ (dB[:, r:] - dB[:, :r] @ swept[:, r:])], axis=1)
 
 
 def gauss_jordan(B: Float[Array, "r n"], r: int) -> Float[Array, "r n"]:

@@ -59,12 +59,21 @@ def driven_pendulum():
     return system, ["pin.point_b", "drive.amplitude", "drive.rate"], {}, None
 
 
-def steady_particle():
+def steady_particle(*laws):
     """The speed of the mass centre is kept by a constraint that is not linear in it."""
     speed = lambda poses, velocities, t, p: velocities[0, 0] ** 2 + velocities[0, 1] ** 2 - p["speed"] ** 2
     pace = mb.VelocityConstraint("pace", "rod", speed, parameters={"speed": 1.2})
-    system = mb.Scene([rod()], joints=[pace], forces=[SPRING, GRAVITY]).compile()
+    system = mb.Scene([rod()], joints=[pace], forces=[SPRING, GRAVITY, *laws]).compile()
     return system, ["rod.mass", "rod.inertia", "spring.stiffness", "pace.speed"], {}, "rod.y"
+
+
+def rubbing_particle():
+    """The same with a constraint that is not ideal: it turns the rod and its path, by a share of its force."""
+    turning = lambda poses, velocities, reactions, t, p: (
+        p["share"] * jnp.stack([-reactions[:, 1], reactions[:, 0], 0.3 * reactions[:, 0]], axis=1)
+    )
+    system, names, *rest = steady_particle(mb.NonIdeal("rub", "pace", turning, parameters={"share": 0.4}))
+    return system, [*names, "rub.share"], *rest
 
 
 def at_the_end(sol):
@@ -92,6 +101,7 @@ ROADS = {
     "event": (pendulum, {"event": HANGING}, when_it_happens),
     "nonlinear in velocity": (steady_particle, {}, at_the_end),
     "nonlinear in velocity, implicit": (steady_particle, {"solver": mb.solvers.Hermite()}, at_the_end),
+    "nonlinear in velocity, not ideal, implicit": (rubbing_particle, {"solver": mb.solvers.Hermite()}, at_the_end),
     "fully driven": (driven_pendulum, {"saveat": TIMES}, at_all_times),
 }
 
