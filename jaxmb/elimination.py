@@ -236,7 +236,7 @@ def _sweep_jvp(primals, tangents):
     inverse = swept[:, :r]
     dinverse = -inverse @ dB[:, :r] @ inverse
     if B.shape[1] == r:
-        # No arrays without entries: after one, jaxlib (0.10.2) forgets how to call LAPACK in the same program.
+        # No arrays without entries: jaxlib (0.10.2) has lost how LAPACK is called in a program with products of them.
         return swept, dinverse
     return swept, jnp.concatenate([dinverse, inverse @ (dB[:, r:] - dB[:, :r] @ swept[:, r:])], axis=1)
 

@@ -183,6 +183,13 @@ def test_combinations(pendulum):
         mb.simulate(pendulum, state, t1=0.1, stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
 
 
+def test_nothing_to_solve_implicitly():
+    turned = planar.Driver("drive", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t)
+    system = mb.Scene([bar()], joints=[pin(), turned]).compile()
+    with pytest.raises(ValueError, match=r"constraints prescribe all components of the state. Use `Adams\(\)`"):
+        mb.simulate(system, mb.assemble(system), t1=0.1, solver=mb.solvers.Hermite())
+
+
 def test_single_precision_warns(pendulum):
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, pendulum)
     with jax.enable_x64(False), pytest.warns(UserWarning, match=r"single precision.*jax_enable_x64"):

@@ -153,6 +153,10 @@ class Hermite(AbstractMultistep):
         # It spreads to the error estimate, and fails the step.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         free = free_components(terms, flat, chart)
+        if free.size == 0:
+            raise ValueError(
+                "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
+            )
         none = jnp.zeros((flat.size, free.size), flat.dtype)
         spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
         matrix = Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
