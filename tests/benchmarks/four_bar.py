@@ -1,7 +1,8 @@
 """The library's four-bar for 10 s: Adams on its partition against Dopri8 with projection and, if installed, Pinocchio.
 
-Run it with `python tests/benchmarks/four_bar.py`. It prints work–precision curves, and ratios at equal error read off
-them by interpolation: evaluations and warm run time of Adams over those of the others, in one process, interleaved.
+Run it with `python tests/benchmarks/four_bar.py`, with `NPROC=1` before it for a single thread of XLA. It prints
+work–precision curves, and ratios at equal error read off them by interpolation: evaluations and warm run time of Adams
+over those of the others, in one process, interleaved.
 Pinocchio (`pip install pin`) solves for accelerations with `constraintDynamics`, SciPy's DOP853 integrates.
 """
 
