@@ -1,7 +1,6 @@
 """Accurate, differentiable dynamics of constrained mechanical systems in JAX."""
 
 from . import (
-    contact as contact,
     formulations as formulations,
     lagrangian as lagrangian,
     manifold as manifold,
@@ -10,23 +9,23 @@ from . import (
     report as report,
     solvers as solvers,
     spatial as spatial,
-    terrain as terrain,
     viz as viz,
 )
-from ._forces import Gravity as Gravity
 from ._results import RESULTS as RESULTS
-from ._servo import Servo as Servo
 from ._types import State as State
-from ._user import (
+from .parts import contact as contact, terrain as terrain
+from .parts.forces import Gravity as Gravity
+from .parts.functions import (
     Constraint as Constraint,
     Force as Force,
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
 )
-from .assembly import assemble as assemble
-from .identify import Identification as Identification, identify as identify
+from .parts.servo import Servo as Servo
 from .scene import Scene as Scene
 from .simulate import simulate as simulate
-from .statics import equilibrium as equilibrium
+from .states.assembly import assemble as assemble
+from .states.equilibrium import equilibrium as equilibrium
+from .studies.identify import Identification as Identification, identify as identify
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load

@@ -235,8 +235,8 @@ def _fit(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
     """Estimate the parameter that the motion feels most from a noisy sample of it."""
     import numpy as np
 
-    from ._quantities import places, quantity
-    from .identify import identify
+    from .studies.identify import identify
+    from .studies.quantities import places, quantity
     from .system import RigidBodySystem, parameters
 
     system = mechanism.system
@@ -283,9 +283,9 @@ def _most_felt(mechanism: "Mechanism", ts) -> str | None:
     import jax.numpy as jnp
     import numpy as np
 
-    from ._quantities import places, quantity
-    from .assembly import assemble
     from .simulate import simulate
+    from .states.assembly import assemble
+    from .studies.quantities import places, quantity
     from .system import parameters, with_parameters
 
     known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}

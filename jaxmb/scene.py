@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._forces import Gravity
-from ._names import unknown
-from ._parts import (
+from ._types import State
+from .parts.base import (
     GROUND,
     AbstractConstraint,
     AbstractForce,
@@ -19,17 +18,18 @@ from ._parts import (
     AbstractVelocityConstraint,
     rows_of,
 )
-from ._resolve import label, vector
-from ._servo import Servo
-from ._structure import find_structure
-from ._types import State
+from .parts.forces import Gravity
+from .parts.names import unknown
+from .parts.planar.kinematics import PLANE
+from .parts.resolve import label, vector
+from .parts.servo import Servo
+from .parts.spatial.kinematics import SPACE
 from .planar import Body as PlanarBody, PointMass as PlanarPointMass
-from .planar._space import PLANE
 from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
-from .spatial._space import SPACE
+from .states.structure import find_structure
 from .system import RigidBodySystem
-from .system._base import Ranks
 from .system.describe import Description
+from .system.equation import Ranks
 from .system.groups import (
     ConstraintGroup,
     ForceGroup,

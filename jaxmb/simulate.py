@@ -12,12 +12,12 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-from ._namespace import as_array, is_traced
 from ._results import RESULTS
 from ._types import Scalar, State
-from .elimination import full_pivot
 from .formulations import AbstractFormulation, BlockMultipliers, Multipliers, NullSpace, Partitioned
-from .formulations._base import stages
+from .formulations.formulation import stages
+from .linalg.arrays import as_array, is_traced
+from .linalg.elimination import full_pivot
 from .manifold import AbstractManifold, Baumgarte, BlockProjection, Free, Partition, Projection, project
 from .manifold.partition import Chart
 from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController

@@ -12,13 +12,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ._names import unknown
 from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
 from .manifold import project
-from .reactions import Reaction, applied_force, constraint_force, force_names, joint_names, reaction
+from .parts.names import unknown
 from .system import RigidBodySystem
+from .system.reactions import Reaction, applied_force, constraint_force, force_names, joint_names, reaction
 
 
 class ConstraintViolation(NamedTuple):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.block_tridiagonal import BlockTridiagonal
+from jaxmb.linalg.block_tridiagonal import BlockTridiagonal
 
 
 def dense(diagonal, coupling):

@@ -10,9 +10,10 @@ from oracles import tracked_vehicle as oracle
 from scipy.integrate import quad
 
 import jaxmb as mb
-from jaxmb import contact, planar, spatial, terrain
-from jaxmb.planar._space import PLANE
-from jaxmb.spatial._space import SPACE
+from jaxmb import planar, spatial
+from jaxmb.parts import contact, terrain
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
 
 BUMP = terrain.Bump(start=4.0, length=1.5, peak=0.12)
 TERRAINS = {

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb import elimination
+from jaxmb.linalg import elimination
 
 # As programs: every operation of its own would be compiled for every shape.
 full_pivot, solve_positive, cholesky = map(

@@ -10,7 +10,6 @@ import pytest
 from compiling import jit_to_run_long
 
 import jaxmb as mb
-from jaxmb.elimination import factor, full_pivot
 from jaxmb.formulations import (
     AbstractFormulation,
     Multipliers,
@@ -21,7 +20,8 @@ from jaxmb.formulations import (
     gauss_function,
     linearize,
 )
-from jaxmb.formulations._base import solve_constrained
+from jaxmb.formulations.formulation import solve_constrained
+from jaxmb.linalg.elimination import factor, full_pivot
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
 
 ROADS = {

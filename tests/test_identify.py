@@ -10,10 +10,10 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
-from jaxmb._free import free_parameters
-from jaxmb._minimise import levenberg_marquardt
-from jaxmb._quantities import quantities, quantity
 from jaxmb.lagrangian import LagrangianSystem
+from jaxmb.studies.minimise import levenberg_marquardt
+from jaxmb.studies.quantities import quantities, quantity
+from jaxmb.studies.ranges import free_parameters
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}

@@ -9,8 +9,8 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import mechanisms
-from jaxmb._quantities import quantities, quantity
 from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Nonholonomic, Pfaffian, Servo, Viscous
+from jaxmb.studies.quantities import quantities, quantity
 
 TS = jnp.linspace(0.0, 1.0, 5)
 

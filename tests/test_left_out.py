@@ -13,8 +13,10 @@ import pytest
 from jax.extend import core
 
 import jaxmb as mb
-from jaxmb import contact, elimination, planar, rotations, spatial
+from jaxmb import planar, spatial
+from jaxmb.linalg import elimination, rotations
 from jaxmb.manifold import constrained, partition, projection
+from jaxmb.parts import contact
 from jaxmb.system import chain
 
 

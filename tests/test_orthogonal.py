@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.orthogonal import frame
+from jaxmb.linalg.orthogonal import frame
 
 RNG = np.random.default_rng(0)
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from jaxmb import planar
-from jaxmb.planar._space import PLANE
-from jaxmb.rotations import rotate_2d
+from jaxmb.linalg.rotations import rotate_2d
+from jaxmb.parts.planar.kinematics import PLANE
 
 POINT_A, POINT_B = (0.1, -0.2), (0.4, 0.3)
 GROUND = jnp.zeros(3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmb import rotations as rot
+from jaxmb.linalg import rotations as rot
 
 RNG = np.random.default_rng(1)
 UNIT = [jnp.asarray(p / np.linalg.norm(p)) for p in RNG.normal(size=(6, 4))]

@@ -11,7 +11,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import formulations, planar, spatial
-from jaxmb.formulations._base import accelerations
+from jaxmb.formulations.formulation import accelerations
 
 GRAVITY = mb.Gravity((0.0, -9.81))
 

@@ -10,8 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 
-from jaxmb import rotations as rot, spatial
-from jaxmb.spatial._space import SPACE
+from jaxmb import spatial
+from jaxmb.linalg import rotations as rot
+from jaxmb.parts.spatial.kinematics import SPACE
 
 POINT_A, POINT_B = (0.1, -0.2, 0.3), (0.4, 0.1, -0.2)
 PITCH = -0.3

@@ -9,8 +9,9 @@ import pytest
 from oracles import linkages, stiff
 
 import jaxmb as mb
-from jaxmb import mechanisms, rotations
+from jaxmb import mechanisms
 from jaxmb.formulations import Partitioned, accelerations
+from jaxmb.linalg import rotations
 
 extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="needs numbers longer than double")
 

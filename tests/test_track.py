@@ -8,7 +8,7 @@ from oracles import tracked_vehicle as oracle
 from scipy.spatial import ConvexHull
 
 from jaxmb import planar
-from jaxmb.planar._space import PLANE
+from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.system.groups import stack
 from jaxmb.system.layout import Layout
 

@@ -12,11 +12,12 @@ import pytest
 from oracles import trains as oracle
 
 import jaxmb as mb
-from jaxmb import _chain_assembly, _structure, assembly, planar, spatial
+from jaxmb import planar, spatial
 from jaxmb.formulations import BlockMultipliers, Multipliers, accelerations
 from jaxmb.manifold import BlockProjection
 from jaxmb.mechanisms._relative import velocities
 from jaxmb.mechanisms.train import coupler_forces
+from jaxmb.states import assembly, chain_assembly as _chain_assembly, structure as _structure
 
 # A draft gear that is a linear spring.
 LINEAR = functools.partial(planar.DraftGear, stiffness=2e7, unloading=1.0, preload=0.0, slack=0.0, travel=10.0)

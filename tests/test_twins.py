@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import mechanisms, rotations
+from jaxmb import mechanisms
 from jaxmb.formulations import Partitioned, accelerations
+from jaxmb.linalg import rotations
 
 ZERO = jnp.zeros(())
 

@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar
 
-from ._base import AbstractFormulation
+from .formulation import AbstractFormulation
 
 
 class BlockMultipliers(AbstractFormulation):

@@ -2,8 +2,8 @@
 
 from typing import ClassVar
 
-from ..elimination import solve_positive
-from ._base import AbstractFormulation
+from ..linalg.elimination import solve_positive
+from .formulation import AbstractFormulation
 
 
 class Multipliers(AbstractFormulation):

@@ -2,9 +2,9 @@
 
 from typing import ClassVar
 
-from ..elimination import solve_positive
-from ..orthogonal import frame
-from ._base import AbstractFormulation
+from ..linalg.elimination import solve_positive
+from ..linalg.orthogonal import frame
+from .formulation import AbstractFormulation
 
 
 class NullSpace(AbstractFormulation):

@@ -2,8 +2,8 @@
 
 from typing import ClassVar
 
-from ..orthogonal import frame
-from ._base import AbstractFormulation
+from ..linalg.orthogonal import frame
+from .formulation import AbstractFormulation
 
 
 class Poincare(AbstractFormulation):

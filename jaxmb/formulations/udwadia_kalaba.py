@@ -5,8 +5,8 @@ from typing import Literal, get_args
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..orthogonal import frame
-from ._base import AbstractFormulation
+from ..linalg.orthogonal import frame
+from .formulation import AbstractFormulation
 
 Method = Literal["moore_penrose", "inverses", "singular_mass"]
 

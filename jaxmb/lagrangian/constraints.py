@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ._dataflow import depends
+from .dataflow import depends
 from .kinematics import Parameters
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..elimination import Order, factor, full_pivot
+from ..linalg.elimination import Order, factor, full_pivot
 from .equations import AbstractEquations
 from .kinematics import Frame
 from .transposition import Transposition, check_shape, share_of_suslov

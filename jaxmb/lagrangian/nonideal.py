@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..rotations import norm
+from ..linalg.rotations import norm
 from .kinematics import Parameters
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import Scalar, VectorLike
-from ..elimination import factor, full_pivot
+from ..linalg.elimination import factor, full_pivot
 from .kinematics import AbstractKinematics, Parameters
 from .system import LagrangianSystem
 

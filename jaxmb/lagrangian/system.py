@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._parts import array
 from .._types import Scalar, State, VectorLike
+from ..parts.base import array
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
-from ..system._base import Ranks
-from ._structure import count_rows, find_structure
+from ..system.equation import Ranks
 from .constraints import AbstractConstraint, Holonomic, Pfaffian, check_names, is_linear, is_rheonomic
 from .equations import AbstractEquations, Projected
 from .kinematics import AbstractKinematics, Rates
 from .nonideal import AbstractNonIdeal
+from .structure import count_rows, find_structure
 
 if TYPE_CHECKING:
     from ..system.describe import Description

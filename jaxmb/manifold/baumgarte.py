@@ -11,9 +11,9 @@ import numpy as np
 
 from .._types import State
 from ..formulations import AbstractFormulation, accelerations
-from ..formulations._base import check_mass
+from ..formulations.formulation import check_mass
 from ..system import AbstractSystem
-from ._base import AbstractManifold
+from .manifold import AbstractManifold
 
 
 class Baumgarte(AbstractManifold):

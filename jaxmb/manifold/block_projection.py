@@ -7,13 +7,13 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..formulations import BlockMultipliers
-from ..formulations._base import check_independent
+from ..formulations.formulation import check_independent
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, Adams, ManifoldEvaluation
 from ..system import AbstractSystem
 from ..system.chain import chain_of
 from ..system.corrector import corrector
-from ._base import AbstractManifold, newton_tolerance
 from .free import VectorField
+from .manifold import AbstractManifold, newton_tolerance
 from .nearest import nearest
 from .projection import ProjectedSolver
 

@@ -17,9 +17,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar
-from ..elimination import Factor, Order, factor, solve_positive
 from ..formulations import AbstractFormulation
-from ..formulations._base import solve_constrained
+from ..formulations.formulation import solve_constrained
+from ..linalg.elimination import Factor, Order, factor, solve_positive
 from ..system import AbstractSystem
 
 _MAX_ITERATIONS = 12

@@ -6,7 +6,7 @@ import equinox as eqx
 from .._types import State
 from ..formulations import AbstractFormulation, accelerations
 from ..system import AbstractSystem
-from ._base import AbstractManifold
+from .manifold import AbstractManifold
 
 
 class Free(AbstractManifold):

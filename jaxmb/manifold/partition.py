@@ -13,13 +13,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import State
-from ..elimination import factor, full_pivot
 from ..formulations import AbstractFormulation
-from ..formulations._base import check_mass, stages
+from ..formulations.formulation import check_mass, stages
+from ..linalg.elimination import factor, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
-from ._base import AbstractManifold, newton_tolerance
 from .constrained import (
     Evaluation,
     Split,
@@ -32,6 +31,7 @@ from .constrained import (
     shared,
 )
 from .free import VectorField
+from .manifold import AbstractManifold, newton_tolerance
 
 # A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
 _AGE = 4

@@ -13,13 +13,13 @@ from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar, State
-from ..elimination import full_pivot, solve_positive
+from ..linalg.elimination import full_pivot, solve_positive
 from ..solvers import Adams
 from ..system import AbstractSystem, DiagonalInertia
 from ..system.chain import is_long
 from ..system.corrector import corrector
-from ._base import AbstractManifold
 from .free import VectorField
+from .manifold import AbstractManifold
 from .nearest import nearest
 
 _ITERATIONS = 8

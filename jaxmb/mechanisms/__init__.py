@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from .._names import unknown
+from ..parts.names import unknown
 from . import ride as ride
-from ._base import Mechanism as Mechanism, References as References
 from .andrews import andrews as andrews
 from .appell_hamel import appell_hamel as appell_hamel
 from .benenti import benenti as benenti
@@ -21,6 +20,7 @@ from .hanging_chain import hanging_chain as hanging_chain
 from .heavy_top import heavy_top as heavy_top
 from .knife_edge import knife_edge as knife_edge
 from .longitudinal_train import longitudinal_train as longitudinal_train
+from .mechanism import Mechanism as Mechanism, References as References
 from .n_four_bar import n_four_bar as n_four_bar
 from .nonholonomic_cart import nonholonomic_cart as nonholonomic_cart
 from .parallelogram import parallelogram as parallelogram

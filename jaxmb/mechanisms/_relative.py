@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..planar import DraftGear
 from ..system import AbstractInertia, AbstractSystem, DenseInertia
-from ..system._base import Ranks
+from ..system.equation import Ranks
 
 
 class RelativeInertia(AbstractInertia):

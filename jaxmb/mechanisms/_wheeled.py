@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
-from .._parts import array
 from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
+from ..parts.base import array
 from ..scene import Scene
 from ..system import parameters as parameters_of
 from ..trajectory import Trajectory
-from ._base import Observation, point_motion
+from .mechanism import Observation, point_motion
 
 COORDINATES = ("x", "y", "theta", "phi")
 FORMS = ("frame", "constraints", "connection")

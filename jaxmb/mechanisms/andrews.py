@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import planar
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 # Lengths [m] along the bodies, in the letters of the source.
 _F, _FE = 0.007, 0.028

@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import spatial
-from .._forces import Gravity
-from .._parts import array
-from .._user import VelocityConstraint
 from ..lagrangian import LagrangianSystem, Nonholonomic
+from ..parts.base import array
+from ..parts.forces import Gravity
+from ..parts.functions import VelocityConstraint
 from ..scene import Scene
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
 @mechanism(variants=("model",))

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
-from .._user import VelocityConstraint
 from ..lagrangian import LagrangianSystem, Nonholonomic
+from ..parts.forces import Gravity
+from ..parts.functions import VelocityConstraint
 from ..scene import Scene
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
 @mechanism(variants=("model",))

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
-from .._user import Constraint, Force
-from ..rotations import norm
+from ..linalg.rotations import norm
+from ..parts.forces import Gravity
+from ..parts.functions import Constraint, Force
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 
 @mechanism()

@@ -5,7 +5,7 @@ import numpy as np
 
 from .. import planar
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism, point_motion
 
 
 @mechanism()

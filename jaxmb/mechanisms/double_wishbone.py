@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import rotations, spatial
-from .._forces import Gravity
-from .._names import unknown
+from .. import spatial
 from .._types import VectorLike
-from .._user import Force
-from ..assembly import assemble
+from ..linalg import rotations
+from ..parts.forces import Gravity
+from ..parts.functions import Force
+from ..parts.names import unknown
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from ..states.assembly import assemble
+from .mechanism import Mechanism, References, build, mechanism
 
 _POINTS = {
     "lower_front": (0.14, 0.36, 0.24),

@@ -4,7 +4,7 @@ import numpy as np
 
 from .. import spatial
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 
 @mechanism()

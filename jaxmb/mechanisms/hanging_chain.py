@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
+from ..parts.forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 
 @mechanism()

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._parts import array
 from .._types import State, VectorLike
-from ..planar._space import PLANE
-from ._base import Mechanism, build, mechanism
+from ..parts.base import array
+from ..parts.planar.kinematics import PLANE
 from ._relative import RelativeTrain, velocities
+from .mechanism import Mechanism, build, mechanism
 from .train import braking, check_train, davis, of_each, running_resistance
 
 

@@ -5,8 +5,8 @@ from typing import Literal
 import numpy as np
 
 from ..lagrangian import AbstractEquations
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 from ._wheeled import observe_bodies, wheeled, wheeled_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
 @mechanism(variants=("model",))

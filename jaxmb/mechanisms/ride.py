@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._types import VectorLike
 from ..system import parameters
 from ..trajectory import Trajectory
-from ._base import point_acceleration
+from .mechanism import point_acceleration
 
 PREFIXES = ("", "rear_")
 

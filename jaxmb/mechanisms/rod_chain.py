@@ -3,9 +3,9 @@
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
+from ..parts.forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism, point_motion
 
 
 @mechanism(variants=("n",))

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import rotations, spatial
-from .._forces import Gravity
+from .. import spatial
+from ..linalg import rotations
+from ..parts.forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 
 @mechanism()

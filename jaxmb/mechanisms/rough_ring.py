@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
 from ..lagrangian import Friction, Holonomic, LagrangianSystem
+from ..parts.forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
 @mechanism(variants=("model",))

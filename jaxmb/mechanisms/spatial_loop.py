@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from .. import rotations, spatial
-from .._forces import Gravity
+from .. import spatial
+from ..linalg import rotations
+from ..parts.forces import Gravity
 from ..scene import Scene
-from ._base import Mechanism, build, mechanism, point_motion
+from .mechanism import Mechanism, build, mechanism, point_motion
 
 
 @mechanism()

@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import rotations, spatial
-from .._user import Force
+from .. import spatial
 from ..lagrangian import Holonomic, LagrangianSystem
+from ..linalg import rotations
+from ..parts.functions import Force
 from ..scene import Scene
 from ..system import parameters as parameters_of
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 _COUPLER = ((0.06, -0.004, 0.0), (-0.004, 0.05, 0.0), (0.0, 0.0, 0.03))
 _CENTRES = ((0.02, -0.05, 0.1), (0.05, -0.12, 0.15), (0.0, -0.08, 0.12))

@@ -4,8 +4,8 @@ import numpy as np
 
 from .. import planar
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism, point_motion
 from .four_bar import four_bar
+from .mechanism import Mechanism, References, build, mechanism, point_motion
 
 
 @mechanism()

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import planar
-from .._parts import array
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
+from ..parts.base import array
 from ..scene import Scene
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 
 @mechanism(variants=("gait", "model"))

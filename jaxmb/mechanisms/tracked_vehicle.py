@@ -5,15 +5,16 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from .. import contact, planar
-from .._forces import Gravity
+from .. import planar
 from .._types import State, VectorLike
-from .._user import Force
+from ..parts import contact
+from ..parts.forces import Gravity
+from ..parts.functions import Force
+from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
-from ..statics import equilibrium
+from ..states.equilibrium import equilibrium
 from ..system import parameters, with_parameters
-from ..terrain import AbstractTerrain, Bump
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
 # Arm pivots of five wheels, in the hull [m]; of other numbers they lie evenly between the outer ones.

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._servo import Servo as ServoOfJoint
-from .._user import Constraint, Force
 from ..lagrangian import LagrangianSystem, Servo
+from ..parts.functions import Constraint, Force
+from ..parts.servo import Servo as ServoOfJoint
 from ..scene import Scene
-from ._base import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
 _MASSES = ("one", "two", "three")
 

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from .._forces import Gravity
-from .._parts import AbstractForce, array, number
 from .._types import VectorLike
-from .._user import Force
+from ..parts.base import AbstractForce, array, number
+from ..parts.forces import Gravity
+from ..parts.functions import Force
 from ..scene import Scene
-from ._base import Mechanism, References, build, mechanism
+from .mechanism import Mechanism, References, build, mechanism
 
 
 @mechanism()

@@ -1,18 +1,18 @@
 """Parts of planar scenes."""
 
-from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
-from .._friction import Friction as Friction
-from ..contact import Contact as Contact
-from .bodies import Body as Body, PointMass as PointMass, box as box, disc as disc, rod as rod
-from .couplers import DraftGear as DraftGear
-from .drivers import Driver as Driver
-from .forces import (
+from ..parts.contact import Contact as Contact
+from ..parts.forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from ..parts.friction import Friction as Friction
+from ..parts.planar.bodies import Body as Body, PointMass as PointMass, box as box, disc as disc, rod as rod
+from ..parts.planar.draft_gear import DraftGear as DraftGear
+from ..parts.planar.drivers import Driver as Driver
+from ..parts.planar.forces import (
     BumpStop as BumpStop,
     Bushing as Bushing,
     Torque as Torque,
     TorsionalSpringDamper as TorsionalSpringDamper,
 )
-from .joints import (
+from ..parts.planar.joints import (
     Distance as Distance,
     Fixed as Fixed,
     Gear as Gear,
@@ -22,5 +22,5 @@ from .joints import (
     RackAndPinion as RackAndPinion,
     Revolute as Revolute,
 )
-from .nonholonomic import KnifeEdge as KnifeEdge
-from .track import Track as Track
+from ..parts.planar.knife_edge import KnifeEdge as KnifeEdge
+from ..parts.planar.track import Track as Track

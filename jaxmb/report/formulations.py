@@ -12,9 +12,9 @@ import numpy as np
 from jax import lax
 
 from .._types import State
-from ..elimination import Order, factor, full_pivot
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations._base import every_row, solve_constrained, stages
+from ..formulations.formulation import every_row, solve_constrained, stages
+from ..linalg.elimination import Order, factor, full_pivot
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
 from .timing import interleaved

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from .._figure import new_figure
+from ..viz.figure import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around ter
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._base import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ._base import Args, Chart, Y
 from ._evaluation import check_real, check_term, derivative, first_chart, next_chart
 from ._order import StepEstimate
 from ._tolerances import Tolerances, norm_of
+from .manifold_term import Args, Chart, Y
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar

@@ -11,7 +11,6 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._base import Chart
 from ._evaluation import controlled_components, evaluate, next_chart, ravel, restore, unravel_like
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
 from ._interpolation import RateInterpolation
@@ -19,6 +18,7 @@ from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, choose_order
 from ._stiffness import Stiffness, none_found, observed
 from ._tolerances import Tolerances, norm_of
+from .manifold_term import Chart
 
 # The error that a step aims at, in units of the tolerance.
 _TARGET = 0.2

@@ -13,10 +13,10 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._base import Args, Y
 from ._evaluation import check_real, ravel, unravel_like
 from ._order import StepEstimate
 from ._tolerances import MultistepNorm, norm_of
+from .manifold_term import Args, Y
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
 _WITHOUT_ESTIMATE = 0.25

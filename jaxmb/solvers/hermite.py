@@ -13,7 +13,6 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._base import Chart
 from ._damping import are_damped, is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
 from ._formulas import FAMILIES, Family, double, formulas, start
@@ -23,6 +22,7 @@ from ._interpolation import MultistepInterpolation, RateInterpolation, StateInte
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._tolerances import Tolerances
+from .manifold_term import Chart
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
 _NEWTON = 0.01

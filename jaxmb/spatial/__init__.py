@@ -1,9 +1,9 @@
 """Parts of spatial scenes."""
 
-from .._forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
-from .._friction import Friction as Friction
-from ..contact import Contact as Contact
-from .bodies import (
+from ..parts.contact import Contact as Contact
+from ..parts.forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
+from ..parts.friction import Friction as Friction
+from ..parts.spatial.bodies import (
     Body as Body,
     PointMass as PointMass,
     box as box,
@@ -12,9 +12,13 @@ from .bodies import (
     rod as rod,
     sphere as sphere,
 )
-from .drivers import Driver as Driver
-from .forces import Bushing as Bushing, Torque as Torque, TorsionalSpringDamper as TorsionalSpringDamper
-from .joints import (
+from ..parts.spatial.drivers import Driver as Driver
+from ..parts.spatial.forces import (
+    Bushing as Bushing,
+    Torque as Torque,
+    TorsionalSpringDamper as TorsionalSpringDamper,
+)
+from ..parts.spatial.joints import (
     Cylindrical as Cylindrical,
     Distance as Distance,
     Fixed as Fixed,
@@ -27,4 +31,4 @@ from .joints import (
     Spherical as Spherical,
     Universal as Universal,
 )
-from .nonholonomic import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere
+from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere

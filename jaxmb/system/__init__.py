@@ -1,6 +1,6 @@
 """The equation of constrained motion, and the compiled rigid-body system."""
 
-from ._base import AbstractSystem as AbstractSystem
+from .equation import AbstractSystem as AbstractSystem
 from .inertia import (
     AbstractInertia as AbstractInertia,
     BlockInertia as BlockInertia,

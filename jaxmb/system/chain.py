@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..block_tridiagonal import BlockTridiagonal
-from ._base import AbstractSystem
+from ..linalg.block_tridiagonal import BlockTridiagonal
+from .equation import AbstractSystem
 from .inertia import AbstractInertia
 from .layout import Layout, pick
 from .rigid_bodies import RigidBodySystem

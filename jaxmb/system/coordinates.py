@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._names import unknown
-from .._namespace import as_array, replaced
 from .._types import VectorLike
+from ..linalg.arrays import as_array, replaced
+from ..parts.names import unknown
 from .layout import Layout
 
 

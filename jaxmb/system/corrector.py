@@ -4,9 +4,9 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State
-from ..block_tridiagonal import BlockFactor
-from ._base import AbstractSystem
+from ..linalg.block_tridiagonal import BlockFactor
 from .chain import BlockJacobian, block_jacobian
+from .equation import AbstractSystem
 from .inertia import AbstractInertia
 
 

@@ -5,8 +5,8 @@ import html
 from collections import Counter
 from collections.abc import Iterable
 
-from ._base import AbstractSystem
 from .chain import is_long
+from .equation import AbstractSystem
 from .rigid_bodies import RigidBodySystem
 
 

@@ -11,8 +11,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._parts import AbstractPart
 from .._types import Scalar
+from ..parts.base import AbstractPart
 from .layout import Layout, pick
 
 

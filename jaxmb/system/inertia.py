@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..elimination import cholesky, solve_positive
-from ..rotations import cross
+from ..linalg.elimination import cholesky, solve_positive
+from ..linalg.rotations import cross
 
 
 class AbstractInertia(eqx.Module):

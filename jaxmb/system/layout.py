@@ -6,7 +6,7 @@ import functools
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._space import AbstractSpace
+from ..parts.space import AbstractSpace
 
 
 def pick(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:

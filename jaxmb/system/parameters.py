@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from .._names import unknown
-from .._namespace import is_traced, replaced
-from .._parts import array
 from .._types import VectorLike
-from ._base import AbstractSystem
+from ..linalg.arrays import is_traced, replaced
+from ..parts.base import array
+from ..parts.names import unknown
+from .equation import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
 

@@ -10,9 +10,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..rotations import cross, rotate
-from ._base import AbstractSystem, Ranks
+from ..linalg.rotations import cross, rotate
 from .coordinates import coordinate_names, rate_names
+from .equation import AbstractSystem, Ranks
 from .groups import (
     AbstractConstraintGroup,
     ConstraintGroup,

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._figure import new_figure
 from ..system import RigidBodySystem
 from ..trajectory import Trajectory
+from .figure import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._figure import new_figure
-from .._names import unknown
+from ..parts.names import unknown
 from ..system import RigidBodySystem
 from ..trajectory import Trajectory
+from .figure import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,9 +15,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import jaxmb as mb
-from jaxmb import rotations
 from jaxmb.formulations import Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba, accelerations
 from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Servo
+from jaxmb.linalg import rotations
 
 ROADS = [Partitioned(), Multipliers(), NullSpace(), Poincare(), UdwadiaKalaba()]
 INERTIAS = np.array([np.diag([1.0, 2.0, 3.0]), [[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 1.8]]])

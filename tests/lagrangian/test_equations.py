@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import mechanisms, rotations
-from jaxmb.elimination import full_pivot
+from jaxmb import mechanisms
 from jaxmb.formulations import Multipliers, Partitioned, accelerations
 from jaxmb.lagrangian import (
     Connection,
@@ -25,6 +24,8 @@ from jaxmb.lagrangian import (
     pivoted_frame,
     structure_functions,
 )
+from jaxmb.linalg import rotations
+from jaxmb.linalg.elimination import full_pivot
 from jaxmb.mechanisms import _wheeled
 
 ZERO = jnp.zeros(())

@@ -1,0 +1,217 @@
+"""The structure of a Lagrangian system: shapes, ranks, and whether its mass matrix is diagonal."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..linalg.elimination import full_pivot
+from ..parts.names import unknown
+from ..states.assembly import nearest, residual_size, tolerance
+from ..system.equation import Ranks
+from .constraints import AbstractConstraint, Holonomic
+from .dataflow import depends
+
+if TYPE_CHECKING:
+    from .system import LagrangianSystem
+
+# With so many sets of parameters a matrix is looked at.
+_LOOKS = 3
+
+
+def count_rows(system: "LagrangianSystem") -> tuple[int, ...]:
+    """The number of rows of each constraint, from shapes alone.
+
+    **Raises:** `ValueError` for functions of the wrong shape.
+    """
+    q, p = system.guess.q, system.parameters
+    t = jnp.zeros((), q.dtype)
+    _shape("kinematics", (q.size,), lambda: system.rates(t, q, system.guess.u))
+    _shape("lagrangian", (), lambda: system.lagrangian(t, q, q, p))
+    if system.applied is not None:
+        applied = system.applied
+        _shape("force", (q.size,), lambda: applied(t, q, q, p))
+    sizes = []
+    for c in system.constraints:
+        row = lambda c=c: c(t, q, q, p) if isinstance(c, AbstractConstraint) else c.residual(t, q, q, q, p)
+        sizes.append(int(np.prod(_shape(c.name, None, row))))
+    return tuple(sizes)
+
+
+def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[[], Any]) -> tuple[int, ...]:
+    try:
+        shape = jax.eval_shape(lambda: jnp.asarray(evaluate())).shape
+    except TypeError as error:
+        raise ValueError(f"{name} does not fit the system: {error}") from error
+    if expected is not None and shape != expected:
+        raise ValueError(f"{name} must have shape {expected}, got {shape}.")
+    return shape
+
+
+class Structure(NamedTuple):
+    """What the numbers of a system tell.
+
+    **Fields:** `diagonal`: whether the mass matrix is diagonal, and constant; `regular`: whether it is positive
+    definite, in the velocities and at the guess; `ranks`, near the guess on the constraints.
+    """
+
+    diagonal: bool
+    regular: bool
+    ranks: Ranks
+
+
+def find_structure(system: "LagrangianSystem") -> Structure:
+    """Evaluate a system's functions at its guess, and eliminate.
+
+    **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
+    the guess, and laws of constraints that are not there, or whose own force is not determined.
+    """
+    q, p = system.guess.q, system.parameters
+    t = jnp.zeros((), q.dtype)
+    # A matrix that depends on where the system is might have other entries elsewhere.
+    constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
+    found = jax.tree.map(np.asarray, _evaluate(system, constant))
+    if not np.all(np.isfinite(found.rates)):
+        raise ValueError(
+            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at q = {q.tolist()}: no "
+            "rates were found that belong to them."
+        )
+    if not np.all(np.isfinite(found.mass)) or not np.any(found.mass):
+        raise ValueError(
+            f"The Lagrangian needs finite second derivatives with respect to the rates, and not all of them zero; at "
+            f"the guess they are {found.mass.tolist()}."
+        )
+    for c, slope in zip(_between_velocities(system), found.slopes, strict=True):
+        if not np.all(np.isfinite(slope)):
+            raise ValueError(f"{c.name}: its derivative with respect to the rates is not finite at the guess.")
+    if not found.residual <= tolerance(q.dtype):
+        names = ", ".join(c.name for c in system.constraints if isinstance(c, Holonomic))
+        raise ValueError(
+            f"The constraints {names} cannot be satisfied near q = {q.tolist()}: a scaled residual of "
+            f"{float(found.residual):.2g} remains."
+        )
+    if not np.all(np.isfinite(found.jacobian)):
+        raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
+    position, velocity, acceleration, *others = map(int, found.row_ranks)
+    if system.linear:
+        rows = slice(0, system.velocity_rows)
+        _check_consistent(system, "velocities", found.jacobian[rows], -found.unmet, rows)
+    # What binds velocities is left alone here: the guess need not satisfy it.
+    rows = slice(system.velocity_rows, system.acceleration_rows)
+    _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
+    _check_nonideal(system, acceleration, others)
+    diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
+    sizes = np.linalg.eigvalsh(found.inertia)
+    regular = bool(sizes[0] > np.finfo(q.dtype).eps ** 0.75 * sizes[-1])
+    return Structure(bool(diagonal), regular, Ranks(position, int(found.coordinate_rank), velocity, acceleration))
+
+
+class _Numbers(NamedTuple):
+    """Rates, second derivatives of L and mass matrix at the guess, second derivatives with other parameters; slopes of
+    the constraints between velocities; the residual that remains of the constraints between positions; A, γ, ψ, and
+    the ranks of some rows of A.
+    """
+
+    rates: Any
+    mass: Any
+    inertia: Any
+    masses: Any
+    slopes: tuple[Any, ...]
+    residual: Any
+    coordinate_rank: Any
+    jacobian: Any
+    right: Any
+    unmet: Any
+    row_ranks: Any
+
+
+@eqx.filter_jit
+def _evaluate(system: "LagrangianSystem", constant: bool) -> _Numbers:
+    """All that needs the user's functions, in one compiled function."""
+    q, u, p = system.guess.q, system.guess.u, system.parameters
+    t = jnp.zeros((), q.dtype)
+    v = system.rates(t, q, u)
+    hessian = jax.hessian(system.lagrangian, 2)
+    looks = jnp.arange(_LOOKS if constant else 0, dtype=q.dtype)
+    masses = jax.vmap(lambda k: hessian(t, q, v, jax.tree.map(lambda x: _shaken(x, k), p)))(looks)
+    slopes = tuple(jax.jacfwd(c, 2)(t, q, v, p) for c in _between_velocities(system))
+    residual, coordinate_rank = jnp.zeros((), q.dtype), jnp.array(0)
+    mass, inertia = hessian(t, q, v, p), system.inertia(t, q, u).product(jnp.eye(u.size, dtype=q.dtype))
+    if system.position_rows:
+        q, near = nearest(system, t, q, system.coordinate_scale())
+        residual = residual_size(system, t, q, near)
+        coordinate_rank = full_pivot(system.coordinate_jacobian(t, q)).rank
+    jacobian = system.jacobian(t, q, u)
+    rank = lambda own: full_pivot(jnp.where(own[:, None], jacobian, 0.0)).rank
+    return _Numbers(
+        rates=v,
+        mass=mass,
+        inertia=inertia,
+        masses=masses,
+        slopes=slopes,
+        residual=residual,
+        coordinate_rank=coordinate_rank,
+        jacobian=jacobian,
+        right=-system.acceleration_residual(t, q, u, jnp.zeros_like(u)),
+        unmet=system.velocity_residual(t, q, u),
+        row_ranks=jax.vmap(rank)(_row_sets(system)),
+    )
+
+
+def _shaken(x: Array, k: Array) -> Array:
+    """A parameter with each of its numbers changed by a share of its own."""
+    return x * (1 + 0.1 * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
+
+
+def _row_sets(system: "LagrangianSystem") -> np.ndarray:
+    """Masks of the rows whose ranks are asked for: between positions, between velocities, all, and for each law that
+    is not ideal those of the other constraints.
+    """
+    names = np.array([name for name, _ in system.rows], dtype=str)
+    rows = np.arange(names.size)
+    others = [names != law.constraint for law in system.nonideal]
+    return np.stack([rows < system.position_rows, rows < system.velocity_rows, rows >= 0, *others])
+
+
+def _between_velocities(system: "LagrangianSystem") -> list[AbstractConstraint]:
+    return [c for c in system.constraints if isinstance(c, AbstractConstraint) and not isinstance(c, Holonomic)]
+
+
+def _check_consistent(
+    system: "LagrangianSystem", what: str, jacobian: np.ndarray, right: np.ndarray, rows: slice
+) -> None:
+    """Raise a `ValueError` naming the constraints among some rows that contradict others at the guess."""
+    if right.size == 0:
+        return
+    left_over = np.abs(right - jacobian @ np.linalg.lstsq(jacobian, right, rcond=None)[0])
+    bound = left_over[rows] > 1e-8 * (1.0 + np.max(np.abs(right)))
+    wrong = dict.fromkeys(name for (name, _), own in zip(system.rows[rows], bound, strict=True) if own)
+    if wrong:
+        raise ValueError(
+            f"The constraints {', '.join(wrong)} contradict each other: no {what} satisfy them together at the guess."
+        )
+
+
+def _check_nonideal(system: "LagrangianSystem", rank: int, others: list[int]) -> None:
+    """Raise a `ValueError` unless every law is of a constraint whose force is determined.
+
+    `rank` of all rows; `others`: for each law that of the rows of the other constraints.
+    """
+    names = [name for name, _ in system.rows]
+    for law, rest in zip(system.nonideal, others, strict=True):
+        if law.constraint not in names:
+            raise ValueError(
+                f"{type(law).__name__} is of a constraint {law.constraint!r}, but there are {sorted(set(names))}."
+            )
+        coefficient = getattr(law, "coefficient", None)
+        if coefficient is not None and coefficient not in system.parameters:
+            raise unknown("parameter", coefficient, system.parameters)
+        if rest + names.count(law.constraint) > rank:
+            raise ValueError(
+                f"{type(law).__name__} of {law.constraint!r}: the force of this constraint is not determined, because "
+                "other constraints imply some of its rows. Leave the redundant ones out."
+            )

@@ -1,0 +1,1 @@
+"""Linear algebra and rotation algebra that the rest is built on."""

@@ -1,0 +1,172 @@
+"""Rotations: Euler parameters (unit quaternions, scalar first), planar rotations, and norms that differentiate at zero.
+
+Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
+components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p`
+are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`. What is made of NumPy's
+arrays alone is NumPy's.
+
+Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the Dynamic Analysis of Three-Dimensional
+Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._types import Scalar, VectorLike
+from .arrays import as_array, namespace
+
+# Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would
+# make a kernel of every slice and every stack of components.
+
+
+def _tables():
+    epsilon = np.zeros((3, 3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        epsilon[i, j, k], epsilon[i, k, j] = 1.0, -1.0
+    product = np.zeros((4, 4, 4))  # (a b)_i = product[i, j, k] a_j b_k
+    product[0, 0, 0] = 1.0
+    product[0, 1:, 1:] = -np.eye(3)
+    product[1:, 0, 1:] = product[1:, 1:, 0] = np.eye(3)
+    product[1:, 1:, 1:] = epsilon
+    conjugate = np.array([1.0, -1.0, -1.0, -1.0])
+    # R v is the vector part of p v p*.
+    rotation = np.einsum("iam,akj,m->ijkm", product[1:], product[:, :, 1:], conjugate)
+    return epsilon, product, conjugate, rotation, 0.5 * product[:, :, 1:]
+
+
+_CROSS, _MULTIPLY, _CONJUGATE, _ROTATION, _RATES = _tables()
+
+
+def _constant(table: np.ndarray, like: Array) -> np.ndarray:
+    return table.astype(like.dtype, copy=False)
+
+
+def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
+    """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
+    # Pairs as one axis: under a few `vmap`s, arrays of rank seven and more are what jaxlib 0.10.2 and 0.11.0 hang on.
+    pairs = (a[:, None] * b[None, :]).reshape(-1)
+    return (_constant(table.reshape(-1, pairs.size), a) * pairs[None, :]).sum(axis=1)
+
+
+def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
+    """Euclidean norm over the last axis, with derivative zero (not NaN) at the zero vector."""
+    xp = namespace(x)
+    square = (x * x).sum(axis=-1)
+    positive = square > 0
+    return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
+
+
+def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
+    """World components of the body vector `v` in a planar frame turned by `angle` [rad]."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Matrix from body to world components, `(e0² − e·e) I + 2 e eᵀ + 2 e0 ẽ`."""
+    return _bilinear(_ROTATION, p, p).reshape(3, 3)
+
+
+def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
+    """World components of the body vector `v`."""
+    return (rotation_matrix(p) * v[None, :]).sum(axis=1)
+
+
+def unrotate(p: Float[Array, "4"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Body components of the world vector `v_W`."""
+    return (rotation_matrix(p) * v_W[:, None]).sum(axis=0)
+
+
+def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Vector product."""
+    return _bilinear(_CROSS, a, b)
+
+
+def skew(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix `ã` of the vector product, `ã b = a × b`."""
+    return (_constant(_CROSS, a) * a[None, :, None]).sum(axis=1)
+
+
+def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Euler parameters of the inverse rotation."""
+    return p * _constant(_CONJUGATE, p)
+
+
+def multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Euler parameters of rotation `b` followed, in the world, by rotation `a`: R(a b) = R(a) R(b)."""
+    return _bilinear(_MULTIPLY, a, b)
+
+
+def rates(p: Float[Array, "4"], omega: Float[Array, "3"]) -> Float[Array, "4"]:
+    """`ṗ = ½ Lᵀ ω′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
+    return _bilinear(_RATES, p, omega)
+
+
+def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array, "3"]:
+    """`½ L g`: the body torque that does the work of the gradient `g` with respect to Euler parameters.
+
+    This is the adjoint of `rates`.
+    """
+    return _bilinear(_RATES.transpose(2, 1, 0), p, gradient)
+
+
+def matrix_rates(R: Float[Array, "3 3"], omega: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`Ṙ = R ω̃′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
+    return jnp.sum(R[:, :, None] * skew(omega)[None, :, :], axis=1)
+
+
+def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The body torque that does the work of the gradient with respect to a rotation matrix.
+
+    This is the adjoint of `matrix_rates`.
+    """
+    work = jnp.sum(R[:, :, None] * gradient[:, None, :], axis=0)
+    return jnp.sum(_constant(_CROSS, R) * work[:, None, :], axis=(0, 2))
+
+
+def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Array, "3"]:
+    """`ω′ = 2 L ṗ` [rad/s], in the body frame."""
+    return 4.0 * pull_back(p, pdot)
+
+
+def normalize(p: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    """The nearest unit Euler parameters."""
+    return p / norm(p)[..., None]
+
+
+def from_axis_angle(axis: VectorLike, angle: Scalar) -> Float[Array, "4"]:
+    """Euler parameters of a turn by `angle` [rad] about the unit vector `axis`."""
+    dtype = jnp.result_type(float)
+    axis, half = as_array(axis, dtype), as_array(angle, dtype) / 2
+    xp = namespace(axis, half)
+    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * axis]))
+
+
+def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
+    """Euler parameters of a rotation matrix (body to world), with the best conditioned of the four formulas."""
+    matrix: Any = as_array(R, jnp.result_type(float))
+    xp, t = namespace(matrix), matrix.trace()
+    squares = xp.concatenate([(1.0 + t)[None], 1.0 + 2.0 * xp.diag(matrix) - t])  # 4 e_k²
+    difference = matrix - matrix.T
+    antisymmetric = xp.stack([difference[2, 1], difference[0, 2], difference[1, 0]])
+    symmetric = matrix + matrix.T
+    symmetric = symmetric + xp.diag(squares[1:] - xp.diag(symmetric))
+    # columns[k] = 4 e_k (e0, e1, e2, e3)
+    columns = xp.concatenate([antisymmetric[:, None], symmetric], axis=1)
+    columns = xp.concatenate([xp.concatenate([squares[:1], antisymmetric])[None], columns])
+    return jax.device_put(normalize(columns[xp.argmax(squares)]))
+
+
+def to_xyzw(p: Float[ArrayLike, "... 4"]) -> Float[Array, "... 4"]:
+    """Scalar last, as SciPy, ROS and pinocchio write quaternions."""
+    return jnp.roll(jnp.asarray(p), -1, axis=-1)
+
+
+def from_xyzw(p: Float[ArrayLike, "... 4"]) -> Float[Array, "... 4"]:
+    """Scalar first, from the order of SciPy, ROS and pinocchio."""
+    return jnp.roll(jnp.asarray(p), 1, axis=-1)

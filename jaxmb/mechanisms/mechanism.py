@@ -1,0 +1,227 @@
+"""What a mechanism of the library is: a system with a consistent state, and values to compare its motion with."""
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from .._types import State, VectorLike
+from ..parts.names import unknown
+from ..scene import Scene
+from ..states.assembly import assemble
+from ..system import AbstractSystem, with_parameters
+from ..trajectory import Trajectory
+
+Observation = dict[str, Array]
+
+# How a machine that has a Lagrangian on paper is built.
+Model = Literal["lagrangian", "rigid_bodies"]
+
+
+@dataclasses.dataclass(frozen=True)
+class References:
+    """Values of a motion that do not come from this package.
+
+    **Fields:**
+
+    - `times` [s]: when, ascending, shape (times,).
+    - `labels`: what, as in `Mechanism.observe`.
+    - `values`: shape (times, labels), in SI units.
+    - `source`: where they come from.
+    - `tolerance`: the relative error up to which the values themselves can be trusted.
+    """
+
+    times: np.ndarray
+    labels: tuple[str, ...]
+    values: np.ndarray
+    source: str
+    tolerance: float
+
+    def __post_init__(self):
+        object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
+        object.__setattr__(self, "values", np.asarray(self.values, dtype=float))
+        if self.values.shape != (len(self.times), len(self.labels)):
+            raise ValueError(
+                f"References need a value for each of {len(self.times)} times and {len(self.labels)} labels, "
+                f"got shape {self.values.shape}."
+            )
+
+    @property
+    def scales(self) -> np.ndarray:
+        """The size that errors of a label are relative to: its largest value, or 1 if that is zero; shape (labels,)."""
+        largest = np.max(np.abs(self.values), axis=0)
+        return np.where(largest > 1e-12, largest, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """A mechanism of the library, ready to run: `simulate(m.system, m.state, t1=m.t1)`.
+
+    **Fields:**
+
+    - `name`: as in `names()`.
+    - `scene`: its parts, to build on: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`;
+        None for a system from a Lagrangian.
+    - `system`, `state`: the system, and a consistent state of it at t = 0.
+    - `t1`: the end of the motion that it is known for [s].
+    - `references`: values to compare with, or None where there are none (other parameters than the published ones).
+    - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the
+        references.
+    - `description`: what it is and where its data come from.
+    - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
+    - `start(system, guess)`: how the state was made, or None where it was assembled and no more.
+    - `beside`: keyword arguments of other machines of this name that belong beside it in a report.
+    """
+
+    name: str
+    scene: Any
+    system: Any
+    state: State
+    t1: float
+    references: References | None
+    observe: Callable[[Trajectory], Observation]
+    description: str
+    fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
+    rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
+    start: Callable[[Any, State], State] | None = None
+    beside: tuple[Mapping[str, Any], ...] = ()
+
+    def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
+        """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
+
+        Errors are relative to the largest reference value of their label.
+
+        **Raises:** `ValueError` if there are no references, or none of their times was saved.
+        """
+        if self.references is None:
+            raise ValueError(f"There are no reference values for {self.name!r} with these parameters.")
+        times, saved = self.references.times, np.asarray(trajectory.ts)
+        near = np.isclose(saved[None, :], times[:, None], rtol=0.0, atol=1e-12 * max(1.0, float(times[-1])))
+        own, where = np.nonzero(near)
+        if own.size == 0:
+            raise ValueError(
+                f"The trajectory of {self.name!r} was saved at none of the reference times {times.tolist()}; "
+                "use simulate(..., saveat=mechanism.references.times)."
+            )
+        observed = self.observe(trajectory)
+        return {
+            label: np.abs(np.asarray(observed[label])[where] - self.references.values[own, k]) / scale
+            for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
+        }
+
+    def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
+        """The same mechanism with some parameters replaced, its state made again near the present one; also under
+        `jit`.
+
+        **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
+        """
+        system = with_parameters(self.system, values)
+        if self.start is None:
+            state = assemble(system, self.state, fix=self.fix, rates=self.rates)
+        else:
+            state = self.start(system, self.state)
+        return dataclasses.replace(self, system=system, state=state, references=None)
+
+
+def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mechanism]], Callable[..., Mechanism]]:
+    """Make a function a member of the library: its references hold for the default values of its parameters only.
+
+    **Arguments:** `variants`: parameters for whose values the function itself chooses the references.
+    """
+
+    def decorate(function: Callable[..., Mechanism]) -> Callable[..., Mechanism]:
+        defaults = {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
+
+        @functools.wraps(function)
+        def build(**parameters: Any) -> Mechanism:
+            for name in parameters:
+                if name not in defaults:
+                    raise unknown(f"parameter of {function.__name__}", name, defaults)
+            made = function(**parameters)
+            published = all(name in variants or _same(value, defaults[name]) for name, value in parameters.items())
+            return made if published else dataclasses.replace(made, references=None)
+
+        return build
+
+    return decorate
+
+
+def _same(value: Any, default: Any) -> bool:
+    if isinstance(value, Tracer):
+        return False
+    return value is default or (default is not None and value is not None and np.array_equal(value, default))
+
+
+def point_motion(trajectory: Trajectory, body: str, s: VectorLike) -> tuple[Array, Array]:
+    """Position [m] and velocity [m/s] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
+    system = trajectory.system
+    space, k = system.layout.space, system.body_names.index(body)
+    s = jnp.asarray(s, float)
+
+    def at(y):
+        pose, velocity = system.poses(y.q)[k], system.velocities(y.u)[k]
+        return space.point(pose, s), space.point_velocity(pose, velocity, s)
+
+    return jax.vmap(at)(trajectory.ys)
+
+
+def point_acceleration(trajectory: Trajectory, body: str, s: VectorLike) -> Array:
+    """Acceleration [m/s²] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
+    system = trajectory.system
+    space, k = system.layout.space, system.body_names.index(body)
+    s = jnp.asarray(s, float)
+    velocity = lambda q, u: space.point_velocity(system.poses(q)[k], system.velocities(u)[k], s)
+    at = lambda y, qdot, udot: jax.jvp(velocity, (y.q, y.u), (qdot, udot))[1]
+    return jax.vmap(at)(trajectory.ys, trajectory.rates, trajectory.accelerations)
+
+
+def build(
+    name: str,
+    scene: Scene | AbstractSystem,
+    *,
+    t1: float,
+    observe: Callable[[Trajectory], Observation],
+    description: str,
+    references: References | None = None,
+    fix: Mapping[str, VectorLike] | None = None,
+    rates: Mapping[str, VectorLike] | None = None,
+    start: Callable[[Any, State], State] | None = None,
+    beside: tuple[Mapping[str, Any], ...] = (),
+) -> Mechanism:
+    """Compile and assemble a scene, or assemble a system, into a mechanism."""
+    fix, rates = fix or {}, rates or {}
+    parts = scene if isinstance(scene, Scene) else None
+    system: Any = scene if parts is None else parts.compile()
+    state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
+    observe = eqx.filter_jit(observe)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start, beside)
+
+
+def of_bodies(model: Model, **defaults: bool) -> bool:
+    """Whether a mechanism is to be a scene of rigid bodies, and not a system from its Lagrangian.
+
+    **Arguments:** `defaults`: by name, whether a parameter that says how the Lagrangian is written has its default.
+
+    **Raises:** `ValueError` for an unknown model, and for a way to write the Lagrangian of rigid bodies.
+    """
+    if model not in get_args(Model):
+        raise ValueError(f"The models are {', '.join(get_args(Model))}; got {model!r}.")
+    chosen = [name for name, default in defaults.items() if not default]
+    if model == "rigid_bodies" and chosen:
+        raise ValueError(f"model='rigid_bodies' has no Lagrangian to write: leave out {', '.join(chosen)}.")
+    return model == "rigid_bodies"
+
+
+def observe_coordinates(trajectory: Trajectory) -> Observation:
+    """The coordinates of a system from a Lagrangian by their names, and its velocities as `u0`, `u1`, …."""
+    names = trajectory.system.coordinate_names()
+    rates = {f"u{k}": trajectory.ys.u[:, k] for k in range(trajectory.system.nu)}
+    return {name: trajectory[name] for name in names} | rates

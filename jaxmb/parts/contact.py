@@ -1,0 +1,269 @@
+"""Compliant contact of bodies with terrain: a law of the normal force, a law of friction, and the force that they make.
+
+A body touches the ground as a disc or a sphere around one of its points, or with the point itself. The ground yields:
+the deeper the body is in it, the harder it pushes, so contact adds no constraint and no event.
+"""
+
+import abc
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..linalg.rotations import norm
+from .base import AbstractForce, number, optional_number
+from .functions import names
+from .resolve import fill, label, positive
+from .smooth import ramp, step
+from .terrain import AbstractTerrain
+
+_MAY_BE_ZERO = ("cohesive_modulus", "frictional_modulus", "coefficient", "cohesion", "friction_angle")
+
+Number = Float[Array, ""]
+Vector = Float[Array, "d"]
+
+
+class AbstractNormalLaw(eqx.Module):
+    """Normal force as a function of the depth of penetration; the same on the way in and out."""
+
+    @abc.abstractmethod
+    def force(self, depth: Number) -> Number:
+        """Normal force [N] at a depth [m] > 0."""
+
+    @abc.abstractmethod
+    def energy(self, depth: Number) -> Number:
+        """The work [J] that was done against it from no depth on."""
+
+
+class Linear(AbstractNormalLaw):
+    """`stiffness depth`.
+
+    **Arguments:** `stiffness` [N/m].
+    """
+
+    stiffness: Number = eqx.field(converter=number)
+
+    def force(self, depth):
+        return self.stiffness * depth
+
+    def energy(self, depth):
+        return 0.5 * self.stiffness * depth**2
+
+
+class Hertz(AbstractNormalLaw):
+    """`stiffness depth^1.5`, of elastic bodies that touch in a point.
+
+    **Arguments:** `stiffness` [N/m^1.5], of a sphere of radius R on a plane `4/3 E √R` with
+    `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
+    """
+
+    stiffness: Number = eqx.field(converter=number)
+
+    def force(self, depth):
+        return self.stiffness * depth**1.5
+
+    def energy(self, depth):
+        return self.stiffness * depth**2.5 / 2.5
+
+
+class Bekker(AbstractNormalLaw):
+    """Bekker's pressure and sinkage of soil, `area (cohesive_modulus / width + frictional_modulus) depth^exponent`.
+
+    The soil springs back: a rut stays where there is none to remember it.
+
+    Source: M. G. Bekker, "Introduction to Terrain-Vehicle Systems", University of Michigan Press 1969.
+
+    **Arguments:** `cohesive_modulus` k_c [N/m^(n+1)] ≥ 0; `frictional_modulus` k_φ [N/m^(n+2)] ≥ 0; `exponent` n > 0;
+    `width` b [m], the smaller side of the patch that presses; `area` [m²] of it.
+    """
+
+    cohesive_modulus: Number = eqx.field(converter=number, kw_only=True)
+    frictional_modulus: Number = eqx.field(converter=number, kw_only=True)
+    exponent: Number = eqx.field(converter=number, kw_only=True)
+    width: Number = eqx.field(converter=number, kw_only=True)
+    area: Number = eqx.field(converter=number, kw_only=True)
+
+    def force(self, depth):
+        return self.area * (self.cohesive_modulus / self.width + self.frictional_modulus) * depth**self.exponent
+
+    def energy(self, depth):
+        return self.force(depth) * depth / (self.exponent + 1)
+
+
+class AbstractFriction(eqx.Module):
+    """Force along the ground against slip."""
+
+    @abc.abstractmethod
+    def force(self, load: Number, engaged: Number, slip: Vector, travel: Vector) -> Vector:
+        """Force [N] on the body.
+
+        **Arguments:** `load`: normal force [N]; `engaged`: from 0 off the ground to 1 in full contact; `slip`: velocity
+        along the ground [m/s] of the body's lowest point; `travel`: that of its centre.
+        """
+
+
+class Coulomb(AbstractFriction):
+    """Coulomb friction, smooth through zero slip: `coefficient load tanh(slip / transition_speed)`.
+
+    A body at rest on a slope creeps, the slower the smaller `transition_speed` is.
+
+    **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, of slip, where 76 % of the friction is there.
+    """
+
+    coefficient: Number = eqx.field(converter=number)
+    transition_speed: Number = eqx.field(converter=number, kw_only=True)
+
+    def force(self, load, engaged, slip, travel):
+        del engaged, travel
+        s = slip / self.transition_speed
+        square = jnp.dot(s, s)
+        small = square < 1e-3
+        size = jnp.sqrt(jnp.where(small, 1.0, square))
+        series = 1 - square * (1 / 3 - square * (2 / 15 - square * (17 / 315)))
+        return -self.coefficient * load * jnp.where(small, series, jnp.tanh(size) / size) * s
+
+
+class Janosi(AbstractFriction):
+    """Shear of soil by Janosi and Hanamoto, `τ = (c + p tan φ) (1 − exp(−j/K))`, under a patch along which the shear
+    displacement j grows evenly to slip ratio times length.
+
+    The slip ratio is slip over the speed of travel or of the turning circumference, whichever is larger; below
+    `transition_speed` they are not told from zero.
+
+    Source: Z. Janosi and B. Hanamoto, "The analytical determination of drawbar pull as a function of slip for tracked
+    vehicles in deformable soils", 1st ISTVS Conference, Torino 1961.
+
+    **Arguments:** `cohesion` c [Pa] ≥ 0; `friction_angle` φ [rad]; `shear_modulus` K [m] > 0, the displacement;
+    `length` [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
+    """
+
+    cohesion: Number = eqx.field(converter=number, kw_only=True)
+    friction_angle: Number = eqx.field(converter=number, kw_only=True)
+    shear_modulus: Number = eqx.field(converter=number, kw_only=True)
+    length: Number = eqx.field(converter=number, kw_only=True)
+    area: Number = eqx.field(converter=number, kw_only=True)
+    transition_speed: Number = eqx.field(converter=number, kw_only=True)
+
+    def force(self, load, engaged, slip, travel):
+        strength = self.cohesion * self.area * engaged + load * jnp.tan(self.friction_angle)
+        speed = lambda v: jnp.sqrt(jnp.dot(v, v) + self.transition_speed**2)
+        reference = 0.5 * (speed(travel) + speed(travel - slip) + speed(slip))
+        scale = self.length / (self.shear_modulus * reference)
+        x = scale * norm(slip)
+        small = x < 0.02
+        other = jnp.where(small, 1.0, x)
+        series = 1 / 2 - x * (1 / 6 - x * (1 / 24 - x * (1 / 120 - x * (1 / 720 - x / 5040))))
+        # The mean of 1 − exp(−j/K) for j/K from 0 to x, over x.
+        return -strength * scale * jnp.where(small, series, (other + jnp.expm1(-other)) / other**2) * slip
+
+
+class Contact(AbstractForce):
+    """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
+
+    The depth δ of a body in the ground is smoothed, `½ (d + √(d² + smoothing²))` for a distance d below it, and has a
+    potential, the energy of `normal`. To its force come damping against the velocity across the ground,
+    `damping onset(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body leaves.
+
+    **Arguments:**
+
+    - `bodies`: one name or several, with one terrain, one law and so one set of parameters for all of them.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
+    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
+    - `points` [m], the centres, body-fixed, shape (d,) or (bodies, d), default the mass centres.
+    - `damping` [N s/m] ≥ 0; `damping_depth` [m] > 0, from which on it is all there; `onset`: its way there, `"smooth"`
+        with two continuous derivatives or `"linear"`.
+    - `smoothing` [m] > 0. Far above the ground it leaves a depth of `smoothing² / (4 |d|)`.
+    - `depth`: `"normal"` to the terrain, exact on even ground and to first order in its curvature, or `"vertical"` for
+        small slopes: depth and damping along the vertical, friction along the horizontal.
+    """
+
+    name: str = eqx.field(static=True)
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
+    terrain: AbstractTerrain = eqx.field(kw_only=True)
+    normal: AbstractNormalLaw = eqx.field(kw_only=True)
+    friction: AbstractFriction | None = eqx.field(default=None, kw_only=True)
+    radius: Float[Array, "*n"] = eqx.field(converter=number, default=0.0, kw_only=True)
+    points: Float[Array, "*n d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    damping: Number = eqx.field(converter=number, default=0.0, kw_only=True)
+    damping_depth: Number = eqx.field(converter=number, default=0.01, kw_only=True)
+    smoothing: Number = eqx.field(converter=number, default=1e-3, kw_only=True)
+    onset: Literal["smooth", "linear"] = eqx.field(static=True, default="smooth", kw_only=True)
+    depth: Literal["normal", "vertical"] = eqx.field(static=True, default="normal", kw_only=True)
+    conservative: ClassVar[bool] = True
+
+    def __check_init__(self):
+        for field, choices in {"onset": ("smooth", "linear"), "depth": ("normal", "vertical")}.items():
+            if getattr(self, field) not in choices:
+                raise ValueError(f"{label(self)}: {field} must be one of {choices}, got {getattr(self, field)!r}.")
+        for field, kind, where in (
+            ("terrain", AbstractTerrain, "jaxmb.terrain"),
+            ("normal", AbstractNormalLaw, "jaxmb.contact"),
+            ("friction", AbstractFriction | None, "jaxmb.contact"),
+        ):
+            if not isinstance(getattr(self, field), kind):
+                raise ValueError(f"{label(self)}: {field} must be a law from {where}, got {getattr(self, field)!r}.")
+
+    def resolve(self, space, poses):
+        part = fill(self, "points", np.zeros(space.dimension))
+        n, d = len(self.bodies), space.dimension
+        for field, shapes in {"radius": ((), (n,)), "points": ((d,), (n, d))}.items():
+            shape = getattr(part, field).shape
+            if shape not in shapes:
+                raise ValueError(f"{label(self)}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
+        for field, zero in {"radius": True, "damping": True, "damping_depth": False, "smoothing": False}.items():
+            positive(self, field, getattr(self, field), zero=zero)
+        for field, law in {"normal": self.normal, "friction": self.friction}.items():
+            for own in () if law is None else law.__dataclass_fields__:
+                positive(self, f"{field}.{own}", getattr(law, own), zero=own in _MAY_BE_ZERO)
+        return part
+
+    def wrenches(self, space, poses, velocities, t):
+        return self._each(space, lambda *own: self._wrench(space, *own), poses, velocities)
+
+    def energy(self, space, poses, t):
+        single = lambda pose, point, radius: self.normal.energy(self._depth(space.point(pose, point), radius))
+        return jnp.sum(self._each(space, single, poses))
+
+    def _each(self, space, single, *of_bodies):
+        """`single(…, point, radius)` of every body."""
+        n = len(self.bodies)
+        points, radii = jnp.broadcast_to(self.points, (n, space.dimension)), jnp.broadcast_to(self.radius, (n,))
+        return jax.vmap(single)(*of_bodies, points, radii)
+
+    def _depth(self, centre, radius):
+        """Depth of the lowest point of a body, smoothed."""
+        above = centre[-1] - self.terrain.height(centre[:-1])
+        if self.depth == "normal":
+            slope = jax.grad(self.terrain.height)(centre[:-1])
+            above = above / jnp.sqrt(1 + jnp.dot(slope, slope))
+        return ramp(radius - above, self.smoothing)
+
+    def _normal(self, centre):
+        """The direction out of the ground."""
+        up = jnp.zeros_like(centre).at[-1].set(1.0)
+        if self.depth == "vertical":
+            return up
+        slope = jax.grad(self.terrain.height)(centre[:-1])
+        return up.at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
+
+    def _wrench(self, space, pose, velocity, point, radius):
+        centre, travel = space.point(pose, point), space.point_velocity(pose, velocity, point)
+        depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
+        load, normal = self.normal.force(depth), self._normal(centre)
+        engaged = depth / self.damping_depth
+        engaged = step(engaged) if self.onset == "smooth" else jnp.clip(engaged, 0.0, 1.0)
+        # Centre and lowest point are the same to a normal force.
+        wrench = space.point_force(
+            pose, point, -load * gradient - self.damping * engaged * jnp.dot(travel, normal) * normal
+        )
+        if self.friction is None:
+            return wrench
+        lowest = space.body_point(pose, centre - radius * normal)
+        along = lambda v: v - jnp.dot(v, normal) * normal
+        slip = along(space.point_velocity(pose, velocity, lowest))
+        friction = self.friction.force(load, engaged, slip, along(travel))
+        return wrench + space.point_force(pose, lowest, friction)

@@ -1,0 +1,82 @@
+"""Friction of joints, from their own reactions."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..linalg.rotations import norm
+from .base import AbstractNonIdeal, number, optional_number, rows_of
+from .resolve import fill, label, positive, vector
+
+
+class Friction(AbstractNonIdeal):
+    """Coulomb friction in a joint: `coefficient` times the force that the joint bears, against its slip.
+
+    The slip s is the relative velocity of the bodies at the joint's point (of a single body: that against the ground)
+    together with `radius` times their relative angular velocity, so that one law holds for pins, slides and cylinders.
+    The generalized force on it is `−μ N s / √(s·s + smoothing²)`: smooth, and full only where the slip is large
+    against `smoothing`. N is the length of the reaction force that the joint would exert if all joints were ideal; its
+    moments count for nothing.
+
+    **Arguments:**
+
+    - `joint`: its name. Its force must be determined: no other joint may imply any of its rows.
+    - `coefficient` μ ≥ 0.
+    - `radius` [m] ≥ 0 of the pin or ball, default zero: sliding only.
+    - `point` [m]: where the bodies slide on one another, fixed in the joint's last body; default the joint's point
+        there, or the mass centre if it has none.
+    - `smoothing` [m/s].
+
+    Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",
+    Proc. R. Soc. A 463, 2007.
+    """
+
+    name: str = eqx.field(static=True)
+    joint: str = eqx.field(static=True)
+    coefficient: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    radius: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+    point: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    smoothing: Float[Array, ""] = eqx.field(converter=number, default=1e-4, kw_only=True)
+
+    def resolve(self, space, joint, poses):
+        for field in ("coefficient", "radius"):
+            positive(self, field, getattr(self, field), zero=True)
+        positive(self, "smoothing", self.smoothing)
+        if poses.shape[0] > 2:
+            raise ValueError(f"{label(self)}: {joint.name!r} is between more than two bodies; use NonIdeal.")
+        own = getattr(joint, "point_b", None)
+        own = getattr(joint, "point", None) if own is None else own
+        part = fill(self, "point", np.zeros(space.dimension) if own is None else own)
+        vector(part, "point", part.point, space.dimension)
+        part._check_slip(space, joint, poses)
+        return part
+
+    def _check_slip(self, space, joint, poses):
+        columns = poses.shape[0] * space.velocity_size
+        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in joint.components()]
+        _, sizes, directions = np.linalg.svd(np.concatenate(rows))
+        allowed = directions[np.sum(sizes > 1e-9 * sizes[0]) :].reshape(-1, poses.shape[0], space.velocity_size)
+        slips = jax.vmap(lambda v: self.slip(space, poses, v))(jnp.asarray(allowed))
+        if not np.any(np.abs(slips) > 1e-9):
+            raise ValueError(
+                f"{label(self)}: {joint.name!r} allows no slip at its point; give the radius of its pin or ball."
+            )
+
+    def slip(self, space, poses, velocities):
+        """Velocity of slip [m/s]: at the point, world axes, then `radius` times the relative angular velocity."""
+        d = space.dimension
+        turn = (lambda pose, v: space.direction(pose, v[d:])) if d == 3 else (lambda pose, v: v[d:])
+        sliding = space.point_velocity(poses[-1], velocities[-1], self.point)
+        turning = turn(poses[-1], velocities[-1])
+        if poses.shape[0] == 2:
+            point_a = space.body_point(poses[0], space.point(poses[-1], self.point))
+            sliding = sliding - space.point_velocity(poses[0], velocities[0], point_a)
+            turning = turning - turn(poses[0], velocities[0])
+        return jnp.concatenate([sliding, self.radius * turning])
+
+    def wrenches(self, space, poses, velocities, reactions, t):
+        slip, pull = jax.vjp(lambda v: self.slip(space, poses, v), velocities)
+        normal = norm(reactions[-1, : space.dimension])
+        return pull(-self.coefficient * normal * slip / jnp.sqrt(slip @ slip + self.smoothing**2))[0]

@@ -1,0 +1,1 @@
+"""Parts of planar scenes, one family a file."""

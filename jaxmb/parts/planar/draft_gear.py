@@ -1,0 +1,121 @@
+"""Couplers between the vehicles of a train."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...linalg.rotations import norm
+from ..base import AbstractForce, number, optional_number
+from ..forces import between_points, fill_points, separation, separation_rate
+from ..resolve import fill, label, positive
+
+
+class DraftGear(AbstractForce):
+    r"""A friction draft gear: slack, then a preloaded spring with dry friction, then a solid stop; in both directions.
+
+    The force acts along the line between the two points. With the extension `s` (length less `free_length`, negative
+    in buff), the stroke is `x = s − slack` in draft and `x = −s − slack` in buff, and the force against it is
+
+    $$(S_0\,p(x) + k\,r(x))\,(\frac{1 + \eta}{2} + \frac{1 - \eta}{2} \tanh\frac{\dot x}{v_0})
+      + k_s\,r(x - x_\text{max}) + c\,p(x)\,\dot x$$
+
+    so that a loading gear follows the spring and an unloading one η times it: a cycle to the stroke δ dissipates
+    `(1 − η)(½ k δ² + S₀ δ)`. The step p and the ramp r, its integral, are 0 and x⁺ but for |x| < `smoothing`/2, where
+    polynomials join them with three continuous derivatives of the ramp. Without slack, preload and friction the force
+    is exactly `k s`. Friction and damper only ever dissipate.
+
+    At zero length the direction is undefined and the force is taken as zero; `free_length` should exceed slack and
+    stroke.
+
+    **Arguments:**
+
+    - `stiffness` k [N/m] ≥ 0 when loading; `unloading` η, between 0 and 1, the share that is left when unloading.
+    - `preload` S₀ [N] ≥ 0; `slack` [m] ≥ 0, to either side.
+    - `travel` x_max [m] > 0, the stroke at which the stop is reached, and its `stop_stiffness` k_s [N/m] ≥ 0.
+    - `damping` c [N s/m] ≥ 0, where there is no slack.
+    - `transition` v₀ [m/s] > 0, the speed at which friction has reached three quarters of its value; `smoothing` [m]
+        > 0. The smaller they are, the shorter the steps.
+    - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the mass
+        centres.
+    """
+
+    name: str = eqx.field(static=True)
+    body_a: str = eqx.field(static=True)
+    body_b: str = eqx.field(static=True)
+    stiffness: Float[Array, ""] = eqx.field(converter=number, default=1e7, kw_only=True)
+    unloading: Float[Array, ""] = eqx.field(converter=number, default=0.4, kw_only=True)
+    preload: Float[Array, ""] = eqx.field(converter=number, default=5e4, kw_only=True)
+    slack: Float[Array, ""] = eqx.field(converter=number, default=0.02, kw_only=True)
+    travel: Float[Array, ""] = eqx.field(converter=number, default=0.11, kw_only=True)
+    stop_stiffness: Float[Array, ""] = eqx.field(converter=number, default=1e8, kw_only=True)
+    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+    transition: Float[Array, ""] = eqx.field(converter=number, default=0.01, kw_only=True)
+    smoothing: Float[Array, ""] = eqx.field(converter=number, default=0.005, kw_only=True)
+    free_length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    conservative: ClassVar[bool] = True
+
+    @property
+    def bodies(self):
+        return (self.body_a, self.body_b)
+
+    def resolve(self, space, poses):
+        for field in ("travel", "transition", "smoothing"):
+            positive(self, field, getattr(self, field))
+        for field in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "damping"):
+            positive(self, field, getattr(self, field), zero=True)
+        if self.unloading > 1:
+            raise ValueError(
+                f"{label(self)}: unloading is the share of the force that is left, at most 1, got {self.unloading}; "
+                "a gear must not give back more than it took."
+            )
+        part = fill_points(self, space)
+        if part.free_length is None:
+            part = fill(part, "free_length", norm(separation(space, part, poses)))
+        positive(part, "free_length", part.free_length, zero=True)
+        return part
+
+    def tension(self, extension: Float[Array, "..."], rate: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The force [N], positive in draft, at an extension [m] and its rate [m/s]."""
+        return self._against(extension - self.slack, rate) - self._against(-extension - self.slack, -rate)
+
+    def stored(self, extension: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The energy [J] of the springs: that of the mean of loading and unloading, from which friction only takes."""
+        return self._stored(extension - self.slack) + self._stored(-extension - self.slack)
+
+    def wrenches(self, space, poses, velocities, t):
+        d, rate = separation(space, self, poses), separation_rate(space, self, poses, velocities)
+        square = jnp.dot(d, d)
+        apart = square > 0
+        length = jnp.sqrt(jnp.where(apart, square, 1.0))
+        tension = self.tension(length - self.free_length, jnp.dot(d, rate) / length)
+        return between_points(space, self, poses, -jnp.where(apart, tension / length, 0.0) * d)
+
+    def energy(self, space, poses, t):
+        return self.stored(norm(separation(space, self, poses)) - self.free_length)
+
+    def _against(self, stroke, rate):
+        step, ramp, _ = self._engaged(stroke)
+        spring = self.preload * step + self.stiffness * ramp
+        friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * jnp.tanh(rate / self.transition)
+        _, stop, _ = self._engaged(stroke - self.travel)
+        return spring * friction + self.stop_stiffness * stop + self.damping * step * rate
+
+    def _stored(self, stroke):
+        _, ramp, area = self._engaged(stroke)
+        _, _, stop = self._engaged(stroke - self.travel)
+        return 0.5 * (1 + self.unloading) * (self.preload * ramp + self.stiffness * area) + self.stop_stiffness * stop
+
+    def _engaged(self, x):
+        """A smooth step from 0 to 1, its integral and the integral of that."""
+        width = self.smoothing
+        z = jnp.clip(x / width + 0.5, 0.0, 1.0)
+        beyond = jnp.maximum(x - 0.5 * width, 0.0)
+        step = z**3 * (10 + z * (6 * z - 15))
+        ramp = z**4 * (2.5 + z * (z - 3))
+        area = z**5 * (0.5 + z * (z / 7 - 0.5))
+        # With x = width/2 + beyond: the ramp is x, its integral x²/2 + width²/56.
+        return step, width * ramp + beyond, width**2 * area + beyond * (0.5 * width + 0.5 * beyond)

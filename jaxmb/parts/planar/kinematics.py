@@ -1,0 +1,79 @@
+"""Kinematics of a body in the plane."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from ...linalg.arrays import namespace
+from ..space import AbstractSpace
+
+
+class PlanarSpace(AbstractSpace):
+    """Poses (x, y, angle), velocities (ẋ, ẏ, angular rate); y is up, angles counter-clockwise.
+
+    A prepared pose carries cosine and sine of its angle as well, (x, y, angle, cos, sin).
+    """
+
+    dimension: ClassVar[int] = 2
+    pose_size: ClassVar[int] = 3
+    velocity_size: ClassVar[int] = 3
+    ground: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
+
+    def point(self, pose, s):
+        return pose[:2] + _turned(pose, s)
+
+    def point_velocity(self, pose, velocity, s):
+        arm = _turned(pose, s)
+        return velocity[:2] + velocity[2] * jnp.stack([-arm[1], arm[0]])
+
+    def point_force(self, pose, s, force_W):
+        arm = _turned(pose, s)
+        return jnp.concatenate([force_W, (arm[0] * force_W[1] - arm[1] * force_W[0])[None]])
+
+    def direction(self, pose, v):
+        return _turned(pose, v)
+
+    def body_point(self, pose, point_W):
+        return _turned_back(pose, point_W - pose[:2])
+
+    def body_direction(self, pose, v_W):
+        return _turned_back(pose, v_W)
+
+    def prepare(self, pose):
+        return jnp.concatenate([pose, jnp.cos(pose[2:3]), jnp.sin(pose[2:3])])
+
+    def rates(self, pose, velocity):
+        if not _prepared(pose):
+            return velocity
+        return jnp.concatenate([velocity, velocity[2] * jnp.stack([-pose[4], pose[3]])])
+
+    def pull_back(self, pose, gradient):
+        if not _prepared(pose):
+            return gradient
+        turning = gradient[2] - gradient[3] * pose[4] + gradient[4] * pose[3]
+        return jnp.concatenate([gradient[:2], turning[None]])
+
+    def normalize(self, pose):
+        return pose
+
+
+def _prepared(pose):
+    return pose.shape[0] == 5
+
+
+def _cos_sin(pose):
+    xp = namespace(pose)
+    return (pose[3], pose[4]) if _prepared(pose) else (xp.cos(pose[2]), xp.sin(pose[2]))
+
+
+def _turned(pose, v):
+    c, s = _cos_sin(pose)
+    return namespace(pose, v).stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+def _turned_back(pose, v):
+    c, s = _cos_sin(pose)
+    return namespace(pose, v).stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
+
+
+PLANE = PlanarSpace()

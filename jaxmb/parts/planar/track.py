@@ -1,0 +1,117 @@
+"""Tracks and belts: a closed elastic loop around wheels."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._types import VectorLike
+from ...linalg.rotations import norm
+from ..base import AbstractForce, number, optional_number
+from ..forces import generalized_force
+from ..resolve import fill, label, positive
+
+
+class Track(AbstractForce):
+    """A closed elastic track or belt without mass around points of any number of bodies.
+
+    Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential
+    `pretension (length − free_length) + ½ stiffness (length − free_length)²`. Without `radii` the track is a polygon
+    through the points; with them it runs around circles, straight between their tangents, and slips on them without
+    friction, so it turns none. Either is taken to touch every wheel, also one that has risen above the line between its
+    neighbours.
+
+    **Arguments:**
+
+    - `path`: pairs (body, point), in the order of the track, at least 3 of them; points [m] are body-fixed, shape (2,).
+        A body may come several times.
+    - `pretension` [N] ≥ 0, at the free length; `stiffness` [N/m] ≥ 0.
+    - `free_length` [m], default that of the given poses.
+    - `radii` [m] ≥ 0, shape (points,), of circles around the points, inside a track whose path is counter-clockwise.
+
+    **Fields:** `bodies`, each once; `owners`, for each point the place of its body among them; `points`.
+    """
+
+    name: str = eqx.field(static=True)
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    owners: tuple[int, ...] = eqx.field(static=True)
+    points: Float[Array, "n 2"]
+    pretension: Float[Array, ""]
+    stiffness: Float[Array, ""]
+    free_length: Float[Array, ""]
+    radii: Float[Array, "n"] | None
+    conservative: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        name: str,
+        path: Sequence[tuple[str, VectorLike]],
+        *,
+        pretension: Any,
+        stiffness: Any,
+        free_length: Any = None,
+        radii: VectorLike | None = None,
+    ):
+        self.name = name
+        self.bodies = tuple(dict.fromkeys(body for body, _ in path))
+        self.owners = tuple(self.bodies.index(body) for body, _ in path)
+        self.points = number([np.asarray(point, float) for _, point in path])
+        self.pretension, self.stiffness = number(pretension), number(stiffness)
+        self.free_length, self.radii = optional_number(free_length), optional_number(radii)
+
+    def __check_init__(self):
+        n = len(self.owners)
+        if n < 3 or self.points.shape != (n, 2):
+            raise ValueError(
+                f"{label(self)}: path must hold at least 3 pairs (body, point) with points of shape (2,), got {n} with "
+                f"points of shape {self.points.shape[1:]}."
+            )
+        if self.radii is not None and self.radii.shape != (n,):
+            raise ValueError(f"{label(self)}: radii must have shape ({n},), one each point, got {self.radii.shape}.")
+
+    def resolve(self, space, poses):
+        for field in ("pretension", "stiffness", *(() if self.radii is None else ("radii",))):
+            positive(self, field, getattr(self, field), zero=True)
+        if self.radii is not None:
+            distance, more = norm(self._lines(space, poses)), jnp.roll(self.radii, -1) - self.radii
+            if jnp.any(distance <= jnp.abs(more)):
+                raise ValueError(f"{label(self)}: a circle lies in its neighbour; leave it out, or make it smaller.")
+        return fill(self, "free_length", self.length(space, poses))
+
+    def _lines(self, space, poses):
+        """From each point to the next."""
+        points = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        return jnp.roll(points, -1, axis=0) - points
+
+    def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
+        """Length of the track [m]."""
+        d = self._lines(space, poses)
+        if self.radii is None:
+            return jnp.sum(norm(d))
+        square = jnp.sum(d * d, axis=1)
+        more = jnp.roll(self.radii, -1) - self.radii
+        straight = jnp.sqrt(square - more**2)
+        # The unit vector along a tangent, turned from the line of centres towards the smaller circle.
+        across = jnp.stack([-d[:, 1], d[:, 0]], axis=1)
+        along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
+        into = jnp.roll(along, 1, axis=0)
+        turn = jnp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], jnp.sum(into * along, axis=1))
+        # A track turns back at its ends, by half a turn or more, and never as much as a quarter the other way.
+        turn = jnp.where(turn < -0.5 * jnp.pi, turn + 2 * jnp.pi, turn)
+        return jnp.sum(straight) + jnp.dot(self.radii, turn)
+
+    def tension(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
+        """Tension [N]."""
+        return self.pretension + self.stiffness * (self.length(space, poses) - self.free_length)
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda length, rate: -(self.pretension + self.stiffness * (length - self.free_length))
+        return generalized_force(space, lambda p: self.length(space, p), poses, velocities, law)
+
+    def energy(self, space, poses, t):
+        stretch = self.length(space, poses) - self.free_length
+        return self.pretension * stretch + 0.5 * self.stiffness * stretch**2

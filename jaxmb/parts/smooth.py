@@ -1,0 +1,19 @@
+"""Smooth forms of functions with a kink."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar
+
+
+def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
+    """`½ (d + √(d² + width²))`, a smooth and always positive `max(d, 0)`."""
+    root = jnp.sqrt(d * d + width * width)
+    # Below zero the same without cancellation, so that powers of it stay finite far away.
+    return jnp.where(d > 0, 0.5 * (d + root), 0.5 * width * width / (root - jnp.where(d > 0, 0.0, d)))
+
+
+def step(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """From 0 at s ≤ 0 to 1 at s ≥ 1 with two continuous derivatives."""
+    s = jnp.clip(s, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)

@@ -1,0 +1,1 @@
+"""Parts of spatial scenes, one family a file."""

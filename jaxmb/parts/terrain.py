@@ -1,0 +1,184 @@
+"""Terrains: heights as smooth functions of the place, for contacts with the ground.
+
+A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
+where z is up. Terrains that are profiles along x go on unchanged across it, so they serve in both.
+"""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .base import array, number
+from .functions import numbers
+from .smooth import step
+
+Place = Float[Array, "h"]
+
+
+class AbstractTerrain(eqx.Module):
+    """Ground whose height is a function of the place; its numbers are parameters of the contact that it belongs to,
+    `"contact.terrain.field"`.
+    """
+
+    @abc.abstractmethod
+    def height(self, place: Place) -> Float[Array, ""]:
+        """Height [m] above the world's origin at a place [m], continuously differentiable."""
+
+
+class Flat(AbstractTerrain):
+    """Level ground.
+
+    **Arguments:** `level` [m].
+    """
+
+    level: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    def height(self, place):
+        return self.level
+
+
+class Bump(AbstractTerrain):
+    """A single bump, `peak sin²(π s)` with `s = (x − start) / length` in (0, 1); C¹, and smooth but at its ends.
+
+    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `peak` [m], its height, negative for a ditch.
+    """
+
+    start: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    length: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    peak: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+
+    def __check_init__(self):
+        _check_positive(self, "length", self.length)
+
+    def height(self, place):
+        s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
+        return self.peak * jnp.sin(jnp.pi * s) ** 2
+
+
+class Sinusoid(AbstractTerrain):
+    """Waves along x, `amplitude sin(2π x / wavelength + phase)`.
+
+    **Arguments:** `amplitude` [m]; `wavelength` [m] > 0; `phase` [rad].
+    """
+
+    amplitude: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    wavelength: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    phase: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+
+    def __check_init__(self):
+        _check_positive(self, "wavelength", self.wavelength)
+
+    def height(self, place):
+        return self.amplitude * jnp.sin(2 * jnp.pi * place[0] / self.wavelength + self.phase)
+
+
+class Slope(AbstractTerrain):
+    """A plane that rises along x.
+
+    **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.
+    """
+
+    gradient: Float[Array, ""] = eqx.field(converter=number)
+    level: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+
+    def height(self, place):
+        return self.level + self.gradient * place[0]
+
+
+class Ramp(AbstractTerrain):
+    """A way up from one level to another, a polynomial of degree five with level, straight ends; C².
+
+    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `rise` [m], negative for a way down; its steepest
+    gradient is `1.875 rise / length`, in the middle.
+    """
+
+    start: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    length: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    rise: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+
+    def __check_init__(self):
+        _check_positive(self, "length", self.length)
+
+    def height(self, place):
+        return self.rise * step((place[0] - self.start) / self.length)
+
+
+class Spline(AbstractTerrain):
+    """A profile through measured points; C², and in every place a function of the four nearest points alone.
+
+    Between two points a polynomial of degree five, whose slopes and curvatures at the points are those of the parabolas
+    through a point and its two neighbours. Beyond the first and the last point it goes on straight.
+
+    **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
+    """
+
+    x: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
+    heights: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
+
+    def __check_init__(self):
+        if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:
+            raise ValueError(
+                f"Spline: x and heights must be vectors of the same length, at least 3, got shapes {self.x.shape} and "
+                f"{self.heights.shape}."
+            )
+        if not isinstance(self.x, Tracer) and np.any(np.diff(self.x) <= 0):
+            raise ValueError("Spline: x must ascend; sort the points, and leave out repeated ones.")
+
+    def height(self, place):
+        n = self.x.shape[0]
+        x = jnp.clip(place[0], self.x[0], self.x[-1])
+        k = jnp.clip(jnp.searchsorted(self.x, x, side="right") - 1, 0, n - 2)
+        h = self.x[k + 1] - self.x[k]
+        (y0, m0, c0), (y1, m1, c1) = self._at_point(k), self._at_point(k + 1)
+        # What the straight line through both points leaves over, from slopes and curvatures at either.
+        chord = (y1 - y0) / h
+        a, b = (m0 - chord) * h, (chord - m1) * h
+        c, d = 0.5 * c0 * h * h, 0.5 * c1 * h * h
+        s = (x - self.x[k]) / h
+        r = 1 - s
+        inside = y0 + (y1 - y0) * s
+        inside += a * s * r**3 * (1 + 3 * s) + b * s**3 * r * (1 + 3 * r) + c * s**2 * r**3 + d * s**3 * r**2
+        before, after = place[0] - self.x[0], place[0] - self.x[-1]
+        first = (self.heights[1] - self.heights[0]) / (self.x[1] - self.x[0])
+        last = (self.heights[-1] - self.heights[-2]) / (self.x[-1] - self.x[-2])
+        return inside + jnp.minimum(before, 0.0) * first + jnp.maximum(after, 0.0) * last
+
+    def _at_point(self, k):
+        """Height, slope and curvature at a point; at the ends those of the straight continuation."""
+        n = self.x.shape[0]
+        i = jnp.clip(k, 1, n - 2)
+        left, right = self.x[i] - self.x[i - 1], self.x[i + 1] - self.x[i]
+        back = (self.heights[i] - self.heights[i - 1]) / left
+        ahead = (self.heights[i + 1] - self.heights[i]) / right
+        slope = (back * right + ahead * left) / (left + right)
+        curvature = 2 * (ahead - back) / (left + right)
+        end = (k == 0) | (k == n - 1)
+        return (
+            self.heights[k],
+            jnp.where(end, jnp.where(k == 0, back, ahead), slope),
+            jnp.where(end, 0.0, curvature),
+        )
+
+
+class Surface(AbstractTerrain):
+    """Ground from a function, `function(place, parameters)`.
+
+    **Arguments:** `function(place, parameters)`: height [m] at a place, twice differentiable by JAX; `parameters`:
+    numbers by name, parameters of the system `"contact.terrain.key"`.
+    """
+
+    function: Callable[[Place, dict[str, Array]], Float[Array, ""]] = eqx.field(static=True)
+    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+
+    def height(self, place):
+        return jnp.reshape(self.function(place, self.parameters), ())
+
+
+def _check_positive(terrain, field, value):
+    if not isinstance(value, Tracer) and not value > 0:
+        raise ValueError(f"{type(terrain).__name__}: {field} must be positive, got {value}.")

@@ -1,0 +1,1 @@
+"""Initial states, equilibria, and the ranks of constraints."""

@@ -1,0 +1,275 @@
+"""Static equilibrium: a configuration in which nothing starts to move.
+
+At rest the applied forces and those of the constraints balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search
+follows the forces along the displacements that the constraints allow, by Newton's method with the curvatures of the
+potential made positive and with bounded steps, so that it goes down to where a conservative system rests and not up to
+where it would be balanced. Derivatives are those of the balance, by the implicit function theorem.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar, State, VectorLike
+from ..linalg.arrays import as_array, is_traced
+from ..linalg.rotations import norm
+from ..system import AbstractSystem
+from .assembly import configuration, tangent_solve, tolerance
+
+_ITERATIONS = 200
+
+# Half the longest step at first, and the longest of all, in the system's size and radians.
+_FIRST, _LONGEST = 0.025, 0.5
+
+# Singular values and curvatures below this share of the largest are rounding errors.
+_NEGLIGIBLE = 1e-12
+
+
+def equilibrium(
+    system: AbstractSystem,
+    guess: State | None = None,
+    *,
+    fix: Mapping[str, VectorLike] | None = None,
+    t: Scalar = 0.0,
+    throw: bool = True,
+) -> State:
+    """Find a static equilibrium near a guess.
+
+    Where displacements meet no resistance (a vehicle may roll along level ground, its wheels may turn) every place is
+    an equilibrium. One near the guess is found, by steps that are the shortest in the scales of the velocities; `fix`
+    may tell which. Wheels that roll without slipping get there by rolling.
+
+    **Arguments:**
+
+    - `system`: a compiled scene, or another system; its forces at rest must not need velocities to balance.
+    - `guess`: where to start, default the poses given with the bodies; assembled first.
+    - `fix`: coordinates that must have these values, by name, as in `assemble`; whatever holds them bears a force.
+    - `t`: the time, for forces and drivers that depend on it [s].
+    - `throw`: whether it is an error that none is found. With `False` the state is NaN instead, so that one member of a
+        batch does not spoil the others.
+
+    **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
+
+    **Raises:** `ValueError` if the mechanism cannot be assembled, if something is driven at time t, or if there is no
+    equilibrium; the message names the coordinates whose forces nothing balances. Under `jit` a run-time error without
+    the names.
+    """
+    if not system.plain:
+        raise ValueError("Equilibria are of systems whose constraints are ideal and bind positions or velocities.")
+    guess = system.guess if guess is None else guess
+    time: Any = as_array(t, guess.q.dtype)
+    start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
+    held = tuple(np.flatnonzero(fixed).tolist())
+    u = jax.device_put(np.zeros(system.nu, start.dtype))
+    still = _still(system, time, start, u)
+    concrete = not is_traced(still)
+    if concrete and throw and not bool(still):
+        raise ValueError("Something is driven at this time, and moves; give a time t at which it stands.")
+    q, unbalanced, ok = _balanced(system, time, start, held)
+    if concrete and throw and not bool(ok):
+        raise ValueError(_not_found(system, unbalanced))
+    if throw and concrete:
+        return State(q, u)
+    ok = ok & still & assembled
+    if throw:
+        q = eqx.error_if(q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see what is loose.")
+    return State(q if throw else jnp.where(ok, q, jnp.nan), u)
+
+
+@eqx.filter_jit
+def _still(system, t, q, u):
+    """Whether nothing is driven."""
+    speeds = jnp.concatenate([system.velocity_residual(t, q, u), system.rates(t, q, u)])
+    return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(q.dtype)
+
+
+class _Balance(eqx.Module):
+    """The balance of a system in the scales of its velocities; its rows are those of the constraints and of the
+    coordinates that are held.
+    """
+
+    system: AbstractSystem
+    t: Array
+    values: Float[Array, "held"]
+    held: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def rank(self) -> int:
+        """Of the rows at the most, without those implied."""
+        return self.system.velocity_rank + len(self.held)
+
+    @property
+    def rest(self) -> Float[Array, "nu"]:
+        return jnp.zeros_like(self.system.velocity_scale())
+
+    def moved(self, q, z):
+        """The configuration after a small displacement."""
+        return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
+
+    def force(self, q, multipliers):
+        """Applied forces with those of the rows."""
+        rows = self.system.velocity_rows
+        force = self.system.force(self.t, q, self.rest)
+        force += self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
+        _, pull = jax.vjp(lambda u: self._held_rates(q, u), self.rest)
+        return self.system.velocity_scale() * (force + pull(multipliers[rows:])[0])
+
+    def jacobian(self, q):
+        held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
+        rows = jnp.concatenate([self.system.velocity_jacobian(self.t, q, self.rest), held])
+        return rows * self.system.velocity_scale()[None, :]
+
+    def residual(self, q, jacobian, z):
+        """How far the rows are from holding; those between velocities by the displacement alone."""
+        constraints = slice(self.system.position_rows, self.system.velocity_rows)
+        rolled = jacobian[constraints] @ z
+        return jnp.concatenate(
+            [self.system.position_residual(self.t, q), rolled, q[np.array(self.held, int)] - self.values]
+        )
+
+    def _held_rates(self, q, u):
+        return self.system.rates(self.t, q, u)[np.array(self.held, int)]
+
+
+class _Linearised(NamedTuple):
+    """The balance for small displacements z from a configuration, `force − stiffness z` along what the rows allow.
+
+    `curvatures` and `directions` of the symmetric part of the stiffness, in which what the rows forbid counts as stiff;
+    `loose`, those directions that meet no stiffness; `multipliers` of the rows; `correction`, the displacement back to
+    the rows; `sizes` of the rows, and `implied`, the projector on combinations of them that vanish.
+    """
+
+    force: Float[Array, "n"]
+    stiffness: Float[Array, "n n"]
+    curvatures: Float[Array, "n"]
+    directions: Float[Array, "n n"]
+    loose: Bool[Array, "n"]
+    multipliers: Float[Array, "m"]
+    correction: Float[Array, "n"]
+    sizes: Float[Array, "m"]
+    implied: Float[Array, "m m"]
+
+
+def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
+    jacobian = balance.jacobian(q)
+    m, n = jacobian.shape
+    sizes = norm(jacobian)
+    sizes = jnp.where(sizes > 0, sizes, 1.0)
+    left, values, right = jnp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
+    # Off the constraints, rows that are implied on them are not quite so: they are left out by number.
+    kept = (jnp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * jnp.max(values, initial=0.0))
+    left, right = jnp.where(kept[None, :], left, 0.0), jnp.where(kept[:, None], right, 0.0)
+    inverse = right.T @ (left / jnp.where(kept, values, 1.0)[None, :]).T
+    allowed = jnp.eye(n, dtype=q.dtype) - right.T @ right
+
+    multipliers = -(inverse.T @ balance.force(q, jnp.zeros(m, q.dtype))) / sizes
+    still = jnp.zeros(n, q.dtype)
+    forces = lambda z: (balance.force(balance.moved(q, z), multipliers),) * 2
+    softness, force = jax.jacfwd(forces, has_aux=True)(still)
+    stiffness = -allowed @ softness @ allowed
+    largest = jnp.max(jnp.abs(stiffness))
+    stiffness += jnp.where(largest > 0, largest, 1.0) * (right.T @ right)
+    curvatures, directions = jnp.linalg.eigh(0.5 * (stiffness + stiffness.T))
+    return _Linearised(
+        allowed @ force,
+        stiffness,
+        curvatures,
+        directions,
+        jnp.abs(curvatures) <= _NEGLIGIBLE * jnp.max(jnp.abs(curvatures)),
+        multipliers,
+        -inverse @ (balance.residual(q, jacobian, still) / sizes),
+        sizes,
+        jnp.eye(m, dtype=q.dtype) - left @ left.T,
+    )
+
+
+def _step(near: _Linearised) -> Float[Array, "n"]:
+    """Newton's step with curvatures made positive; none along loose directions without force."""
+    along = near.directions.T @ near.force
+    largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
+    noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(near.curvatures) + largest(near.sizes * near.multipliers))
+    quiet = near.loose & (jnp.abs(along) <= noise)
+    size = jnp.abs(near.curvatures)
+    # Quiet directions count as stiff, so that rounding errors of the others do not move along them.
+    size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
+    stiffness = near.stiffness + (near.directions * (size - near.curvatures)[None, :]) @ near.directions.T
+    return jnp.linalg.solve(stiffness, near.directions @ jnp.where(quiet, 0.0, along))
+
+
+@eqx.filter_jit
+def _balanced(
+    system: AbstractSystem, t: Array, start: Float[Array, "nq"], held: tuple[int, ...]
+) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Bool[Array, ""]]:
+    """The equilibrium, what is left of the generalized forces there, and whether that is nothing."""
+    balance = _Balance(system, t, start[np.array(held, int)], held)
+    q, near, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
+
+    # The equations that it solves, for their derivatives. What is loose or implied is made definite: nothing moves
+    # along loose directions, and multipliers are as small as they can be.
+    n, stiff = system.nu, jnp.max(jnp.abs(near.curvatures))
+    loose = jnp.where(near.loose[None, :], near.directions, 0.0) @ near.directions.T
+    jacobian = lax.stop_gradient(balance).jacobian(q)
+
+    def equations(x):
+        z, multipliers = x[:n], x[n:]
+        there = balance.moved(q, z)
+        force = balance.force(there, multipliers) - stiff * (loose @ z)
+        rows = balance.residual(there, jacobian, z) / near.sizes
+        rows += near.implied @ (near.sizes * multipliers) / stiff
+        # Where there is no equilibrium, equations with a solution, so that their derivatives stay finite.
+        return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
+
+    known = jnp.concatenate([jnp.zeros(n, q.dtype), near.multipliers])
+    solved = lax.custom_root(equations, known, lambda _, x: x, tangent_solve)
+    return balance.moved(q, solved[:n]), near.force / system.velocity_scale(), ok
+
+
+def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
+    """Follow the forces to where they vanish; and whether they do."""
+    close = jnp.finfo(start.dtype).eps ** 0.5
+
+    def proceed(carry):
+        *_, radius, found, k = carry
+        return ~found & (radius > close) & (k < _ITERATIONS)
+
+    def advance(carry):
+        q, near, step, radius, _, k = carry
+        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(near.correction))
+        trial = balance.moved(q, step + near.correction)
+        there = _linearise(balance, trial)
+        # Too long a step ends where the forces push back half as hard as they pushed at its beginning, or harder.
+        # What the correction of the rows does to the forces is not counted.
+        other = jnp.max(jnp.abs(near.curvatures)) * norm(near.correction) * norm(step)
+        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(near.force, step)) - other
+        better = ~back | (norm(there.force) < norm(near.force))
+        good = (k == 0) | (better & jnp.all(jnp.isfinite(there.force)))
+        q, near = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, near))
+        radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
+        step = _step(near)
+        longest = jnp.max(jnp.abs(step))
+        step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
+        # What is left after so small a step of Newton's method is its square.
+        return q, near, step, radius, good & (size <= close) & (k > 0), k + 1
+
+    # At first nothing is known, and nothing moves.
+    unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))
+    at = (start, unknown, balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
+    q, near, _, _, found, _ = lax.while_loop(proceed, advance, at)
+    return q, near, found
+
+
+def _not_found(system, unbalanced):
+    size = np.abs(np.asarray(unbalanced))
+    names = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
+    worst = [k for k in np.argsort(-size)[:4] if size[k] > 1e-6 * np.max(size)]
+    listed = ", ".join(f"{names[k]} ({unbalanced[k]:.3g})" for k in worst)
+    return (
+        f"No static equilibrium was found: forces remain along {listed or 'nothing'}, in N and N m. Hold such a "
+        "coordinate with fix, take away what drives it, or give a guess nearer to the equilibrium."
+    )
