@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State, VectorLike
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.equation import Ranks
 from .constraints import AbstractConstraint, Holonomic, Pfaffian, check_names, is_linear, is_rheonomic
@@ -102,15 +102,15 @@ class LagrangianSystem(AbstractSystem):
         self.nonideal = tuple(nonideal)
         self.kinematics = Rates() if kinematics is None else kinematics
         self.equations = Projected() if equations is None else equations
-        self.parameters = {name: array(value) for name, value in (parameters or {}).items()}
-        self.length = array(length)
+        self.parameters = {name: as_jax(value) for name, value in (parameters or {}).items()}
+        self.length = as_jax(length)
         check_names(self.constraints)
 
-        q = array(q)
+        q = as_jax(q)
         if q.ndim != 1:
             raise ValueError(f"q is a vector, got shape {q.shape}.")
         nu = self.kinematics.count(q.size)
-        self.guess = State(q, array(np.zeros(nu)) if u is None else array(u))
+        self.guess = State(q, as_jax(np.zeros(nu)) if u is None else as_jax(u))
         if self.guess.u.shape != (nu,):
             raise ValueError(f"The system has {nu} velocities, got u of shape {self.guess.u.shape}.")
         self.coordinates = tuple(f"q{k}" for k in range(q.size)) if coordinates is None else tuple(coordinates)
