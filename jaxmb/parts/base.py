@@ -67,7 +67,7 @@ class AbstractPart(eqx.Module):
     def with_fields(self, **values: Any) -> Self:
         """The same part with other values in some fields."""
         out = object.__new__(type(self))
-        for field in self.__dataclass_fields__:
+        for field in fields.field_names(type(self)):
             object.__setattr__(out, field, values[field] if field in values else getattr(self, field))
         return out
 

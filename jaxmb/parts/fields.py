@@ -82,6 +82,12 @@ def declarations(cls: type) -> dict[str, Declaration]:
     return {field.name: field.metadata["declaration"] for field in fields if "declaration" in field.metadata}
 
 
+@functools.lru_cache(maxsize=None)
+def field_names(cls: type) -> tuple[str, ...]:
+    """The names of all fields of a class, declared or not."""
+    return tuple(field.name for field in dataclasses.fields(cls))
+
+
 # Conversion
 
 
@@ -367,7 +373,7 @@ def anonymous(part: Any) -> Any:
     """The part without the names that tell it from its siblings, and without the state that bodies are given with."""
     declared = declarations(type(part))
     out = object.__new__(type(part))
-    for field in part.__dataclass_fields__:
+    for field in field_names(type(part)):
         value, kind = getattr(part, field), declared[field].kind if field in declared else None
         if kind in ("identity", "body"):
             value = ""
@@ -386,7 +392,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Sign | 
     dictionaries, as users call it, and its sign.
     """
     declared = declarations(type(part))
-    for field in part.__dataclass_fields__:
+    for field in field_names(type(part)):
         own = declared.get(field)
         if own is None or own.kind != "state":
             yield from _paths(getattr(part, field), (field,), (field,), None if own is None else own.sign)

@@ -22,7 +22,9 @@ class Servo(AbstractLink):
     Gauss's principle", J. Appl. Mech. 60, 1993.
     """
 
-    program: Any = fields.law(AbstractConstraint, what="a constraint between positions, such as a Driver", kw_only=False)
+    program: Any = fields.law(
+        AbstractConstraint, what="a constraint between positions, such as a Driver", kw_only=False
+    )
     damping: Float[Array, ""] = fields.parameter(unit="1/s", sign="non-negative", default=0.0, kw_only=False)
     stiffness: Float[Array, ""] = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
 
