@@ -82,7 +82,7 @@ def declarations(cls: type) -> dict[str, Declaration]:
     return {field.name: field.metadata["declaration"] for field in fields if "declaration" in field.metadata}
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def field_names(cls: type) -> tuple[str, ...]:
     """The names of all fields of a class, declared or not."""
     return tuple(field.name for field in dataclasses.fields(cls))
