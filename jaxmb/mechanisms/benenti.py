@@ -52,7 +52,7 @@ def benenti(
         t1=2.0,
         observe=_observe_particles if rigid else observe_coordinates,
         description="Two particles with parallel velocities; a constraint quadratic in them (Benenti).",
-        references=_REFERENCES,
+        references=References.load("benenti"),
     )
 
 
@@ -81,12 +81,3 @@ def _observe_particles(trajectory):
     places, rates = jnp.hstack([one.position, two.position]), jnp.hstack([one.velocity, two.velocity])
     observed = {name: places[:, k] for k, name in enumerate(("x1", "y1", "x2", "y2"))}
     return observed | {f"u{k}": rates[:, k] for k in range(4)}
-
-
-_REFERENCES = References(
-    times=np.array([2.0]),
-    labels=("x1", "y1", "x2", "y2"),
-    values=np.array([[2.990189703, -13.041993719, 3.041463848, -13.747922217]]),
-    source="DOP853 at 1e-12 on the equations with a multiplier",
-    tolerance=1e-9,
-)

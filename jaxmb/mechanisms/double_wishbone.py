@@ -112,7 +112,7 @@ def double_wishbone(
         t1=0.2,
         observe=lambda trajectory: _observe(trajectory, P["wheel"]),
         description="Double wishbone suspension of a wheel, on hinges or bushings, jouncing on its tyre.",
-        references=_REFERENCES,
+        references=References.load("double_wishbone"),
         rates=rates,
     )
 
@@ -151,36 +151,3 @@ def _observe(trajectory, wheel):
         "toe": jnp.arctan2(axle[:, 0], axle[:, 1]),
         "rate": upright.velocity[:, 2],
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.05, 0.1, 0.2]),
-    labels=("z", "y", "camber", "toe", "rate"),
-    values=np.array(
-        [
-            [
-                -0.0156743621862509,
-                -0.000756361288963503,
-                0.008414792126765321,
-                -0.0006506380697574503,
-                -0.6257523459093997,
-            ],
-            [
-                0.009161874569484252,
-                0.00011505724436311482,
-                -0.005243381307130886,
-                0.0003315850639836451,
-                -0.4303042464390093,
-            ],
-            [
-                -0.004944478817251574,
-                -0.00016215570172029015,
-                0.002729226927633397,
-                -0.00019287646387629816,
-                -0.3072339288850443,
-            ],
-        ]
-    ),
-    source="one coordinate with the loop closed in closed form, derivatives by complex steps, DOP853 at 3e-14",
-    tolerance=1e-11,
-)

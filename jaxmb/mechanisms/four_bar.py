@@ -55,7 +55,7 @@ def four_bar(
         t1=10.0,
         observe=_observe,
         description="Planar four-bar linkage of uniform bars under gravity, crank started at 4 rad/s.",
-        references=_REFERENCES,
+        references=References.load("four_bar"),
         fix={"crank.angle": angle},
         rates={"crank.angle": speed},
     )
@@ -77,31 +77,3 @@ def _observe(trajectory):
         observed[name] = trajectory[name].angle
         observed[f"{name}_rate"] = trajectory[name].angular_velocity
     return observed
-
-
-_REFERENCES = References(
-    times=np.array([5.0, 10.0]),
-    labels=("crank", "coupler", "rocker", "crank_rate", "coupler_rate", "rocker_rate"),
-    values=np.array(
-        [
-            [
-                30.916938721474885,
-                1.2718852833966114,
-                1.8706677750466523,
-                4.037617308079547,
-                -1.6655733326711997,
-                -2.808240598089986,
-            ],
-            [
-                59.202769683547,
-                0.652952369775114,
-                1.9825882365006702,
-                5.2319065738216075,
-                1.1173835556582663,
-                1.958620874745937,
-            ],
-        ]
-    ),
-    source="one coordinate, with equations of its own, extrapolation method in extended precision",
-    tolerance=1e-12,
-)

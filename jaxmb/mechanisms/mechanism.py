@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import inspect
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -21,6 +23,8 @@ from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory
 
 Observation = dict[str, Array]
+
+_DATA = Path(__file__).parent / "data"
 
 # How a machine that has a Lagrangian on paper is built.
 Model = Literal["lagrangian", "rigid_bodies"]
@@ -46,6 +50,7 @@ class References:
     tolerance: float
 
     def __post_init__(self):
+        object.__setattr__(self, "labels", tuple(self.labels))
         object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
         object.__setattr__(self, "values", np.asarray(self.values, dtype=float))
         if self.values.shape != (len(self.times), len(self.labels)):
@@ -53,6 +58,11 @@ class References:
                 f"References need a value for each of {len(self.times)} times and {len(self.labels)} labels, "
                 f"got shape {self.values.shape}."
             )
+
+    @classmethod
+    def load(cls, name: str) -> "References":
+        """The values in the file `data/<name>.json` of the library."""
+        return cls(**json.loads((_DATA / f"{name}.json").read_text(encoding="utf-8")))
 
     @property
     def scales(self) -> np.ndarray:
@@ -78,7 +88,6 @@ class Mechanism:
     - `description`: what it is and where its data come from.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
     - `start(system, guess)`: how the state was made, or None where it was assembled and no more.
-    - `beside`: keyword arguments of other machines of this name that belong beside it in a report.
     """
 
     name: str
@@ -92,7 +101,6 @@ class Mechanism:
     fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     start: Callable[[Any, State], State] | None = None
-    beside: tuple[Mapping[str, Any], ...] = ()
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
@@ -194,7 +202,6 @@ def build(
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
     start: Callable[[Any, State], State] | None = None,
-    beside: tuple[Mapping[str, Any], ...] = (),
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
@@ -202,7 +209,7 @@ def build(
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
     observe = eqx.filter_jit(observe)
-    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start, beside)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start)
 
 
 def of_bodies(model: Model, **defaults: bool) -> bool:

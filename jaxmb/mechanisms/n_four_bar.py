@@ -54,7 +54,7 @@ def n_four_bar(
         t1=10.0,
         observe=lambda trajectory: _observe(trajectory, half),
         description="Four-bar linkages in a row that fall and lie flat in passing (IFToMM benchmark A02).",
-        references=_REFERENCES,
+        references=References.load("n_four_bar"),
         fix={"upright0.angle": np.pi / 2},
         rates={"upright0.angle": -speed / length},
     )
@@ -69,19 +69,3 @@ def _observe(trajectory, half):
         "vy": velocity[:, 1],
         "rate": -trajectory["upright0"].angular_velocity,
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.25, 0.5, 0.7, 10.0]),
-    labels=("x", "y", "vx", "vy", "rate"),
-    values=np.array(
-        [
-            [0.2771022560590423, 0.9608404340404233, 1.3231587284831592, -0.3815932966570722, 1.3770847703808153],
-            [0.6952866331644233, 0.7187325634357196, 1.9602054253718357, -1.8962611405866994, 2.72730849427716],
-            [0.9976213222073151, 0.06893255745530082, 0.3256079079206818, -4.712336283643993, 4.723572139795069],
-            [0.3284581115408154, 0.9445185381786010, 1.4230514702069441, -0.4948688454870430, 1.5066421808418295],
-        ]
-    ),
-    source="one coordinate, DOP853 at 2e-14, checked with elliptic functions in extended precision",
-    tolerance=1e-12,
-)

@@ -2,8 +2,6 @@
 
 from typing import Literal
 
-import numpy as np
-
 from ..lagrangian import AbstractEquations
 from ._wheeled import observe_bodies, wheeled, wheeled_bodies
 from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
@@ -62,7 +60,7 @@ def roller_racer(
         t1=5.0,
         observe=observe_bodies if rigid else observe_coordinates,
         description="Roller racer: two wheeled platforms with a pin, coasting (Krishnaprasad and Tsakiris).",
-        references=_REFERENCES,
+        references=References.load("roller_racer"),
     )
 
 
@@ -80,12 +78,3 @@ def _with_mass_in_front(p):
         "front_ahead": -p["handle"],
         "inertia": p["inertia"] - ratio * arm,
     }
-
-
-_REFERENCES = References(
-    times=np.array([5.0]),
-    labels=("x", "y", "theta", "phi", "u0", "u1"),
-    values=np.array([[0.5479154961, 0.1185110704, 6.2350455697, 3.5701901507, 0.8833468748, 1.4409397963]]),
-    source="DOP853 at 1e-12 on Hamel's equations in the frame of speed and turning rate",
-    tolerance=1e-9,
-)

@@ -68,7 +68,7 @@ def spherical_four_bar(
         t1=3.0,
         observe=_observe_bodies if rigid else observe_coordinates,
         description="Spherical four-bar linkage, in angles and the coupler's Euler parameters (Dooley and McCarthy).",
-        references=_REFERENCES,
+        references=References.load("spherical_four_bar"),
         fix={} if rigid else {"theta": angle},
         rates={"input.wz" if rigid else "theta": speed},
     )
@@ -222,12 +222,3 @@ def _potential(t, q, p):
 
 def _force(t, q, v, p):
     return jnp.zeros_like(q).at[0].set(p["torque"])
-
-
-_REFERENCES = References(
-    times=np.array([3.0]),
-    labels=("theta", "psi", "u0"),
-    values=np.array([[0.3482026199, 4.5646228730, -3.3558259716]]),
-    source="DOP853 at 1e-12 on the equation of motion in the input angle alone",
-    tolerance=1e-9,
-)

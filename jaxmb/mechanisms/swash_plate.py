@@ -88,7 +88,7 @@ def swash_plate(
         t1=0.1,
         observe=lambda trajectory: _observe(trajectory, pistons),
         description="Swash-plate compressor: a wobbling plate, rods and pistons, coasting at 600 rpm.",
-        references=_REFERENCES,
+        references=References.load("swash_plate"),
         rates={"shaft.wx": speed},
     )
 
@@ -101,48 +101,3 @@ def _observe(trajectory, pistons):
         piston = trajectory[f"piston{k}"]
         observed |= {f"x{k}": piston.position[:, 0], f"v{k}": piston.velocity[:, 0]}
     return observed
-
-
-_REFERENCES = References(
-    times=np.array([0.025, 0.05, 0.1]),
-    labels=("cos", "sin", "omega", "x1", "v1", "x2", "v2", "x3", "v3"),
-    values=np.array(
-        [
-            [
-                0.025994499109747733,
-                0.9996620859150522,
-                60.49770138967758,
-                0.4981078398199922,
-                4.401794073041926,
-                0.4416198436308571,
-                -2.305667359169232,
-                0.5600537502078702,
-                -2.094621537518787,
-            ],
-            [
-                -0.9985519336054425,
-                0.05379624422607871,
-                62.743180915122736,
-                0.5681718063756193,
-                0.20219807317478805,
-                0.462796083520734,
-                3.4048942908476496,
-                0.46881264536950107,
-                -3.6042530390097873,
-            ],
-            [
-                0.9941970180220343,
-                -0.10757457578858887,
-                62.81364899147514,
-                0.4318043972822912,
-                -0.4125108336116728,
-                0.5399527908292167,
-                -3.259840694009527,
-                0.5280197199898002,
-                3.677923516863544,
-            ],
-        ]
-    ),
-    source="one coordinate and its energy, derivatives by complex steps, DOP853 at 3e-14",
-    tolerance=1e-12,
-)

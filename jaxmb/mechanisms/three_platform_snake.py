@@ -76,7 +76,7 @@ def three_platform_snake(
         t1=1.0 if gait is None else 2 * np.pi,
         observe=_observe_bodies if rigid else observe_coordinates,
         description="SE(2)-snake of three platforms on wheels (Krishnaprasad and Tsakiris).",
-        references=_REFERENCES if gait is None else None,
+        references=References.load("three_platform_snake") if gait is None else None,
     )
 
 
@@ -161,12 +161,3 @@ def _connection(t, q, p):
     a, b, c = matrix[:, :3]
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     return cofactors @ matrix[:, 3:] / (a @ jnp.cross(b, c))
-
-
-_REFERENCES = References(
-    times=np.array([1.0]),
-    labels=("x", "y", "theta", "phi1", "phi2"),
-    values=np.array([[-0.0441318413, -0.0015964638, 0.0684829930, 1.1937250240, 0.0387634348]]),
-    source="DOP853 at 1e-12 on Voronets' equations",
-    tolerance=3e-8,
-)

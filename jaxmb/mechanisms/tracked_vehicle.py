@@ -146,10 +146,9 @@ def tracked_vehicle(
         t1=1.5,
         observe=_observe,
         description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
-        references=_REFERENCES[units],
+        references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
         start=lambda system, guess: _rolling(system, guess, speed),
-        beside=({"units": 3 - units},),
     )
 
 
@@ -178,55 +177,3 @@ def _observe(trajectory):
             observed |= {f"{p}x": hull.position[:, 0], f"{p}y": hull.position[:, 1], f"{p}phi": hull.angle}
             observed |= {f"{p}a{k + 1}": travel[:, k] for k in range(travel.shape[1])}
     return observed
-
-
-_SOURCE = "minimal coordinates, Runge–Kutta method of order 8"
-_REFERENCES = {
-    1: References(
-        times=np.array([0.5, 1.0, 1.5]),
-        labels=("x", "y", "phi"),
-        values=np.array(
-            [
-                [2.61085798931969, 0.901098716083570, 0.00610065148341],
-                [5.35923980461595, 0.950519106033969, 0.04338680007403],
-                [8.24014542540776, 0.898593479742995, -0.01868034501957],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-10,
-    ),
-    2: References(
-        times=np.array([0.5, 1.0, 1.5]),
-        labels=("x", "y", "phi", "rear_x", "rear_y", "rear_phi"),
-        values=np.array(
-            [
-                [
-                    2.61197544144702,
-                    0.902300281302783,
-                    0.000464589124938,
-                    -2.18802717305855,
-                    0.900032447411396,
-                    0.000480341078139,
-                ],
-                [
-                    5.40640262990527,
-                    0.934491601883477,
-                    0.015504099914322,
-                    0.610171001981034,
-                    0.901807065275057,
-                    -0.001875053942165,
-                ],
-                [
-                    8.39247455278833,
-                    0.907575301554893,
-                    -0.001084883650678,
-                    3.59235957375105,
-                    0.911382517316909,
-                    -0.000501417919300,
-                ],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-10,
-    ),
-}

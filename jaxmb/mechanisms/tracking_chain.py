@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import planar
 from ..lagrangian import LagrangianSystem, Servo
@@ -65,7 +64,7 @@ def tracking_chain(
         t1=20.0,
         observe=_observe_points if rigid else _observe,
         description="Three masses held to a desired motion by the least control force (Kalaba and Udwadia).",
-        references=_REFERENCES,
+        references=References.load("tracking_chain"),
     )
 
 
@@ -116,14 +115,3 @@ def _observe_points(trajectory):
     # The program's rows are of q1 and of q3 − q1.
     first, second = trajectory.reactions["track"].multipliers.T
     return places | rates | {"force1": first - second, "force3": second}
-
-
-_REFERENCES = References(
-    times=np.array([20.0]),
-    labels=("q1", "q2", "q3", "force1", "force3"),
-    values=np.array(
-        [[0.5 * np.sin(20.0), 0.3463702111, 0.5 * np.sin(20.0) + 0.2 * np.cos(40.0), 7.88958994, 0.27118949]]
-    ),
-    source="DOP853 at 1e-12 on the equation of Kalaba and Udwadia; q1 and q3 are the desired motion",
-    tolerance=1e-8,
-)

@@ -139,7 +139,7 @@ def train(
         t1=t1,
         observe=_observe,
         description=f"Emergency stop of a train of {n} vehicles with pitch, brakes applied by a pressure wave.",
-        references=_REFERENCES,
+        references=References.load("train"),
     )
 
 
@@ -221,41 +221,3 @@ def coupler_forces(trajectory) -> jax.Array:
     if not system.constraints:
         return jax.vmap(of_forces)(trajectory.ts, trajectory.ys)
     return jax.vmap(of_joints)(trajectory.ts, trajectory.ys, trajectory.multipliers)
-
-
-_REFERENCES = References(
-    times=np.array([1.5, 3.0]),
-    labels=("x1", "x2", "x3", "x4", "v1", "v2", "v3", "v4", "F1", "F2", "F3"),
-    values=np.array(
-        [
-            [
-                29.78037966932884,
-                16.800980252322272,
-                3.8229695058378783,
-                -9.154651471363259,
-                19.50245217687066,
-                19.503465603910513,
-                19.507037195314105,
-                19.54664822257675,
-                -30769.22806862605,
-                -54466.8481449641,
-                -73931.87715905337,
-            ],
-            [
-                57.976985447012595,
-                44.97857503589924,
-                31.96407089156402,
-                18.945804813151657,
-                18.033800731617703,
-                18.02005237265511,
-                17.993587524172142,
-                17.96568420258797,
-                0.0,
-                0.0,
-                1386.2401575324104,
-            ],
-        ]
-    ),
-    source="equations of its own in NumPy, Runge-Kutta of order 8 with steps below a millisecond",
-    tolerance=1e-10,
-)
