@@ -14,6 +14,7 @@ from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
 from ..states.equilibrium import equilibrium
 from ..system import parameters, with_parameters
+from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
@@ -129,7 +130,7 @@ def tracked_vehicle(
         joints.append(planar.Revolute("hitch", *pair, point_a=hitch_rear, point_b=hitch_front))
         bend = {"stiffness": hitch_stiffness, "damping": hitch_damping, "free_angle": 0.0}
         forces.append(planar.TorsionalSpringDamper("hitch_spring", *pair, **bend))
-    road = planar.Contact(
+    road = WheelContact(
         "road",
         [body.name for body in bodies if "wheel" in body.name],
         terrain=Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
@@ -137,8 +138,6 @@ def tracked_vehicle(
         friction=contact.Coulomb(friction, transition_speed=transition_speed),
         radius=radius,
         damping=ground_damping,
-        onset="linear",
-        depth="vertical",
     )
     return build(
         "tracked_vehicle",

@@ -13,6 +13,7 @@ from .._types import VectorLike
 from ..parts.base import AbstractForce, array, number
 from ..parts.forces import Gravity
 from ..parts.functions import Force
+from ..parts.smooth import step
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 
@@ -177,8 +178,7 @@ def running_resistance(v, p):
 
 def braking(t, v, p):
     """The force [N] of the brakes at a time [s] and speed [m/s]."""
-    z = jnp.clip((t - p["start"]) / p["rise"], 0.0, 1.0)
-    return -p["force"] * z**3 * (10 + z * (6 * z - 15)) * jnp.tanh(v / p["transition"])
+    return -p["force"] * step((t - p["start"]) / p["rise"]) * jnp.tanh(v / p["transition"])
 
 
 def _resistance(poses, velocities, t, p):

@@ -10,6 +10,7 @@ from ...linalg.rotations import norm
 from ..base import AbstractForce, number, optional_number
 from ..forces import between_points, fill_points, separation, separation_rate
 from ..resolve import fill, label, positive
+from ..smooth import quintic
 
 
 class DraftGear(AbstractForce):
@@ -98,11 +99,11 @@ class DraftGear(AbstractForce):
         return self.stored(norm(separation(space, self, poses)) - self.free_length)
 
     def _against(self, stroke, rate):
-        step, ramp, _ = self._engaged(stroke)
-        spring = self.preload * step + self.stiffness * ramp
+        engaged, ramp, _ = self._engaged(stroke)
+        spring = self.preload * engaged + self.stiffness * ramp
         friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * jnp.tanh(rate / self.transition)
         _, stop, _ = self._engaged(stroke - self.travel)
-        return spring * friction + self.stop_stiffness * stop + self.damping * step * rate
+        return spring * friction + self.stop_stiffness * stop + self.damping * engaged * rate
 
     def _stored(self, stroke):
         _, ramp, area = self._engaged(stroke)
@@ -110,12 +111,11 @@ class DraftGear(AbstractForce):
         return 0.5 * (1 + self.unloading) * (self.preload * ramp + self.stiffness * area) + self.stop_stiffness * stop
 
     def _engaged(self, x):
-        """A smooth step from 0 to 1, its integral and the integral of that."""
+        """A smooth step from 0 to 1 over the width `smoothing`, its integral and the integral of that."""
         width = self.smoothing
         z = jnp.clip(x / width + 0.5, 0.0, 1.0)
         beyond = jnp.maximum(x - 0.5 * width, 0.0)
-        step = z**3 * (10 + z * (6 * z - 15))
         ramp = z**4 * (2.5 + z * (z - 3))
         area = z**5 * (0.5 + z * (z / 7 - 0.5))
         # With x = width/2 + beyond: the ramp is x, its integral x²/2 + width²/56.
-        return step, width * ramp + beyond, width**2 * area + beyond * (0.5 * width + 0.5 * beyond)
+        return quintic(z), width * ramp + beyond, width**2 * area + beyond * (0.5 * width + 0.5 * beyond)
