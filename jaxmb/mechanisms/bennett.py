@@ -1,6 +1,5 @@
 """Bennett's linkage."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,6 +8,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 
 @mechanism()
@@ -22,7 +22,7 @@ def bennett(
     speed: float = 8.0,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """Four hinges on skew axes, a loop with one degree of freedom although counting rows leaves minus two; y up.
+    """Four hinges on skew axes, a loop with one degree of freedom although the count of rows leaves −2; y up.
 
     Links of length a and twist α alternate with links of length b and twist β, `b sin α = a sin β`; the ground is one
     of the latter, with the input axis z in the origin and the output axis at (−b, 0, 0). Input θ and output φ, measured
@@ -83,8 +83,7 @@ def _turned(axis, angle):
 
 
 def _observe(trajectory, beta):
-    along = jax.vmap(lambda p: rotations.rotate(p, jnp.array([1.0, 0.0, 0.0])))
-    first, last = (along(trajectory[link].orientation) for link in ("link1", "link3"))
+    first, last = (body_axis(trajectory, link, (1.0, 0.0, 0.0)) for link in ("link1", "link3"))
     return {
         "cos": first[:, 0],
         "sin": first[:, 1],

@@ -5,7 +5,8 @@ import numpy as np
 from .. import spatial
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 _AXES = ("y", "z", "x", "y", "z", "x")
 
@@ -13,7 +14,7 @@ _AXES = ("y", "z", "x", "y", "z", "x")
 @mechanism()
 def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gravity: float = 9.81) -> Mechanism:
     """Six hinges P0 … P5 and five equal bars along the edges of a cube, a closed loop with one degree of freedom
-    although counting rows leaves none; y up, released from rest.
+    although the count of rows leaves none; y up, released from rest.
 
     Source: problem A04 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics. The reference
     values were computed in two joint angles with the loop closed in closed form, in extended precision, and with all
@@ -48,5 +49,4 @@ def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gra
 
 def _observe(trajectory, length):
     point, speed = point_motion(trajectory, "bar2", (0.0, -0.5 * length, 0.0))
-    observed = {axis: point[:, k] for k, axis in enumerate("xyz")}
-    return observed | {f"v{axis}": speed[:, k] for k, axis in enumerate("xyz")}
+    return columns("xyz", point) | columns(("vx", "vy", "vz"), speed)

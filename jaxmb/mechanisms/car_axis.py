@@ -8,6 +8,7 @@ from ..parts.forces import Gravity
 from ..parts.functions import Constraint, Force
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -86,9 +87,8 @@ def _observe(trajectory, length):
     observed = {}
     for body, letter in (("left", "l"), ("right", "r")):
         motion = trajectory[body]
-        for k, axis in enumerate("xy"):
-            observed[f"{axis}{letter}"] = motion.position[:, k]
-            observed[f"{axis}{letter}1"] = motion.velocity[:, k]
+        observed |= columns((f"x{letter}", f"y{letter}"), motion.position)
+        observed |= columns((f"x{letter}1", f"y{letter}1"), motion.velocity)
     observed["lam1"] = trajectory.reactions["upright"].multipliers[:, 0]
     # The row of a rod is its constraint over twice the length, so that its multiplier is a force.
     observed["lam2"] = trajectory.reactions["axle"].multipliers[:, 0] / (2 * length)

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 
 from .. import planar
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 
 @mechanism()
@@ -41,9 +42,7 @@ def _observe(trajectory, distance):
     sleigh = trajectory["sleigh"]
     blade, _ = point_motion(trajectory, "sleigh", (-distance, 0.0))
     c, s = jnp.cos(sleigh.angle), jnp.sin(sleigh.angle)
-    return {
-        "x_blade": blade[:, 0],
-        "y_blade": blade[:, 1],
+    return columns(("x_blade", "y_blade"), blade) | {
         "theta": sleigh.angle,
         "v": c * sleigh.velocity[:, 0] + s * sleigh.velocity[:, 1],
         "omega": sleigh.angular_velocity,

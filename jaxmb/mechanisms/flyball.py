@@ -1,6 +1,5 @@
 """The stiff flyball governor."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,6 +8,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 # Lengths [m] and density [kg/m³] of the source.
 _HEIGHT, _ARM, _SECTION, _CUBE, _OFFSET = 1.0, 1.0, 0.01, 0.1, 0.05
@@ -115,8 +115,7 @@ def flyball(
 
 def _observe(trajectory):
     shaft, arm, slider = trajectory["shaft"], trajectory["arm1"], trajectory["slider"]
-    turned = lambda motion: jax.vmap(lambda p: rotations.rotate(p, jnp.array([1.0, 0.0, 0.0])))(motion.orientation)
-    x, along = turned(shaft), turned(arm)
+    x, along = (body_axis(trajectory, name, (1.0, 0.0, 0.0)) for name in ("shaft", "arm1"))
     return {
         "cos": x[:, 0],
         "sin": x[:, 1],

@@ -6,6 +6,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import bar_angles
 
 
 @mechanism()
@@ -32,7 +33,7 @@ def four_bar(
     crank, coupler, rocker = lengths
     A, D = np.zeros(2), np.array([base, 0.0])
     B = A + crank * np.array([np.cos(angle), np.sin(angle)])
-    C = _above(B, D, coupler, rocker)
+    C = circles_meet(B, D, coupler, rocker)
     bar = lambda name, m, l, start, end: planar.Body(
         name,
         mass=m,
@@ -53,7 +54,7 @@ def four_bar(
         "four_bar",
         Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]),
         t1=10.0,
-        observe=_observe,
+        observe=lambda trajectory: bar_angles(trajectory, "crank", "coupler", "rocker"),
         description="Planar four-bar linkage of uniform bars under gravity, crank started at 4 rad/s.",
         references=References.load("four_bar"),
         fix={"crank.angle": angle},
@@ -61,7 +62,7 @@ def four_bar(
     )
 
 
-def _above(B, D, coupler, rocker):
+def circles_meet(B, D, coupler, rocker):
     """The intersection of circles about B and D to the left of the way from B to D, or the point nearest to both."""
     d = D - B
     distance = np.hypot(*d)
@@ -69,11 +70,3 @@ def _above(B, D, coupler, rocker):
     across = np.sqrt(max(coupler**2 - along**2, 0.0))
     e = d / distance
     return B + along * e + across * np.array([-e[1], e[0]])
-
-
-def _observe(trajectory):
-    observed = {}
-    for name in ("crank", "coupler", "rocker"):
-        observed[name] = trajectory[name].angle
-        observed[f"{name}_rate"] = trajectory[name].angular_velocity
-    return observed

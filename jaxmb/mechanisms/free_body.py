@@ -5,6 +5,7 @@ import numpy as np
 from .. import spatial
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -39,5 +40,4 @@ def free_body(
 
 def _observe(trajectory):
     body = trajectory["body"]
-    observed = {f"q{k}": body.orientation[:, k] for k in range(4)}
-    return observed | {f"w{k + 1}": body.angular_velocity[:, k] for k in range(3)}
+    return columns(("q0", "q1", "q2", "q3"), body.orientation) | columns(("w1", "w2", "w3"), body.angular_velocity)

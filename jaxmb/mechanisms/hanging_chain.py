@@ -7,6 +7,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -63,5 +64,4 @@ def hanging_chain(
 def _observe(trajectory, n):
     places = jnp.stack([trajectory[f"mass{k + 1}"].position for k in range(n)])
     along = jnp.diff(places, axis=0, prepend=jnp.zeros_like(places[:1]))
-    observed = {"x": places[-1, :, 0], "y": places[-1, :, 1]}
-    return observed | {f"angle{k + 1}": jnp.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}
+    return columns("xy", places[-1]) | {f"angle{k + 1}": jnp.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}

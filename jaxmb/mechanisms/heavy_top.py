@@ -7,6 +7,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -50,6 +51,5 @@ def heavy_top(
 
 def _observe(trajectory):
     top = trajectory["top"]
-    observed = {f"{axis}c": top.position[:, k] for k, axis in enumerate("xyz")}
-    observed |= {f"e{k}": top.orientation[:, k] for k in range(4)}
-    return observed | {f"w{k + 1}": top.angular_velocity[:, k] for k in range(3)}
+    observed = columns(("xc", "yc", "zc"), top.position) | columns(("e0", "e1", "e2", "e3"), top.orientation)
+    return observed | columns(("w1", "w2", "w3"), top.angular_velocity)

@@ -7,6 +7,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -45,9 +46,5 @@ def knife_edge(
 def _observe(trajectory):
     skate = trajectory["skate"]
     c, s = jnp.cos(skate.angle), jnp.sin(skate.angle)
-    return {
-        "x": skate.position[:, 0],
-        "y": skate.position[:, 1],
-        "phi": skate.angle,
-        "v": c * skate.velocity[:, 0] + s * skate.velocity[:, 1],
-    }
+    speed = c * skate.velocity[:, 0] + s * skate.velocity[:, 1]
+    return columns("xy", skate.position) | {"phi": skate.angle, "v": speed}

@@ -5,7 +5,8 @@ import numpy as np
 from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 
 @mechanism()
@@ -15,11 +16,10 @@ def n_four_bar(
     """n + 1 upright bars on ground pivots a length apart, their tips joined by n level bars, fall to one side; y up.
 
     One degree of freedom, θ from upright: `I θ̈ = P g sin θ / l` with `I = (n + 1)/3 + n`, `P = (n + 1)/2 + n`. Where
-    all bars lie in one line, at odd multiples of π/2, the rows lose rank and other motions begin. Steps go over these
-    positions with the momentum that is there, and find the same branch on the other side, since the prediction is much
-    closer to it than another. A step that ends too near to one is rejected: rounding errors divided by the cube of the
-    distance are more than the tolerance allows. Below rtol 1e-11 that may happen again and again, and the motion ends
-    there with a result that says so.
+    all bars lie in one line, at odd multiples of π/2, the rows lose rank and other motions branch off. Steps pass over
+    these positions and stay on their branch, because the prediction is much closer to it than to any other. A step that
+    ends too close to such a position is rejected, since round-off, divided by the cube of the distance, exceeds the
+    tolerance. Below rtol 1e-11 this may happen repeatedly, until the motion ends there with a result that reports it.
 
     Source: problem A02 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics (1 m, 1 kg,
     1 m/s, 10 s). The reference values, for n = 2, come from the equation above.
@@ -62,10 +62,5 @@ def n_four_bar(
 
 def _observe(trajectory, half):
     tip, velocity = point_motion(trajectory, "upright0", (half, 0.0))
-    return {
-        "x": tip[:, 0],
-        "y": tip[:, 1],
-        "vx": velocity[:, 0],
-        "vy": velocity[:, 1],
-        "rate": -trajectory["upright0"].angular_velocity,
-    }
+    rate = -trajectory["upright0"].angular_velocity
+    return columns("xy", tip) | columns(("vx", "vy"), velocity) | {"rate": rate}

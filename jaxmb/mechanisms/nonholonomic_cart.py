@@ -3,8 +3,8 @@
 from typing import Literal
 
 from ..lagrangian import AbstractEquations
-from ._wheeled import observe_bodies, wheeled, wheeled_bodies
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from ._wheeled import build_wheeled
+from .mechanism import Mechanism, Model, mechanism
 
 
 @mechanism(variants=("model",))
@@ -49,13 +49,12 @@ def nonholonomic_cart(
         "pivot": pivot,
         "handle": handle,
     }
-    rigid = of_bodies(model, form=form == "frame", equations=equations is None)
-    start = {"angle": angle, "speed": speed, "rate": rate}
-    return build(
+    return build_wheeled(
         "nonholonomic_cart",
-        wheeled_bodies(parameters, **start) if rigid else wheeled(form, equations, parameters, **start),
-        t1=5.0,
-        observe=observe_bodies if rigid else observe_coordinates,
-        description="Cart of two wheeled platforms with a pin, coasting.",
-        references=References.load("nonholonomic_cart"),
+        "Cart of two wheeled platforms with a pin, coasting.",
+        parameters,
+        (angle, speed, rate),
+        form=form,
+        equations=equations,
+        model=model,
     )

@@ -6,6 +6,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 _SOURCE = (
     "Problem A01 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics "
@@ -44,9 +45,4 @@ def pendulum(
 
 def _observe(trajectory):
     bob = trajectory["bob"]
-    return {
-        "x": bob.position[:, 0],
-        "y": bob.position[:, 1],
-        "vx": bob.velocity[:, 0],
-        "vy": bob.velocity[:, 1],
-    }
+    return columns("xy", bob.position) | columns(("vx", "vy"), bob.velocity)

@@ -5,7 +5,8 @@ import numpy as np
 from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 
 @mechanism(variants=("n",))
@@ -47,7 +48,7 @@ def rod_chain(*, n: int = 10, length: float = 1.0, mass: float = 1.0, gravity: f
 
 def _observe(trajectory, n, l):
     tip, _ = point_motion(trajectory, f"link{n}", (0.5 * l, 0.0))
-    observed = {"tip_x": tip[:, 0], "tip_y": tip[:, 1]}
+    observed = columns(("tip_x", "tip_y"), tip)
     for k in range(1, n + 1):
         link = trajectory[f"link{k}"]
         observed[f"th{k}"] = link.angle + 0.5 * np.pi

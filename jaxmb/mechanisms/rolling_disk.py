@@ -9,6 +9,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 
 @mechanism()
@@ -63,7 +64,7 @@ def rolling_disk(
 
 def _observe(trajectory):
     disk = trajectory["disk"]
-    axle = jax.vmap(lambda p: rotations.rotate(p, jnp.array([0.0, 1.0, 0.0])))(disk.orientation)
+    axle = body_axis(trajectory, "disk", (0.0, 1.0, 0.0))
     omega_W = jax.vmap(rotations.rotate)(disk.orientation, disk.angular_velocity)
     level = jnp.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
     cos, sin = axle[:, 1] / level, -axle[:, 0] / level

@@ -6,6 +6,7 @@ from .. import spatial
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import turn_about_x
 
 
 @mechanism()
@@ -71,12 +72,6 @@ def spatial_slider_crank(
 
 
 def _observe(trajectory):
-    crank, slider = trajectory["crank"], trajectory["slider"]
-    e0, e1 = crank.orientation[:, 0], crank.orientation[:, 1]
-    return {
-        "x": slider.position[:, 0],
-        "x_dot": slider.velocity[:, 0],
-        "cos": e0**2 - e1**2,
-        "sin": 2 * e0 * e1,
-        "theta_dot": crank.angular_velocity[:, 0],
-    }
+    slider = trajectory["slider"]
+    observed = {"x": slider.position[:, 0], "x_dot": slider.velocity[:, 0]} | turn_about_x(trajectory, "crank")
+    return observed | {"theta_dot": trajectory["crank"].angular_velocity[:, 0]}

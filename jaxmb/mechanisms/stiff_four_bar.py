@@ -5,7 +5,8 @@ import numpy as np
 from .. import planar
 from ..scene import Scene
 from .four_bar import four_bar
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import bar_angles, point_motion
 
 
 @mechanism()
@@ -60,9 +61,6 @@ def stiff_four_bar(
 
 
 def _observe(trajectory, foot, base):
-    observed = {}
-    for name in ("crank", "coupler", "rocker"):
-        observed[name] = trajectory[name].angle
-        observed[f"{name}_rate"] = trajectory[name].angular_velocity
     end, _ = point_motion(trajectory, "rocker", foot)
-    return observed | {"pivot_x": end[:, 0] - base, "pivot_y": end[:, 1]}
+    pivot = {"pivot_x": end[:, 0] - base, "pivot_y": end[:, 1]}
+    return bar_angles(trajectory, "crank", "coupler", "rocker") | pivot

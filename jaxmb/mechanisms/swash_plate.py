@@ -7,6 +7,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import turn_about_x
 
 
 @mechanism()
@@ -24,8 +25,8 @@ def swash_plate(
 ) -> Mechanism:
     """A plate on an inclined journal of a shaft drives pistons parallel to the shaft by rods; x along the shaft, z up.
 
-    The plate would turn with the shaft but for a pin in a slot, which keeps a point of it in the plane of x and y: it
-    wobbles. Rods have ball joints at the plate and Cardan joints at the pistons. With three pistons, and the ground
+    A pin in a slot keeps a point of the plate in the plane of x and y, so that the plate wobbles and does not turn with
+    the shaft. Rods have ball joints at the plate and Cardan joints at the pistons. With three pistons, and the ground
     counted as a body, there are nine bodies with 63 coordinates and 62 rows: one degree of freedom.
 
     Source: the air compressor of E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989,
@@ -94,9 +95,7 @@ def swash_plate(
 
 
 def _observe(trajectory, pistons):
-    shaft = trajectory["shaft"]
-    e0, e1 = shaft.orientation[:, 0], shaft.orientation[:, 1]
-    observed = {"cos": e0**2 - e1**2, "sin": 2 * e0 * e1, "omega": shaft.angular_velocity[:, 0]}
+    observed = turn_about_x(trajectory, "shaft") | {"omega": trajectory["shaft"].angular_velocity[:, 0]}
     for k in range(1, pistons + 1):
         piston = trajectory[f"piston{k}"]
         observed |= {f"x{k}": piston.position[:, 0], f"v{k}": piston.velocity[:, 0]}

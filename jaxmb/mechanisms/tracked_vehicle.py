@@ -59,8 +59,8 @@ def tracked_vehicle(
     gravity: float = 9.81,
 ) -> Mechanism:
     """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
-    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2`
-    another carrier is towed by a hitch, and there are twice as many less two.
+    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2` it
+    tows another carrier by a hitch, which takes away two degrees of freedom.
 
     It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
     right pair; x is forward, y up.

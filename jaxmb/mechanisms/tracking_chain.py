@@ -8,7 +8,8 @@ from ..lagrangian import LagrangianSystem, Servo
 from ..parts.functions import Constraint, Force
 from ..parts.servo import Servo as ServoOfJoint
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates
 
 _MASSES = ("one", "two", "three")
 
@@ -25,26 +26,27 @@ def tracking_chain(
     gains: tuple[float, float] = (0.0, 0.0),
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """Three masses in a row on nonlinear springs, driven at the end, that are to move as two given functions of time.
+    """Three masses in a row on nonlinear springs, driven at the end, with a control force that makes two of them
+    follow a desired motion.
 
     Coordinates: displacements q1, q2, q3 [m]; springs to the ground and between neighbours have the force k d + κ
-    d³. The desired motion, q1 = 0.5 sin t and q3 − q1 = 0.2 cos 2t, is a constraint on accelerations, and its force
-    `trajectory.constraint_forces["track"]` the control that achieves it exactly.
+    d³. The desired motion, q1 = 0.5 sin t and q3 − q1 = 0.2 cos 2t, is a servo constraint on accelerations; its force
+    `trajectory.constraint_forces["track"]` is the control that achieves it exactly.
 
     Source: R. E. Kalaba and F. E. Udwadia, Equations of motion for nonholonomic, constrained dynamical systems via
     Gauss's principle, J. Appl. Mech. 60(3), 1993; data of this package. Reference values from DOP853 on their
     equation.
 
     **Arguments:** `masses` [kg]; `stiffness` k [N/m] and `cubic` κ [N/m³]; `damping` [N s/m] of every mass; `drive`
-    [rad/s], of the force sin on the last mass; `offset` [m], of the start: q1 too far ahead by it, q3 − q1 behind
-    by twice as much; `gains` [1/s, 1/s²] with which deviations are brought to zero;
+    [rad/s], the frequency of the force on the last mass; `offset` [m] of the start: q1 is ahead of the desired motion
+    by it, q3 − q1 behind by twice as much; `gains` [1/s, 1/s²] of the feedback that reduces deviations;
     `model`: from its Lagrangian, or as point masses `one`, `two` and `three` on a rail along x.
 
     **Labels:** `q1`, `q2`, `q3` [m], `u0`, `u1`, `u2` [m/s].
     """
     q, u = (offset, 0.0, 0.2 - offset), (0.5, 0.0, 0.5)
     numbers = {"stiffness": stiffness, "cubic": cubic, "damping": damping, "drive": drive}
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     if rigid:
         system = _points(masses, numbers, gains, q, u)
     else:
@@ -106,7 +108,7 @@ def _wrenches(poses, velocities, t, p):
 
 def _observe(trajectory):
     force = trajectory.constraint_forces["track"]
-    return observe_coordinates(trajectory) | {"force1": force[:, 0], "force3": force[:, 2]}
+    return lagrangian_coordinates(trajectory) | {"force1": force[:, 0], "force3": force[:, 2]}
 
 
 def _observe_points(trajectory):

@@ -49,8 +49,8 @@ def train(
     vehicle are applied when the pressure wave arrives from the head of the train, and rise to their force in
     `brake_rise`.
 
-    Tolerances are relative to places along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
-    coupler. Long trains want smaller ones, or `longitudinal_train`.
+    Tolerances are relative to positions along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
+    coupler. Use smaller ones for long trains, or `longitudinal_train`.
 
     Source: after V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974; the numbers
     are those of a loaded four-axle wagon, with a generic friction draft gear.
@@ -58,7 +58,7 @@ def train(
     **Arguments:**
 
     - `n` ≥ 1, the number of vehicles.
-    - `coupler(name, front, rear, point_a=, point_b=)`: makes the part that couples two vehicles: a force
+    - `coupler(name, front, rear, point_a=, point_b=)`: returns the part that couples two vehicles: a force
         (`planar.DraftGear`, `functools.partial(planar.DraftGear, slack=0.0)`, …) or a joint (`planar.Revolute`, a
         hinge; `planar.Distance`, a drawbar).
     - `coupler_length` [m], the distance of the coupled points at the start; default 0 for hinges, otherwise 1.
@@ -88,7 +88,7 @@ def train(
         planar.Body(name, mass=m, inertia=j, position=(x, 0.0), velocity=(v, 0.0))
         for name, m, j, x, v in zip(names, mass, inertia, place, speed, strict=True)
     ]
-    # Numbers that all vehicles share are made arrays once.
+    # Numbers that all vehicles share are converted only once.
     shared = lambda kind, **numbers: {name: kind(value) for name, value in numbers.items()}
     ends = shared(number, point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
     couplers = [

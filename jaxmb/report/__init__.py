@@ -1,4 +1,4 @@
-"""What accuracy costs: error against run time and evaluations; what formulations do, and whole ways of integrating."""
+"""Reports: error against run time and evaluations, the costs of formulations, and those of integration methods."""
 
 from .formulations import (
     Cost as Cost,
