@@ -17,7 +17,7 @@ Residuals = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[
 # Residuals and their Jacobian; infinite where the simulation fails.
 Linearised = Callable[[Float[Array, "n"]], tuple[Float[Array, "residuals"], Float[Array, "residuals n"]]]
 
-# Damping of the first step of Levenberg–Marquardt, and its smallest value, relative to the squared norms of columns.
+# Damping of the first step of Levenberg–Marquardt, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
 
 
@@ -32,8 +32,8 @@ class Minimum(NamedTuple):
 def levenberg_marquardt(linearised: Linearised, z: Float[Array, "n"], tol: float, limit: int) -> Minimum:
     """Minimise `½ |r(z)|²`; trials that fail are rejected.
 
-    Marquardt's damping: a step minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J.
-    μ is updated from the gain, the ratio of the actual decrease to that of the linear model.
+    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt). The damping μ follows
+    the gain, the ratio of the decrease of the objective to that of the linear model.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
@@ -41,26 +41,26 @@ def levenberg_marquardt(linearised: Linearised, z: Float[Array, "n"], tol: float
     which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`.
     """
     residuals, jacobian = map(np.asarray, linearised(z))
-    objective, norms = 0.5 * residuals @ residuals, np.linalg.norm(jacobian, axis=0)
+    objective = 0.5 * residuals @ residuals
     damping, growth = _FIRST_DAMPING, 2.0
     for iteration in range(1, limit):
+        norms = np.linalg.norm(jacobian, axis=0)
         weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
         rows, target = np.vstack([jacobian, np.diag(weights)]), np.append(-residuals, np.zeros_like(weights))
-        step = np.linalg.lstsq(rows, target)[0]
+        step = np.linalg.lstsq(rows, target, rcond=None)[0]
         trial = z + jnp.asarray(step, z.dtype)
-        residuals_there, jacobian_there = map(np.asarray, linearised(trial))
-        objective_there = 0.5 * residuals_there @ residuals_there
+        trial_residuals, trial_jacobian = map(np.asarray, linearised(trial))
+        trial_objective = 0.5 * trial_residuals @ trial_residuals
+        decrease = objective - trial_objective
         predicted = 0.5 * step @ (weights**2 * step - jacobian.T @ residuals)
-        gain = (objective - objective_there) / predicted if predicted > 0 else 0.0
-        settled = np.all(np.abs(step) <= tol * (1 + np.abs(z)))
-        settled &= np.abs(objective - objective_there) <= tol * (1 + objective)
+        gain = decrease / predicted if predicted > 0 else 0.0
+        converged = np.all(np.abs(step) <= tol * (1 + np.abs(z))) and abs(decrease) <= tol * (1 + objective)
         if gain > 0:
-            z, residuals, jacobian, objective = trial, residuals_there, jacobian_there, objective_there
-            norms = np.linalg.norm(jacobian, axis=0)
             damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
+            z, residuals, jacobian, objective = trial, trial_residuals, trial_jacobian, trial_objective
         else:
             damping, growth = damping * growth, 2 * growth
-        if settled:
+        if converged:
             return Minimum(z, iteration + 1, True)
     return Minimum(z, limit, False)
 
