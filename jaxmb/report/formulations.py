@@ -37,7 +37,7 @@ def every_formulation() -> dict[str, AbstractFormulation]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Cost:
+class FormulationCost:
     """The cost of one formulation.
 
     **Fields:** times [s] of one evaluation of all accelerations, including the Jacobian and its elimination in a given
@@ -59,7 +59,7 @@ class FormulationCosts:
     """The result of `formulation_costs`; `print` shows a table."""
 
     mechanism: str
-    costs: tuple[Cost, ...]
+    costs: tuple[FormulationCost, ...]
 
     def __str__(self) -> str:
         head = (
@@ -82,7 +82,7 @@ class FormulationCosts:
         return dataclasses.asdict(self)
 
 
-def _cells(cost: Cost) -> tuple[str, ...]:
+def _cells(cost: FormulationCost) -> tuple[str, ...]:
     times = (f"{1e6 * time:.2f}" for time in (cost.evaluation, cost.forward, cost.reverse))
     return (cost.formulation, *times, *map(str, cost.lines), f"{cost.deviation:.0e}")
 
@@ -128,7 +128,7 @@ def formulation_costs(
     for k, name in enumerate(chosen):
         deviation = float(np.max(np.abs(accelerations[name] - first))) / size
         evaluation, forward, reverse = times[3 * k : 3 * k + 3]
-        costs.append(Cost(name, evaluation, forward, reverse, lines[name], deviation))
+        costs.append(FormulationCost(name, evaluation, forward, reverse, lines[name], deviation))
     return FormulationCosts(mechanism.name, tuple(costs))
 
 
