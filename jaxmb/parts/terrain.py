@@ -1,7 +1,7 @@
 """Terrains: heights as smooth functions of the place, for contacts with the ground.
 
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
-where z is up. Terrains that are profiles along x go on unchanged across it, so they serve in both.
+where z is up. A profile along x is constant across it, so that it can be used in both.
 """
 
 import abc
@@ -47,7 +47,7 @@ class Flat(AbstractTerrain):
 
 
 class Bump(AbstractTerrain):
-    """A single bump, `peak sin²(π s)` with `s = (x − start) / length` in (0, 1); C¹, and smooth but at its ends.
+    """A single bump, `peak sin²(π s)` with `s = (x − start) / length` in (0, 1); C¹, and smooth except at its ends.
 
     **Arguments:** `start` [m], where it begins; `length` [m] > 0; `peak` [m], its height, negative for a ditch.
     """
@@ -89,9 +89,9 @@ class Slope(AbstractTerrain):
 
 
 class Ramp(AbstractTerrain):
-    """A way up from one level to another, a polynomial of degree five with level, straight ends; C².
+    """A transition between two levels, by a polynomial of degree five; C².
 
-    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `rise` [m], negative for a way down; its steepest
+    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `rise` [m], negative for a descent; its steepest
     gradient is `1.875 rise / length`, in the middle.
     """
 
@@ -104,7 +104,7 @@ class Ramp(AbstractTerrain):
 
 
 class Spline(AbstractTerrain):
-    """A profile through measured points; C², and in every place a function of the four nearest points alone.
+    """A profile through measured points; C², and local: a height depends on the four nearest points only.
 
     Between two points a polynomial of degree five, whose slopes and curvatures at the points are those of the parabolas
     through a point and its two neighbours. Beyond the first and the last point it goes on straight.
@@ -130,7 +130,7 @@ class Spline(AbstractTerrain):
         k = jnp.clip(jnp.searchsorted(self.x, x, side="right") - 1, 0, n - 2)
         h = self.x[k + 1] - self.x[k]
         (y0, m0, c0), (y1, m1, c1) = self._at_point(k), self._at_point(k + 1)
-        # What the straight line through both points leaves over, from slopes and curvatures at either.
+        # The difference from the straight line through both points, from slopes and curvatures at either.
         chord = (y1 - y0) / h
         a, b = (m0 - chord) * h, (chord - m1) * h
         c, d = 0.5 * c0 * h * h, 0.5 * c1 * h * h
