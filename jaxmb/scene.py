@@ -28,7 +28,7 @@ from .planar import Body as PlanarBody, PointMass as PlanarPointMass
 from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
 from .states.structure import find_structure
 from .system import RigidBodySystem
-from .system.describe import Description
+from .system.description import Description
 from .system.equation import Ranks
 from .system.groups import (
     ConstraintGroup,

@@ -48,7 +48,7 @@ class QuasiVelocities(AbstractKinematics):
     dependent: tuple[int, ...] = eqx.field(static=True)
     identity: ClassVar[bool] = False
     linear: ClassVar[bool] = False
-    homogeneous: ClassVar[bool] = False
+    drift_free: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -163,6 +163,7 @@ def johnsen_hamel_residual(
 
 
 def _quasi(system: LagrangianSystem) -> QuasiVelocities:
+    # A concrete class: only it has dependent velocities that forces hold at zero.
     if not isinstance(system.kinematics, QuasiVelocities):
         raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(system.kinematics).__name__}.")
     return system.kinematics

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
-from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
+from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame, Rates
 from ..parts.base import array
 from ..scene import Scene
 from ..system import parameters as parameters_of
@@ -41,7 +41,7 @@ def wheeled(
         raise ValueError(f"The forms are {', '.join(FORMS)}; got {form!r}.")
     parameters, q, u, v = _start(parameters, angle, speed, rate)
     kinematics, start, constraints = {
-        "frame": (Frame(frame, 2), u, ()),
+        "frame": (QuasiVelocityFrame(frame, 2), u, ()),
         "constraints": (Rates(), v, (Pfaffian("wheels", wheels),)),
         "connection": (Connection((2, 3), (0, 1), connection), v[2:], ()),
     }[form]

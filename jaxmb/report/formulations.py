@@ -104,7 +104,7 @@ def formulation_costs(
     if system.acceleration_rows == 0:
         raise ValueError(f"{mechanism.name!r} has no constraints: its accelerations are M⁻¹F by any formulation.")
     every = every_formulation() if formulations is None else dict(formulations)
-    chosen = {name: road for name, road in every.items() if system.regular or not road.inverts_mass}
+    chosen = {name: road for name, road in every.items() if system.positive_definite_mass or not road.inverts_mass}
     if not chosen:
         raise ValueError(f"The mass matrix of {mechanism.name!r} is singular; no formulation was given that allows it.")
     pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), stage=stages(system))

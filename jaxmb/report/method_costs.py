@@ -183,7 +183,7 @@ def _simulation(
     matrix: float,
 ) -> _Method:
     t1 = float(known.times[-1])
-    others = Multipliers() if mechanism.system.regular else NullSpace()
+    others = Multipliers() if mechanism.system.positive_definite_mass else NullSpace()
     formulation = Partitioned() if isinstance(manifold, Partition) else others
 
     @eqx.filter_jit

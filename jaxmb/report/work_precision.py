@@ -93,7 +93,8 @@ class WorkPrecision:
 
         **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
         """
-        plot_work_precision(self).savefig(path, dpi=150)
+        title = f"{self.mechanism}, {self.t1:g} s"
+        plot_work_precision(title, self.runs, self.disagreement).savefig(path, dpi=150)
 
 
 _HEADER = ("solver", "rtol", "error", "run [ms]", "median", "compile [s]", "steps", "rejected", "evaluations")

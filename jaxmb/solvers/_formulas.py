@@ -124,8 +124,8 @@ def double(history: History, slope: Float[Array, " n"]) -> History:
     slopes = jnp.asarray(np.arange(length) > 0, dtype) * (own / gaps).astype(dtype)
     before = jnp.asarray(before_each(length), dtype)
     new = own.astype(dtype) * slope[None] - (before * slopes[None]) @ history.differences
-    new = jnp.where((np.arange(length, dtype=np.int32) <= history.points)[:, None], new, jnp.zeros((), dtype))
+    new = jnp.where((np.arange(length, dtype=np.int32) <= history.known)[:, None], new, jnp.zeros((), dtype))
     new = jnp.concatenate([history.differences[:1], new[1:]])
-    doubled = History(new, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.points + 1, length).astype(np.int32))
+    doubled = History(new, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.known + 1, length).astype(np.int32))
     already = mesh[0] == mesh[1]
     return jax.tree.map(lambda old, new: jnp.where(already, old, new), history, doubled)
