@@ -92,9 +92,9 @@ def simulate(
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work; `RuntimeError`, if
-    `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the trajectory up to
-    there is kept.
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work;
+    `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
+    trajectory up to there is kept.
 
     Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
     ones. A mesh is made for the motion it follows: from a state of rest in equilibrium it is coarse, and derivatives
@@ -202,7 +202,7 @@ def _corrected(system, ts, saved, correction):
 
 def _named(name: str, state: State) -> Adams:
     if name not in ("auto", "switch"):
-        raise ValueError(f"A solver is an object, or one of the words 'auto' and 'switch'; got {name!r}.")
+        raise ValueError(f"solver must be an object, or one of the words 'auto' and 'switch'; got {name!r}.")
     if name == "switch" and is_traced(state):
         raise ValueError(
             "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
@@ -269,7 +269,7 @@ def _checked_state(system: AbstractSystem, state: Any) -> State:
 
 def _times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
     start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
-    step = None if dt0 is None else real_array("dt0", dt0, dtype)
+    step: Any = None if dt0 is None else real_array("dt0", dt0, dtype)
     if not is_traced(start) and not np.isfinite(start):
         raise ValueError(f"t0 must be finite, got {t0}.")
     known = step is not None and not is_traced((start, end, step))

@@ -158,8 +158,8 @@ def test_description(system, framed):
         "3 coordinates: x, y, z",
         "2, of which 2 independent (1 between accelerations only)",
         "degrees of freedom  2",
-        "Holonomic  rod   1 row",
-        "ServoConstraint      hold  1 row",
+        "Holonomic        rod   1 row",
+        "ServoConstraint  hold  1 row",
         "Viscous  rod",
         "diagonal mass matrix",
     ):

@@ -72,7 +72,7 @@ class Formulas(NamedTuple):
     """The coefficients of one step, for every number m of nodes of the past.
 
     With `z = f`: `y_{n+1} = y_n + h (past[m] @ differences + slope[m] f_{n+1} + curvature[m] h g_{n+1})`, with
-    `z = y`: `y_{n+1} = past[m] @ differences + slope[m] h f_{n+1} + curvature[m] h² g_{n+1}`. Row zero means nothing.
+    `z = y`: `y_{n+1} = past[m] @ differences + slope[m] h f_{n+1} + curvature[m] h² g_{n+1}`. Row 0 is unused.
     """
 
     past: Float[Array, "length length"]

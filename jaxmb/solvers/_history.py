@@ -70,7 +70,7 @@ def basis_means(
     """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
     dtype = mesh.dtype
     table = basis(mesh, a + (b - a) * jnp.asarray(np.append(NODES, 1.0), dtype))
-    # Written out: in a batch XLA's sum over so short an axis is ten times as dear.
+    # Written out: in a batch XLA's sum over so short an axis is ten times as expensive.
     means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(WEIGHTS))
     return jnp.asarray(means), table[:, -1]
 

@@ -55,7 +55,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         check_real(y0)
         return self._initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
-    # A program in the program: it is traced once, not anew in each loop and each transformation around it.
+    # Nested jit: a step is traced once, not anew in each loop and each transformation around it.
     @eqx.filter_jit
     def step(
         self,

@@ -146,7 +146,7 @@ class Adams(AbstractMultistep):
         first = evaluate(terms, t0, ravel(y0), y0, chart, args)
         f, chart = first.f, first.chart
         if first.failed is not False:
-            # It spreads to the error estimate, and fails the step.
+            # The NaN reaches the error estimate, so the step is rejected.
             f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
         if before is None:
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()

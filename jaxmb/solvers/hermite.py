@@ -163,7 +163,7 @@ class Hermite(AbstractMultistep):
         family, flat = FAMILIES[self.family], ravel(y0)
         first = (probed_derivatives if before is None else derivatives)(field_of(terms, t0, y0, chart, args), t0, flat)
         chart, failed = first.rest
-        # It spreads to the error estimate, and fails the step.
+        # The NaN reaches the error estimate, so the step is rejected.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         free = free_components(terms, flat, chart)
         if free.size == 0:
@@ -253,7 +253,7 @@ class Hermite(AbstractMultistep):
         renewed = next_chart(terms, t1, y1, chart, args)
         matrix = newton.matrix
         if chart is not None:
-            # Of other components it is another matrix.
+            # A new choice of components invalidates the matrix.
             changed = jnp.any(free_components(terms, before, renewed) != free)
             matrix = eqx.tree_at(lambda m: m.renewals, matrix, jnp.maximum(matrix.renewals, changed.astype(jnp.int32)))
         new_state = HermiteState(

@@ -11,8 +11,9 @@ def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> N
     """Raise a `ValueError` unless an argument is of a class."""
     if isinstance(value, kind):
         return
-    given = f"the class {value.__name__}" if isinstance(value, type) else repr(value).split("\n")[0]
-    given = given if len(given) <= 60 else f"a {type(value).__name__}"
+    given = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+    if "\n" in given or len(given) > 60:
+        given = f"an object of type {type(value).__name__}"
     raise ValueError(f"{name} must be {expected}, got {given}; {cure}.")
 
 
