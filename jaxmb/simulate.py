@@ -162,7 +162,9 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
     solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
     ts, saved = solution.ts[0], solution.ys[0]
     correction = manifold.correction(interpolated)
-    if isinstance(saved, State) and correction is not None:
+    # `SaveAt(fn=...)` may save something else than states.
+    are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
+    if are_states and correction is not None:
         saved = _corrected(system, ts, saved, correction)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
@@ -269,11 +271,12 @@ def _checked_state(system: AbstractSystem, state: Any) -> State:
 
 def _times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
     start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
-    step: Any = None if dt0 is None else real_array("dt0", dt0, dtype)
     if not is_traced(start) and not np.isfinite(start):
         raise ValueError(f"t0 must be finite, got {t0}.")
-    known = step is not None and not is_traced((start, end, step))
-    if known and not (np.isfinite(step) and step * (1 if end >= start else -1) > 0):
+    if dt0 is None:
+        return {"t0": start, "t1": end, "dt0": None}
+    step = real_array("dt0", dt0, dtype)
+    if not is_traced((start, end, step)) and not (np.isfinite(step) and step * (1 if end >= start else -1) > 0):
         raise ValueError(
             f"dt0 must be a finite step from t0 = {t0} towards t1 = {t1}, got {dt0}; leave it out for the default."
         )
