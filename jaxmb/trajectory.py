@@ -52,8 +52,8 @@ class Trajectory(eqx.Module):
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
-    … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, and of a
-    system with coordinates of the user's that of a coordinate, shape (times,).
+    … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
+    `BodyMotion`; of a system in generalized coordinates it is that of a coordinate, shape (times,).
     """
 
     system: Any

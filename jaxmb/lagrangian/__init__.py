@@ -1,4 +1,4 @@
-"""Systems from a Lagrangian, in coordinates and velocities of the user's choice."""
+"""Systems from a Lagrangian, in any generalized coordinates and velocities."""
 
 from .constraints import (
     AbstractCoordinateConstraint as AbstractCoordinateConstraint,

@@ -1,4 +1,4 @@
-"""What velocities describe the motion of a Lagrangian system: `q̇ = K(t, q, u)`."""
+"""Velocities of a Lagrangian system, and the rates of the coordinates that follow from them: `q̇ = K(t, q, u)`."""
 
 import abc
 from collections.abc import Callable
@@ -33,7 +33,7 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def count(self, nq: int) -> int:
-        """The number of velocities for so many coordinates."""
+        """The number of velocities of a system with nq coordinates."""
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], parameters: Parameters) -> Array:

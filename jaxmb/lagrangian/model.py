@@ -260,7 +260,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         sizes = zip(self.constraints, self.sizes, strict=True)
         tables = {
             "constraints": tuple((type(c).__name__, c.name, f"{n} row{'s' * (n > 1)}") for c, n in sizes),
-            "beyond d'Alembert's principle": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
+            "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
         }
         specialised = specialised_constraints(self)
         if self.diagonal:

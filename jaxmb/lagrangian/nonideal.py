@@ -1,8 +1,8 @@
-"""What constraints do beyond d'Alembert's principle.
+"""Non-ideal constraint forces, which do virtual work.
 
 A constraint that is not ideal adds a force C, given by its work in displacements w that the constraints allow, `w · C`:
-what of C lies along the gradients of constraints has no effect. It may depend on the force that the constraint would
-exert if it were ideal.
+the components of C along the gradients of constraints have no effect. C may depend on the force that the constraint
+would exert if it were ideal.
 
 Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems", Proc.
 R. Soc. A 463, 2007.

@@ -20,7 +20,7 @@ from .dataflow import depends
 from .kinematics import AbstractKinematics
 from .model import AbstractLagrangian
 
-# With so many sets of parameters a matrix is looked at.
+# Number of sets of parameters at which the entries of the mass matrix are compared with zero.
 _LOOKS = 3
 
 
@@ -118,7 +118,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     if linear:
         rows = slice(0, system.velocity_rows)
         _check_consistent(system, "velocities", found.jacobian[rows], -found.unmet, rows)
-    # What binds velocities is left alone here: the guess need not satisfy it.
+    # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
     rows = slice(system.velocity_rows, system.acceleration_rows)
     _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
     _check_nonideal(system, acceleration, others)
@@ -186,7 +186,7 @@ def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
 
 
 def _shaken(x: Array, k: Array) -> Array:
-    """A parameter with each of its numbers changed by a share of its own."""
+    """A parameter with each of its numbers changed by a different factor."""
     return x * (1 + 0.1 * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
 
 

@@ -32,11 +32,10 @@ class LagrangianSystem(AbstractLagrangian):
     $$B^T \left(\frac{d}{dt} \frac{\partial L}{\partial \dot q} - \frac{\partial L}{\partial q} - Q\right)
       = A^T \lambda$$
 
-    All of it is found by automatic differentiation; structure functions of quasi-velocities never appear, unless the
-    equations are to be written with them.
+    Every term is found by automatic differentiation; structure functions of quasi-velocities appear only in equations
+    that are written with them.
 
-    Functions are of JAX, and take numbers of the model by name in their last argument, a dictionary: the system's
-    parameters.
+    All functions are JAX functions. Their last argument is the dictionary of the system's parameters by name.
 
     **Arguments:**
 
@@ -46,8 +45,8 @@ class LagrangianSystem(AbstractLagrangian):
     - `force(t, q, v, parameters)`: generalized forces Q without potential, shape (nq,).
     - `constraints`: `Holonomic`, `Nonholonomic`, `Pfaffian`, `AccelerationConstraint`, `ServoConstraint`; rows may
         imply others.
-    - `nonideal`: what constraints do beyond d'Alembert's principle: `CoulombFriction`, `Viscous`, `NonIdealForce`.
-    - `kinematics`: what u is; default `Rates()`, u = q̇.
+    - `nonideal`: forces of constraints that do virtual work: `CoulombFriction`, `Viscous`, `NonIdealForce`.
+    - `kinematics`: the meaning of u; default `Rates()`, u = q̇.
     - `equations`: how they are written; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
     - `q`, `u`: a state near the constraints, the guess for `assemble`; ranks are found there. Default u is zero.
     - `parameters`: numbers by name.

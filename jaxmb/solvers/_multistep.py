@@ -1,4 +1,4 @@
-"""What the multistep solvers have in common: tolerances, starts and restarts, and how errors are measured."""
+"""The common base of the multistep solvers: tolerances, starts and restarts, and how errors are measured."""
 
 import abc
 from collections.abc import Callable

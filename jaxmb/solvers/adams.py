@@ -31,7 +31,7 @@ _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
 
 class AdamsState(eqx.Module):
-    """What `Adams` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+    """The state of `Adams` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 

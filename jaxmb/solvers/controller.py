@@ -31,7 +31,7 @@ _CAUTION, _CAUTIOUS = 4, 1.4
 
 
 class ControllerState(eqx.Module):
-    """What `MultistepController` remembers between steps; `diffrax.SaveAt(controller_state=True)` returns it.
+    """The state of `MultistepController` between steps; `diffrax.SaveAt(controller_state=True)` returns it.
 
     **Fields:**
 

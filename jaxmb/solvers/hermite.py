@@ -32,7 +32,7 @@ _TARGET = 0.05
 
 
 class HermiteState(eqx.Module):
-    """What `Hermite` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+    """The state of `Hermite` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 
@@ -306,7 +306,7 @@ class Hermite(AbstractMultistep):
         return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
 
     def _recorded(self, y, f, g):
-        """What the history is of, and its slope."""
+        """The values that the history holds, and their time derivatives."""
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])

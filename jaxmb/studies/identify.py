@@ -36,7 +36,7 @@ _ITERATIONS = {"lm": 100, "optax": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class Identification:
-    """What `identify` returns; `print` shows a table.
+    """The result of `identify`; `print` shows a table.
 
     **Fields:**
 

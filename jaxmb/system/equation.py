@@ -6,8 +6,8 @@
 
 `Φ` holds the constraints between positions; `ψ` their time derivatives followed by the nonholonomic rows; the first
 rows of A are ∂ψ/∂u, and those of constraints that bind accelerations only may follow. Coordinates may have invariants
-of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those. `C` is what constraints that are
-not ideal do beyond d'Alembert's principle; M depends on u only where velocities are nonlinear in q̇.
+of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those. `C` holds the forces of
+constraints that do virtual work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
