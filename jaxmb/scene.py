@@ -11,6 +11,8 @@ import numpy as np
 from ._types import State
 from .parts.base import (
     GROUND,
+    AbstractBody,
+    AbstractCompound,
     AbstractConstraint,
     AbstractForce,
     AbstractLink,
@@ -18,30 +20,27 @@ from .parts.base import (
     AbstractVelocityConstraint,
     rows_of,
 )
+from .parts.boundary import check_kernels
+from .parts.fields import anonymous, declarations
 from .parts.forces import Gravity
 from .parts.names import unknown
 from .parts.planar.kinematics import PLANE
-from .parts.resolve import label, vector
 from .parts.servo import Servo
 from .parts.spatial.kinematics import SPACE
-from .planar import Body as PlanarBody, PointMass as PlanarPointMass
-from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
 from .states.structure import find_structure
 from .system import RigidBodySystem
 from .system.description import Description
 from .system.equation import Ranks
 from .system.groups import (
+    BodyGroup,
     ConstraintGroup,
     ForceGroup,
     NonIdealGroup,
     VelocityConstraintGroup,
-    anonymous,
     servo_group,
     stack,
 )
 from .system.layout import Layout
-
-_BODIES = (PlanarBody, PlanarPointMass, SpatialBody, SpatialPointMass)
 
 
 class Scene(eqx.Module):
@@ -92,33 +91,33 @@ class Scene(eqx.Module):
         gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):
             if isinstance(part, Gravity):
+                part.check(space.dimension)
                 gravity = part
-                vector(part, "acceleration", part.acceleration, space.dimension)
-                continue
-            _check_finite(part)
-            if isinstance(part, AbstractNonIdeal):
+            elif isinstance(part, AbstractNonIdeal):
                 joint, own = joints[part.joint]
                 laws.append((part.resolve(space, joint, given[list(own)]), own))
-                continue
-            own = tuple(index[name] for name in part.bodies)
-            poses = given[list(own)]
-            resolved = _call(part, "resolve", space, poses)
-            _check_rotation(resolved, own, layout, poses)
-            joints[part.name] = resolved, own
-            parts += [(component, own) for component in _call(resolved, "components")]
+            else:
+                own = tuple(index[name] for name in part.bodies)
+                poses = given[list(own)]
+                resolved = _call(part, "resolve", space, poses)
+                joints[part.name] = resolved, own
+                components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
+                _check_rotation(resolved, components, own, layout, poses)
+                parts += [(component, own) for component in components]
 
-        kind = lambda cls: stack([(part, own) for part, own in parts if isinstance(part, cls)], layout)
+        def kind(cls, check=check_kernels):
+            return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
+
         of_joint = {law.name: law.joint for law, _ in laws}
         system = RigidBodySystem(
-            mass=jax.device_put(np.stack([body.mass for body in self.bodies])),
-            rotary=jax.device_put(
-                np.stack([body.inertia if body.rotates else _no_inertia(space) for body in self.bodies])
-            ),
+            bodies=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),
             constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
             velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
-            servos=tuple(map(servo_group, kind(Servo))),
-            nonideal=tuple(NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout)),
+            servos=tuple(map(servo_group, kind(Servo, _check_program))),
+            nonideal=tuple(
+                NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
+            ),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
             guess=guess,
             length=_length([part for part, _ in parts], guess, layout),
@@ -132,20 +131,20 @@ class Scene(eqx.Module):
         return dataclasses.replace(system, ranks=ranks, implied=implied)
 
 
+def _check_program(servo, space, bodies):
+    check_kernels(servo.program, space, bodies)
+
+
 def _call(part, name, *arguments):
     """A method of a part. Bound methods of modules are modules, too many of them for scenes of thousands of parts."""
     return getattr(type(part), name)(part, *arguments)
-
-
-def _no_inertia(space):
-    return np.zeros((3, 3) if space.dimension == 3 else (), jnp.result_type(float))
 
 
 def _check_kinds(scene: Scene):
     if not scene.bodies:
         raise ValueError("A scene needs at least one body.")
     for body in scene.bodies:
-        if not isinstance(body, _BODIES):
+        if not isinstance(body, AbstractBody):
             raise ValueError(
                 f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own."
             )
@@ -159,16 +158,9 @@ def _check_kinds(scene: Scene):
         raise ValueError("A scene has one Gravity; add the accelerations.")
     dimension = scene.bodies[0].dimension
     for part in (*scene.bodies, *scene.joints, *scene.forces):
-        own = _dimension(part)
-        if own is not None and own != dimension:
+        if dimension not in part.dimensions:
             here, there = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
-            raise ValueError(f"{label(part)} is {there}, but the scene is {here}; use the {here} part of that name.")
-
-
-def _dimension(part):
-    """2 or 3 for parts of one space, None for those of both."""
-    module = type(part.program if isinstance(part, Servo) else part).__module__
-    return 2 if ".planar" in module else 3 if ".spatial" in module else None
+            raise ValueError(f"{part.label} is {there}, but the scene is {here}; use the {here} part of that name.")
 
 
 def _check_names(scene: Scene):
@@ -180,7 +172,7 @@ def _check_names(scene: Scene):
                 + (" ('ground' is the fixed world)." if part.name == GROUND else ".")
             )
         if not part.name or "." in part.name:
-            raise ValueError(f"{label(part)}: a name must not be empty or contain a dot.")
+            raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(part.name)
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
     # A program of a Servo is no joint: nothing slides in it.
@@ -188,35 +180,33 @@ def _check_names(scene: Scene):
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractNonIdeal):
             if part.joint not in joints:
-                raise ValueError(f"{label(part)}: {unknown('joint', part.joint, joints)}")
+                raise ValueError(f"{part.label}: {unknown('joint', part.joint, joints)}")
             continue
         if isinstance(part, Gravity):
             continue
         for name in part.bodies:
             if name not in known:
-                raise ValueError(f"{label(part)}: {unknown('body', name, known)}")
+                raise ValueError(f"{part.label}: {unknown('body', name, known)}")
         twice = [name for name in part.bodies if part.bodies.count(name) > 1]
         if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
-            raise ValueError(f"{label(part)} connects {twice[0]!r} with itself.")
+            raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
 
 
-def _check_rotation(part, own, layout, poses):
+def _check_rotation(part, components, own, layout, poses):
     """A point mass does not turn: refuse parts that would turn it, or hold on to its angle."""
     points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
-    if not points:
-        return
     space = layout.space
-    for component in part.components():
-        felt = np.asarray(_felt(anonymous(component), space, poses))
-        if np.any(felt[points, space.dimension :] > 0):
+    for component in components if points else ():
+        strength = np.asarray(_strength(anonymous(component), space, poses))
+        if np.any(strength[points, space.dimension :] > 0):
             raise ValueError(
-                f"{label(part)} acts on the rotation of a PointMass, which has none: put its point at the origin, "
+                f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "
                 "or use a Body."
             )
 
 
 @eqx.filter_jit
-def _felt(part, space, poses):
+def _strength(part, space, poses):
     """How strongly a part acts on the velocities of its bodies, or holds on to them."""
     if isinstance(part, AbstractForce):
         velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
@@ -225,22 +215,13 @@ def _felt(part, space, poses):
     return jnp.sum(jnp.abs(rows), axis=0)
 
 
-def _check_finite(part):
-    if all(np.isfinite(item).all() for item in jax.tree.leaves(part) if eqx.is_inexact_array(item)):
-        return
-    for field in part.__dataclass_fields__:
-        for item in jax.tree.leaves(getattr(part, field)):
-            if eqx.is_inexact_array(item) and not np.all(np.isfinite(item)):
-                raise ValueError(f"{label(part)}: {field} must be finite, got {np.asarray(item)}.")
-
-
 def _length(parts, guess, layout):
     """The scene's size [m]: the largest arm of a joint or distance between neighbours."""
     sizes = [
-        float(np.max(np.abs(getattr(part, field)), initial=0.0))
+        float(np.max(np.abs(getattr(part, name)), initial=0.0))
         for part in parts
-        for field in ("point_a", "point_b", "point", "length", "radius")
-        if eqx.is_inexact_array(getattr(part, field, None))
+        for name, own in declarations(type(part)).items()
+        if own.sizes and getattr(part, name) is not None
     ]
     size = max(sizes, default=0.0)
     if size == 0.0:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._types import State, VectorLike
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..system.equation import Ranks
 from .constraints import check_names
 from .equations import Projected
@@ -88,7 +88,7 @@ class LagrangianSystem(AbstractLagrangian):
         functions = _lagrangian(lagrangian, kinetic, potential), force
         # Φ, then the rest of ψ, then rows that bind accelerations only.
         constraints = tuple(sorted(constraints, key=lambda c: c.level))
-        numbers = {name: array(value) for name, value in (parameters or {}).items()}
+        numbers = {name: as_jax(value) for name, value in (parameters or {}).items()}
         model = Unanalysed(
             lagrangian=functions[0],
             applied=force,
@@ -98,7 +98,7 @@ class LagrangianSystem(AbstractLagrangian):
             equations=Projected() if equations is None else equations,
             parameters=numbers,
             guess=guess,
-            length=array(length),
+            length=as_jax(length),
             coordinates=_names(coordinates, guess.q.size),
             sizes=constraint_sizes(*functions, constraints, kinematics, guess, numbers),
         )
@@ -110,11 +110,11 @@ class LagrangianSystem(AbstractLagrangian):
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:
-    q = array(q)
+    q = as_jax(q)
     if q.ndim != 1:
         raise ValueError(f"q is a vector, got shape {q.shape}.")
     nu = kinematics.count(q.size)
-    u = array(np.zeros(nu)) if u is None else array(u)
+    u = as_jax(np.zeros(nu)) if u is None else as_jax(u)
     if u.shape != (nu,):
         raise ValueError(f"The system has {nu} velocities, got u of shape {u.shape}.")
     return State(q, u)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from .. import planar
 from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame, Rates
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..scene import Scene
 from ..system import parameters as parameters_of
 from ..trajectory import Trajectory
@@ -102,9 +102,9 @@ def observe_bodies(trajectory: Trajectory) -> Observation:
 
 def _start(parameters, angle, speed, rate):
     """Numbers, coordinates, speed and turning rate, and rates of the coordinates."""
-    parameters = {name: array(value) for name, value in parameters.items()}
-    q = jnp.stack([array(0.0), array(0.0), array(0.0), array(angle)])
-    u = jnp.stack([array(speed), array(rate)])
+    parameters = {name: as_jax(value) for name, value in parameters.items()}
+    q = jnp.stack([as_jax(0.0), as_jax(0.0), as_jax(0.0), as_jax(angle)])
+    u = jnp.stack([as_jax(speed), as_jax(rate)])
     return parameters, q, u, frame(0.0, q, parameters) @ u
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from .. import spatial
 from ..lagrangian import LagrangianSystem, Nonholonomic
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
 from ..scene import Scene
@@ -35,7 +35,7 @@ def appell_hamel(
 
     **Labels:** `x`, `y`, `z` [m]; `u0`, `u1`, `u2` [m/s].
     """
-    along = array(speed) * jnp.stack([jnp.cos(array(heading)), jnp.sin(array(heading)), array(slope)])
+    along = as_jax(speed) * jnp.stack([jnp.cos(as_jax(heading)), jnp.sin(as_jax(heading)), as_jax(slope)])
     rigid = of_bodies(model)
     if rigid:
         cone = lambda poses, velocities, t, p: _excess(velocities[0], p["slope"])

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import planar
 from .._types import State, VectorLike
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..parts.planar.kinematics import PLANE
 from ._relative import RelativeTrain, velocities
 from .mechanism import Mechanism, build, mechanism
@@ -56,9 +56,9 @@ def longitudinal_train(
     """
     check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
     mass, speed, brake = (
-        array(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
+        as_jax(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
     )
-    extension = array(of_each("extension", extension, n - 1))
+    extension = as_jax(of_each("extension", extension, n - 1))
     apart: Any = np.zeros((2, 3))
     gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, apart)
     numbers = {
@@ -75,10 +75,10 @@ def longitudinal_train(
         mass=mass,
         couplers=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n - 1, *leaf.shape)), gear),
         law=_law,
-        numbers=jax.tree.map(array, numbers),
-        slope=array(gravity * np.sin(np.arctan(grade))),
+        numbers=jax.tree.map(as_jax, numbers),
+        slope=as_jax(gravity * np.sin(np.arctan(grade))),
         guess=State(jnp.append(0.0, extension), jnp.concatenate([speed[:1], speed[:-1] - speed[1:]])),
-        length=array(spacing),
+        length=as_jax(spacing),
     )
     return build(
         "longitudinal_train",

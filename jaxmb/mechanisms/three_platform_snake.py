@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .. import planar
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
 
@@ -51,8 +51,8 @@ def three_platform_snake(
         raise ValueError(f"The forms are connection, constraints; got {form!r}.")
     rigid = of_bodies(model, form=form == "connection", equations=equations is None)
     parameters = {"mass": mass, "inertia": inertia, "half": half}
-    numbers = {name: array(value) for name, value in parameters.items()}
-    shape, turning = array(angles), array(rates)
+    numbers = {name: as_jax(value) for name, value in parameters.items()}
+    shape, turning = as_jax(angles), as_jax(rates)
     if gait is not None:
         shape, turning = jax.jvp(gait, (jnp.zeros(()),), (jnp.ones(()),))
     q, v = _without_slip(shape, turning, numbers)

@@ -10,7 +10,8 @@ import numpy as np
 
 from .. import planar
 from .._types import VectorLike
-from ..parts.base import AbstractForce, array, number
+from ..parts.base import AbstractForce
+from ..parts.fields import as_jax, as_parameter
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..scene import Scene
@@ -89,7 +90,7 @@ def train(
     ]
     # Numbers that all vehicles share are made arrays once.
     shared = lambda kind, **numbers: {name: kind(value) for name, value in numbers.items()}
-    ends = shared(number, point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
+    ends = shared(as_parameter, point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
     couplers = [
         coupler(f"coupler{k}", front, rear, **ends) for k, (front, rear) in enumerate(itertools.pairwise(names), 1)
     ]
@@ -101,9 +102,9 @@ def train(
         forces.append(Gravity((-gravity * np.sin(slope), -gravity * np.cos(slope) if suspension > 0 else 0.0)))
     if suspension > 0:
         spring = shared(
-            number, stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0
+            as_parameter, stiffness=(0.0, suspension, 0.0), damping=(0.0, suspension_damping, 0.0), free_angle=0.0
         )
-        ahead, behind = number((wheelbase / 2, 0.0)), number((-wheelbase / 2, 0.0))
+        ahead, behind = as_parameter((wheelbase / 2, 0.0)), as_parameter((-wheelbase / 2, 0.0))
         free = mass * gravity * np.cos(slope) / (2 * suspension)
         forces += [
             planar.Bushing(
@@ -118,10 +119,10 @@ def train(
             for end, point in (("a", ahead), ("b", behind))
         ]
     if np.any(resistance):
-        numbers = shared(array, **davis(resistance), transition=transition)
+        numbers = shared(as_jax, **davis(resistance), transition=transition)
         forces += [Force(f"resistance{k}", name, _resistance, parameters=numbers) for k, name in enumerate(names, 1)]
     if np.any(brake):
-        numbers = shared(array, rise=brake_rise, transition=transition)
+        numbers = shared(as_jax, rise=brake_rise, transition=transition)
         forces += [
             Force(
                 f"brake{k}",

@@ -5,28 +5,24 @@ the deeper the body is in it, the harder it pushes, so contact adds no constrain
 """
 
 import abc
-from typing import ClassVar, Literal
+from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
-from .base import AbstractForce, number, optional_number
-from .functions import names
-from .resolve import fill, label, positive
+from . import fields
+from .base import AbstractLaw, AbstractPotentialForce
 from .smooth import ramp, step
 from .terrain import AbstractTerrain
-
-_MAY_BE_ZERO = ("cohesive_modulus", "frictional_modulus", "coefficient", "cohesion", "friction_angle")
 
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]
 
 
-class AbstractNormalLaw(eqx.Module):
+class AbstractNormalLaw(AbstractLaw):
     """Normal force as a function of the depth of penetration; the same on the way in and out."""
 
     @abc.abstractmethod
@@ -44,7 +40,7 @@ class Linear(AbstractNormalLaw):
     **Arguments:** `stiffness` [N/m].
     """
 
-    stiffness: Number = eqx.field(converter=number)
+    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth
@@ -60,7 +56,7 @@ class Hertz(AbstractNormalLaw):
     `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
     """
 
-    stiffness: Number = eqx.field(converter=number)
+    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth**1.5
@@ -80,11 +76,11 @@ class Bekker(AbstractNormalLaw):
     `width` b [m], the smaller side of the patch that presses; `area` [m²] of it.
     """
 
-    cohesive_modulus: Number = eqx.field(converter=number, kw_only=True)
-    frictional_modulus: Number = eqx.field(converter=number, kw_only=True)
-    exponent: Number = eqx.field(converter=number, kw_only=True)
-    width: Number = eqx.field(converter=number, kw_only=True)
-    area: Number = eqx.field(converter=number, kw_only=True)
+    cohesive_modulus: Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
+    frictional_modulus: Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
+    exponent: Number = fields.parameter(sign="positive")
+    width: Number = fields.parameter(unit="m", sign="positive")
+    area: Number = fields.parameter(unit="m²", sign="positive")
 
     def force(self, depth):
         return self.area * (self.cohesive_modulus / self.width + self.frictional_modulus) * depth**self.exponent
@@ -93,7 +89,7 @@ class Bekker(AbstractNormalLaw):
         return self.force(depth) * depth / (self.exponent + 1)
 
 
-class AbstractFriction(eqx.Module):
+class AbstractFrictionLaw(AbstractLaw):
     """Force along the ground against slip."""
 
     @abc.abstractmethod
@@ -105,7 +101,7 @@ class AbstractFriction(eqx.Module):
         """
 
 
-class Coulomb(AbstractFriction):
+class Coulomb(AbstractFrictionLaw):
     """Coulomb friction, smooth through zero slip: `coefficient load tanh(slip / transition_speed)`.
 
     A body at rest on a slope creeps, the slower the smaller `transition_speed` is.
@@ -113,8 +109,8 @@ class Coulomb(AbstractFriction):
     **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, of slip, where 76 % of the friction is there.
     """
 
-    coefficient: Number = eqx.field(converter=number)
-    transition_speed: Number = eqx.field(converter=number, kw_only=True)
+    coefficient: Number = fields.parameter(sign="non-negative", kw_only=False)
+    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         del engaged, travel
@@ -126,7 +122,7 @@ class Coulomb(AbstractFriction):
         return -self.coefficient * load * jnp.where(small, series, jnp.tanh(size) / size) * s
 
 
-class Janosi(AbstractFriction):
+class Janosi(AbstractFrictionLaw):
     """Shear of soil by Janosi and Hanamoto, `τ = (c + p tan φ) (1 − exp(−j/K))`, under a patch along which the shear
     displacement j grows evenly to slip ratio times length.
 
@@ -140,12 +136,12 @@ class Janosi(AbstractFriction):
     `length` [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
     """
 
-    cohesion: Number = eqx.field(converter=number, kw_only=True)
-    friction_angle: Number = eqx.field(converter=number, kw_only=True)
-    shear_modulus: Number = eqx.field(converter=number, kw_only=True)
-    length: Number = eqx.field(converter=number, kw_only=True)
-    area: Number = eqx.field(converter=number, kw_only=True)
-    transition_speed: Number = eqx.field(converter=number, kw_only=True)
+    cohesion: Number = fields.parameter(unit="Pa", sign="non-negative")
+    friction_angle: Number = fields.parameter(unit="rad", sign="non-negative")
+    shear_modulus: Number = fields.parameter(unit="m", sign="positive")
+    length: Number = fields.parameter(unit="m", sign="positive")
+    area: Number = fields.parameter(unit="m²", sign="positive")
+    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         strength = self.cohesion * self.area * engaged + load * jnp.tan(self.friction_angle)
@@ -160,7 +156,7 @@ class Janosi(AbstractFriction):
         return -strength * scale * jnp.where(small, series, (other + jnp.expm1(-other)) / other**2) * slip
 
 
-class Contact(AbstractForce):
+class Contact(AbstractPotentialForce):
     """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
 
     The depth δ of a body in the ground is smoothed, `½ (d + √(d² + smoothing²))` for a distance d below it, and has a
@@ -181,44 +177,27 @@ class Contact(AbstractForce):
         small slopes: depth and damping along the vertical, friction along the horizontal.
     """
 
-    name: str = eqx.field(static=True)
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    terrain: AbstractTerrain = eqx.field(kw_only=True)
-    normal: AbstractNormalLaw = eqx.field(kw_only=True)
-    friction: AbstractFriction | None = eqx.field(default=None, kw_only=True)
-    radius: Float[Array, "*n"] = eqx.field(converter=number, default=0.0, kw_only=True)
-    points: Float[Array, "*n d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    damping: Number = eqx.field(converter=number, default=0.0, kw_only=True)
-    damping_depth: Number = eqx.field(converter=number, default=0.01, kw_only=True)
-    smoothing: Number = eqx.field(converter=number, default=1e-3, kw_only=True)
-    onset: Literal["smooth", "linear"] = eqx.field(static=True, default="smooth", kw_only=True)
-    depth: Literal["normal", "vertical"] = eqx.field(static=True, default="normal", kw_only=True)
-    conservative: ClassVar[bool] = True
+    name: str = fields.name()
+    bodies: tuple[str, ...] = fields.body_names()
+    terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
+    friction: AbstractFrictionLaw | None = fields.law(
+        AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
+    )
+    radius: Float[Array, "*n"] = fields.length(shape=None, sign="non-negative", default=0.0)
+    points: Float[Array, "*n d"] = fields.parameter(shape=None, unit="m", optional=True)
+    damping: Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    onset: Literal["smooth", "linear"] = fields.choice("smooth", "linear", default="smooth")
+    depth: Literal["normal", "vertical"] = fields.choice("normal", "vertical", default="normal")
 
-    def __check_init__(self):
-        for field, choices in {"onset": ("smooth", "linear"), "depth": ("normal", "vertical")}.items():
-            if getattr(self, field) not in choices:
-                raise ValueError(f"{label(self)}: {field} must be one of {choices}, got {getattr(self, field)!r}.")
-        for field, kind, where in (
-            ("terrain", AbstractTerrain, "jaxmb.terrain"),
-            ("normal", AbstractNormalLaw, "jaxmb.contact"),
-            ("friction", AbstractFriction | None, "jaxmb.contact"),
-        ):
-            if not isinstance(getattr(self, field), kind):
-                raise ValueError(f"{label(self)}: {field} must be a law from {where}, got {getattr(self, field)!r}.")
-
-    def resolve(self, space, poses):
-        part = fill(self, "points", np.zeros(space.dimension))
-        n, d = len(self.bodies), space.dimension
+    def complete(self, space, poses):
+        part, n, d = self.filled(points=np.zeros(space.dimension)), len(self.bodies), space.dimension
         for field, shapes in {"radius": ((), (n,)), "points": ((d,), (n, d))}.items():
             shape = getattr(part, field).shape
             if shape not in shapes:
-                raise ValueError(f"{label(self)}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
-        for field, zero in {"radius": True, "damping": True, "damping_depth": False, "smoothing": False}.items():
-            positive(self, field, getattr(self, field), zero=zero)
-        for field, law in {"normal": self.normal, "friction": self.friction}.items():
-            for own in () if law is None else law.__dataclass_fields__:
-                positive(self, f"{field}.{own}", getattr(law, own), zero=own in _MAY_BE_ZERO)
+                raise ValueError(f"{self.label}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
         return part
 
     def wrenches(self, space, poses, velocities, t):

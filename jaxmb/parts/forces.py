@@ -1,16 +1,16 @@
 """Forces that read the same in the plane and in space."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
-from .base import AbstractForce, AbstractPart, number, optional_number
-from .resolve import fill, positive, vector
+from . import fields
+from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce
+from .space import force_pair, separation, separation_rate
 
 
 class Gravity(AbstractPart):
@@ -19,7 +19,7 @@ class Gravity(AbstractPart):
     **Arguments:** `acceleration` [m/s²], shape (2,) in a planar scene and (3,) in a spatial one, in world axes.
     """
 
-    acceleration: Float[Array, "d"] = eqx.field(converter=number)
+    acceleration: Float[Array, "d"] = fields.parameter(shape=("d",), unit="m/s²", kw_only=False)
     name: str = eqx.field(static=True, default="gravity", kw_only=True)
 
 
@@ -36,38 +36,7 @@ def generalized_force(space, coordinates, poses, velocities, law):
     return jax.vmap(space.pull_back)(poses, gradient)
 
 
-def fill_points(part, space):
-    """The part with its points, the mass centres where none are given, checked."""
-    zero = np.zeros(space.dimension)
-    for field in ("point_a", "point_b"):
-        part = fill(part, field, zero)
-        vector(part, field, getattr(part, field), space.dimension)
-    return part
-
-
-def separation(space, part, poses):
-    """World vector from point A to point B."""
-    return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
-
-
-def separation_rate(space, part, poses, velocities):
-    """Its rate."""
-    return space.point_velocity(poses[1], velocities[1], part.point_b) - space.point_velocity(
-        poses[0], velocities[0], part.point_a
-    )
-
-
-def between_points(space, part, poses, force_W):
-    """Wrenches of `force_W` on B at point B and of its reaction on A at point A."""
-    return jnp.stack(
-        [
-            space.point_force(poses[0], part.point_a, -force_W),
-            space.point_force(poses[1], part.point_b, force_W),
-        ]
-    )
-
-
-class SpringDamper(AbstractForce):
+class SpringDamper(AbstractPair, AbstractPotentialForce):
     """A linear spring and damper along the line between two points: tension `stiffness (l − free_length) + damping l̇`.
 
     At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero
@@ -77,27 +46,14 @@ class SpringDamper(AbstractForce):
     given poses; `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    free_length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative")
+    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    free_length: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", optional=True)
+    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
+    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        part = fill_points(self, space)
-        if part.free_length is None:
-            part = fill(part, "free_length", norm(separation(space, part, poses)))
-        for field in ("stiffness", "damping", "free_length"):
-            positive(part, field, getattr(part, field), zero=True)
-        return part
+    def complete(self, space, poses):
+        return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
 
     def wrenches(self, space, poses, velocities, t):
         d, rate = separation(space, self, poses), separation_rate(space, self, poses, velocities)
@@ -106,7 +62,7 @@ class SpringDamper(AbstractForce):
         length = jnp.sqrt(jnp.where(apart, square, 1.0))
         pretension = jnp.where(apart, self.stiffness * self.free_length / length, 0.0)
         damping = jnp.where(apart, self.damping * jnp.dot(d, rate) / length**2, 0.0)
-        return between_points(space, self, poses, -(self.stiffness - pretension + damping) * d)
+        return force_pair(space, self, poses, -(self.stiffness - pretension + damping) * d)
 
     def energy(self, space, poses, t):
         d = separation(space, self, poses)
@@ -114,7 +70,7 @@ class SpringDamper(AbstractForce):
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
 
 
-class Damper(AbstractForce):
+class Damper(AbstractPair, AbstractForce):
     """A linear damper on the relative velocity of two points, in every direction: force `−damping (v_B − v_A)` on B.
 
     The two points should coincide or `body_a` be the ground; otherwise the pair of forces has a moment.
@@ -122,25 +78,13 @@ class Damper(AbstractForce):
     **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    damping: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        positive(self, "damping", self.damping, zero=True)
-        return fill_points(self, space)
+    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative")
+    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
+    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
 
     def wrenches(self, space, poses, velocities, t):
         rate = separation_rate(space, self, poses, velocities)
-        return between_points(space, self, poses, -self.damping * rate)
+        return force_pair(space, self, poses, -self.damping * rate)
 
 
 class PointForce(AbstractForce):
@@ -150,26 +94,11 @@ class PointForce(AbstractForce):
     default the mass centre.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    force: Float[Array, "d"] = eqx.field(converter=number, kw_only=True)
-    point: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    frame: Literal["world", "body"] = eqx.field(static=True, default="world", kw_only=True)
-    conservative: ClassVar[bool] = False
-
-    def __check_init__(self):
-        if self.frame not in ("world", "body"):
-            raise ValueError(f"PointForce {self.name!r}: frame must be 'world' or 'body', got {self.frame!r}.")
-
-    @property
-    def bodies(self):
-        return (self.body,)
-
-    def resolve(self, space, poses):
-        vector(self, "force", self.force, space.dimension)
-        part = fill(self, "point", np.zeros(space.dimension))
-        vector(part, "point", part.point, space.dimension)
-        return part
+    name: str = fields.name()
+    body: str = fields.body_name()
+    force: Float[Array, "d"] = fields.parameter(shape=("d",), unit="N")
+    point: Float[Array, "d"] = fields.point(body=0, default="mass centre")
+    frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
 
     def wrenches(self, space, poses, velocities, t):
         force_W = self.force if self.frame == "world" else space.direction(poses[0], self.force)

@@ -1,14 +1,13 @@
 """Friction of joints, from their own reactions."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
-from .base import AbstractNonIdeal, number, optional_number, rows_of
-from .resolve import fill, label, positive, vector
+from . import fields
+from .base import AbstractCompound, AbstractNonIdeal, rows_of
 
 
 class Friction(AbstractNonIdeal):
@@ -33,35 +32,32 @@ class Friction(AbstractNonIdeal):
     Proc. R. Soc. A 463, 2007.
     """
 
-    name: str = eqx.field(static=True)
-    joint: str = eqx.field(static=True)
-    coefficient: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    point: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    smoothing: Float[Array, ""] = eqx.field(converter=number, default=1e-4, kw_only=True)
+    name: str = fields.name()
+    joint: str = fields.name()
+    coefficient: Float[Array, ""] = fields.parameter(sign="non-negative")
+    radius: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", default=0.0)
+    point: Float[Array, "d"] = fields.point(body=None, optional=True)
+    smoothing: Float[Array, ""] = fields.parameter(unit="m/s", sign="positive", default=1e-4)
 
-    def resolve(self, space, joint, poses):
-        for field in ("coefficient", "radius"):
-            positive(self, field, getattr(self, field), zero=True)
-        positive(self, "smoothing", self.smoothing)
-        if poses.shape[0] > 2:
-            raise ValueError(f"{label(self)}: {joint.name!r} is between more than two bodies; use NonIdeal.")
-        own = getattr(joint, "point_b", None)
-        own = getattr(joint, "point", None) if own is None else own
-        part = fill(self, "point", np.zeros(space.dimension) if own is None else own)
-        vector(part, "point", part.point, space.dimension)
+    def complete(self, space, joint, poses):
+        k = poses.shape[0] - 1
+        if k > 1:
+            raise ValueError(f"{self.label}: {joint.name!r} is between more than two bodies; use NonIdeal.")
+        anchor = joint.anchor(k)
+        part = self.filled(point=np.zeros(space.dimension) if anchor is None else anchor)
         part._check_slip(space, joint, poses)
         return part
 
     def _check_slip(self, space, joint, poses):
         columns = poses.shape[0] * space.velocity_size
-        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in joint.components()]
+        components = joint.components() if isinstance(joint, AbstractCompound) else (joint,)
+        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in components]
         _, sizes, directions = np.linalg.svd(np.concatenate(rows))
         allowed = directions[np.sum(sizes > 1e-9 * sizes[0]) :].reshape(-1, poses.shape[0], space.velocity_size)
         slips = jax.vmap(lambda v: self.slip(space, poses, v))(jnp.asarray(allowed))
         if not np.any(np.abs(slips) > 1e-9):
             raise ValueError(
-                f"{label(self)}: {joint.name!r} allows no slip at its point; give the radius of its pin or ball."
+                f"{self.label}: {joint.name!r} allows no slip at its point; give the radius of its pin or ball."
             )
 
     def slip(self, space, poses, velocities):

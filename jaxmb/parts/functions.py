@@ -9,15 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .base import AbstractConstraint, AbstractForce, AbstractNonIdeal, AbstractVelocityConstraint, array
+from . import fields
+from .base import AbstractConstraint, AbstractNonIdeal, AbstractPotentialForce, AbstractVelocityConstraint
 
 
-def names(bodies: Any) -> tuple[str, ...]:
-    return (bodies,) if isinstance(bodies, str) else tuple(bodies)
-
-
-def numbers(parameters: dict[str, Any]) -> dict[str, Array]:
-    return {key: array(value) for key, value in parameters.items()}
+def _shaped(part: Any, value: Any, shape: tuple[int, ...], *also: tuple[int, ...]) -> Array:
+    """What a function returned, in the shape that it must have, or in another that means the same."""
+    value = jnp.asarray(value)
+    if value.shape not in (shape, *also):
+        raise ValueError(f"the function of {part.label} must return shape {shape}, got {value.shape}")
+    return value.reshape(shape)
 
 
 class Constraint(AbstractConstraint):
@@ -33,15 +34,16 @@ class Constraint(AbstractConstraint):
     - `rheonomic`: whether the function depends on `t`.
     """
 
-    name: str = eqx.field(static=True)
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    function: Callable[..., Array] = eqx.field(static=True)
+    name: str = fields.name()
+    bodies: tuple[str, ...] = fields.body_names()
+    function: Callable[..., Array] = fields.function()
     rows: int = eqx.field(static=True, default=1, kw_only=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+    parameters: dict[str, Array] = fields.numbers()
     rheonomic: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def residual(self, space, poses, t):
-        return jnp.reshape(self.function(poses[:, : space.pose_size], t, self.parameters), (self.rows,))
+        value = self.function(poses[:, : space.pose_size], t, self.parameters)
+        return _shaped(self, value, (self.rows,), *[()][: self.rows == 1])
 
 
 class VelocityConstraint(AbstractVelocityConstraint):
@@ -52,19 +54,20 @@ class VelocityConstraint(AbstractVelocityConstraint):
     (cheaper); `homogeneous` that it also vanishes at rest.
     """
 
-    name: str = eqx.field(static=True)
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    function: Callable[..., Array] = eqx.field(static=True)
+    name: str = fields.name()
+    bodies: tuple[str, ...] = fields.body_names()
+    function: Callable[..., Array] = fields.function()
     rows: int = eqx.field(static=True, default=1, kw_only=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+    parameters: dict[str, Array] = fields.numbers()
     linear: bool = eqx.field(static=True, default=False, kw_only=True)
     homogeneous: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def residual(self, space, poses, velocities, t):
-        return jnp.reshape(self.function(poses[:, : space.pose_size], velocities, t, self.parameters), (self.rows,))
+        value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
+        return _shaped(self, value, (self.rows,), *[()][: self.rows == 1])
 
 
-class Force(AbstractForce):
+class Force(AbstractPotentialForce):
     """A force law from a function, `function(poses, velocities, t, parameters) -> wrenches`.
 
     **Arguments:**
@@ -77,11 +80,11 @@ class Force(AbstractForce):
         energy balance.
     """
 
-    name: str = eqx.field(static=True)
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    function: Callable[..., Array] = eqx.field(static=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    potential: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
+    name: str = fields.name()
+    bodies: tuple[str, ...] = fields.body_names()
+    function: Callable[..., Array] = fields.function()
+    parameters: dict[str, Array] = fields.numbers()
+    potential: Callable[..., Array] | None = fields.function(default=None, kw_only=True)
 
     @property
     def conservative(self):
@@ -89,11 +92,12 @@ class Force(AbstractForce):
 
     def wrenches(self, space, poses, velocities, t):
         value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
-        return jnp.reshape(value, (len(self.bodies), space.velocity_size))
+        size = space.velocity_size
+        return _shaped(self, value, (len(self.bodies), size), *[(size,)][: len(self.bodies) == 1])
 
     def energy(self, space, poses, t):
         assert self.potential is not None
-        return jnp.reshape(self.potential(poses[:, : space.pose_size], t, self.parameters), ())
+        return _shaped(self, self.potential(poses[:, : space.pose_size], t, self.parameters), (), (1,))
 
 
 class NonIdeal(AbstractNonIdeal):
@@ -112,11 +116,11 @@ class NonIdeal(AbstractNonIdeal):
     Proc. R. Soc. A 463, 2007.
     """
 
-    name: str = eqx.field(static=True)
-    joint: str = eqx.field(static=True)
-    function: Callable[..., Array] = eqx.field(static=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+    name: str = fields.name()
+    joint: str = fields.name()
+    function: Callable[..., Array] = fields.function()
+    parameters: dict[str, Array] = fields.numbers()
 
     def wrenches(self, space, poses, velocities, reactions, t):
         value = self.function(poses[:, : space.pose_size], velocities, reactions, t, self.parameters)
-        return jnp.reshape(value, reactions.shape)
+        return _shaped(self, value, reactions.shape, *[reactions.shape[1:]][: reactions.shape[0] == 1])

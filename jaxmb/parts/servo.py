@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
-from .base import AbstractConstraint, AbstractLink, number
-from .resolve import label, positive, vector
+from . import fields
+from .base import AbstractConstraint, AbstractLink
 
 
 class Servo(AbstractLink):
@@ -23,16 +22,16 @@ class Servo(AbstractLink):
     Gauss's principle", J. Appl. Mech. 60, 1993.
     """
 
-    program: Any
-    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+    program: Any = fields.law(
+        AbstractConstraint, what="a constraint between positions, such as a Driver", kw_only=False
+    )
+    damping: Float[Array, ""] = fields.parameter(unit="1/s", sign="non-negative", default=0.0, kw_only=False)
+    stiffness: Float[Array, ""] = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
 
     def __check_init__(self):
-        if not isinstance(self.program, AbstractConstraint):
-            raise ValueError(f"Servo needs a constraint between positions as its program, got {self.program!r}.")
         taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
         if taken:
-            raise ValueError(f"{label(self)}: {taken.pop()!r} is the name of a gain; call that parameter otherwise.")
+            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; call that parameter otherwise.")
 
     @property
     def name(self):
@@ -42,11 +41,9 @@ class Servo(AbstractLink):
     def bodies(self):
         return self.program.bodies
 
-    def resolve(self, space, poses):
-        for field in ("damping", "stiffness"):
-            vector(self, field, getattr(self, field)[None], 1)
-            positive(self, field, getattr(self, field), zero=True)
-        return eqx.tree_at(lambda part: part.program, self, self.program.resolve(space, poses))
+    @property
+    def dimensions(self):
+        return self.program.dimensions
 
-    def components(self):
-        return tuple(eqx.tree_at(lambda part: part.program, self, own) for own in self.program.components())
+    def complete(self, space, poses):
+        return self.with_fields(program=self.program.resolve(space, poses))

@@ -9,8 +9,9 @@ A `pose` is what positions a body, a `velocity` what moves it, a `wrench` what d
 """
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Pose = Float[Array, "p"]
@@ -72,3 +73,25 @@ class AbstractSpace(abc.ABC):
     @abc.abstractmethod
     def normalize(self, pose: Pose) -> Pose:
         """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""
+
+
+# What parts between two points share. `part` has `point_a` and `point_b` [m], fixed in the first and the second body.
+
+
+def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Point:
+    """World vector [m] from point A to point B."""
+    return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
+
+
+def separation_rate(
+    space: AbstractSpace, part: Any, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]
+) -> Point:
+    """Rate [m/s] of the world vector from point A to point B."""
+    of_b = space.point_velocity(poses[1], velocities[1], part.point_b)
+    return of_b - space.point_velocity(poses[0], velocities[0], part.point_a)
+
+
+def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], force_W: Point) -> Float[Array, "2 v"]:
+    """Wrenches of `force_W` [N] on B at point B and of its reaction on A at point A."""
+    reaction = space.point_force(poses[0], part.point_a, -force_W)
+    return jnp.stack([reaction, space.point_force(poses[1], part.point_b, force_W)])

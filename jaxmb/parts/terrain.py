@@ -7,23 +7,27 @@ where z is up. Terrains that are profiles along x go on unchanged across it, so 
 import abc
 from collections.abc import Callable
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .base import array, number
-from .functions import numbers
+from ..linalg.arrays import is_traced
+from . import fields
+from .base import AbstractLaw
 from .smooth import step
 
 Place = Float[Array, "h"]
 
 
-class AbstractTerrain(eqx.Module):
+class AbstractTerrain(AbstractLaw):
     """Ground whose height is a function of the place; its numbers are parameters of the contact that it belongs to,
     `"contact.terrain.field"`.
     """
+
+    def __check_init__(self):
+        if not is_traced(self):
+            fields.check_numbers(self, type(self).__name__, 2)
 
     @abc.abstractmethod
     def height(self, place: Place) -> Float[Array, ""]:
@@ -36,7 +40,7 @@ class Flat(AbstractTerrain):
     **Arguments:** `level` [m].
     """
 
-    level: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0, kw_only=False)
 
     def height(self, place):
         return self.level
@@ -48,12 +52,9 @@ class Bump(AbstractTerrain):
     **Arguments:** `start` [m], where it begins; `length` [m] > 0; `peak` [m], its height, negative for a ditch.
     """
 
-    start: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    length: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    peak: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-
-    def __check_init__(self):
-        _check_positive(self, "length", self.length)
+    start: Float[Array, ""] = fields.parameter(unit="m")
+    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
+    peak: Float[Array, ""] = fields.parameter(unit="m")
 
     def height(self, place):
         s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
@@ -66,12 +67,9 @@ class Sinusoid(AbstractTerrain):
     **Arguments:** `amplitude` [m]; `wavelength` [m] > 0; `phase` [rad].
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    wavelength: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    phase: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-
-    def __check_init__(self):
-        _check_positive(self, "wavelength", self.wavelength)
+    amplitude: Float[Array, ""] = fields.parameter(unit="m")
+    wavelength: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
+    phase: Float[Array, ""] = fields.parameter(unit="rad", default=0.0)
 
     def height(self, place):
         return self.amplitude * jnp.sin(2 * jnp.pi * place[0] / self.wavelength + self.phase)
@@ -83,8 +81,8 @@ class Slope(AbstractTerrain):
     **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.
     """
 
-    gradient: Float[Array, ""] = eqx.field(converter=number)
-    level: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
+    gradient: Float[Array, ""] = fields.parameter(unit="m/m", kw_only=False)
+    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0)
 
     def height(self, place):
         return self.level + self.gradient * place[0]
@@ -97,12 +95,9 @@ class Ramp(AbstractTerrain):
     gradient is `1.875 rise / length`, in the middle.
     """
 
-    start: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    length: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    rise: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-
-    def __check_init__(self):
-        _check_positive(self, "length", self.length)
+    start: Float[Array, ""] = fields.parameter(unit="m")
+    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
+    rise: Float[Array, ""] = fields.parameter(unit="m")
 
     def height(self, place):
         return self.rise * step((place[0] - self.start) / self.length)
@@ -117,8 +112,8 @@ class Spline(AbstractTerrain):
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """
 
-    x: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
-    heights: Float[Array, "n"] = eqx.field(converter=array, kw_only=True)
+    x: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
+    heights: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
 
     def __check_init__(self):
         if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:
@@ -172,13 +167,8 @@ class Surface(AbstractTerrain):
     numbers by name, parameters of the system `"contact.terrain.key"`.
     """
 
-    function: Callable[[Place, dict[str, Array]], Float[Array, ""]] = eqx.field(static=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
+    function: Callable[[Place, dict[str, Array]], Float[Array, ""]] = fields.function()
+    parameters: dict[str, Array] = fields.numbers()
 
     def height(self, place):
         return jnp.reshape(self.function(place, self.parameters), ())
-
-
-def _check_positive(terrain, field, value):
-    if not isinstance(value, Tracer) and not value > 0:
-        raise ValueError(f"{type(terrain).__name__}: {field} must be positive, got {value}.")

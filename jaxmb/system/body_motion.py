@@ -46,11 +46,11 @@ def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
     points: list[dict[tuple, np.ndarray]] = [{} for _ in range(bodies)]
     for group in groups:
         stacked = group.group
-        for which, field in enumerate(("point_a", "point_b")):
-            values = getattr(stacked.part, field, None)
-            if values is None or stacked.body_index.shape[1] <= which:
-                continue
-            for body, point in zip(stacked.body_index[:, which], np.asarray(values), strict=True):
+        for k, of_parts in enumerate(stacked.body_index.T):
+            anchors = stacked.part.anchor(k)
+            for body, point in zip(
+                of_parts, () if anchors is None else np.asarray(anchors), strict=anchors is not None
+            ):
                 if body < bodies:
                     points[body][tuple(np.round(point, 12))] = point
     return [np.stack(list(own.values())) if own else np.zeros((0, 0)) for own in points]

@@ -1,7 +1,7 @@
 """Parts of one type, stacked: one kernel and one `vmap` for all of them, whatever their number."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..parts.base import AbstractPart
+from ..parts.fields import anonymous
+from ..parts.space import AbstractSpace
 from .layout import Layout, pick
 
 
@@ -38,12 +40,22 @@ class Group(eqx.Module):
         return pick(of_bodies, self.body_index)
 
 
-def stack(parts: Sequence[tuple[AbstractPart, tuple[int, ...]]], layout: Layout) -> tuple[Group, ...]:
-    """Group parts that share type, static fields and shapes; order of first appearance."""
+def stack(
+    parts: Sequence[tuple[AbstractPart, tuple[int, ...]]],
+    layout: Layout,
+    check: Callable[[Any, AbstractSpace, int], None] | None = None,
+) -> tuple[Group, ...]:
+    """Group parts that share type, static fields and shapes; order of first appearance.
+
+    **Arguments:** `parts` with the numbers of their bodies; `check(part, space, bodies)`: called for one part of each
+    group.
+    """
     groups: dict[Any, list] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
+        if key not in groups and check is not None:
+            check(part, layout.space, len(bodies))
         groups.setdefault(key, []).append((leaves, part.name, bodies))
     out = []
     for (structure, _, _), members in groups.items():
@@ -55,19 +67,20 @@ def stack(parts: Sequence[tuple[AbstractPart, tuple[int, ...]]], layout: Layout)
     return tuple(out)
 
 
-def anonymous(part: AbstractPart) -> AbstractPart:
-    """The part without the names that tell it from its siblings."""
-    out = object.__new__(type(part))
-    for field in part.__dataclass_fields__:
-        value = getattr(part, field)
-        if field in ("name", "body", "body_a", "body_b", "reaction", "carrier", "joint"):
-            value = ""
-        elif field == "bodies":
-            value = ("",) * len(value)
-        elif isinstance(value, AbstractPart):
-            value = anonymous(value)
-        object.__setattr__(out, field, value)
-    return out
+class BodyGroup(eqx.Module):
+    """Stacked bodies."""
+
+    group: Group
+
+    @property
+    def mass(self) -> Float[Array, "parts"]:
+        """Masses [kg]."""
+        return jax.vmap(lambda body: body.mass)(self.group.part)
+
+    @property
+    def inertia(self) -> Float[Array, "parts *matrix"]:
+        """Moments of inertia [kg m²] about the mass centres."""
+        return jax.vmap(lambda body: body.inertia)(self.group.part)
 
 
 class AbstractConstraintGroup(eqx.Module):

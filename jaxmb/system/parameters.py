@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._types import VectorLike
 from ..linalg.arrays import is_traced, replaced
-from ..parts.base import array
+from ..parts.fields import as_jax
 from ..parts.names import unknown
 from .equation import AbstractSystem
 
@@ -44,7 +44,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
     for name, value in values.items():
         if name not in paths:
             raise unknown("parameter", name, paths)
-        value = array(value)
+        value = as_jax(value)
         for where, index in paths[name]:
             old = where(system)
             shape = old.shape if index is None else old.shape[1:]

@@ -55,7 +55,7 @@ def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Arra
     last = max(i for i, body in enumerate(bodies) if body < layout.bodies)
     pose, wrench = group.own(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)
-    point = getattr(part, "point_b" if last else "point_a", None)
+    point = part.anchor(last)
     if layout.space.dimension == 2:
         force, moment = wrench[:2], wrench[2]
         if point is not None:

@@ -17,6 +17,7 @@ from .describe import describe_scene
 from .equation import AbstractSystem, Ranks
 from .groups import (
     AbstractConstraintGroup,
+    BodyGroup,
     ConstraintGroup,
     ForceGroup,
     NonIdealGroup,
@@ -25,7 +26,7 @@ from .groups import (
 )
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
-from .parameter_paths import parameter_paths
+from .parameter_paths import parameter_paths, positive_parameters
 from .quantities import Quantity
 from .reactions import applied_wrenches, reaction
 
@@ -41,13 +42,11 @@ class Implied(NamedTuple):
 class RigidBodySystem(AbstractSystem):
     """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
 
-    **Fields:** `mass` [kg], shape (bodies,); `rotary` [kg m²], shape (bodies,) in the plane and (bodies, 3, 3) in
-    space; `gravity` [m/s²] or None; the groups of parts; `guess`, the state given with the bodies; `length` [m], the
-    scene's size; `body_names`.
+    **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
+    bodies; `length` [m], the scene's size; `body_names`.
     """
 
-    mass: Float[Array, "b"]
-    rotary: Float[Array, "b *matrix"]
+    bodies: tuple[BodyGroup, ...]
     gravity: Float[Array, "d"] | None
     constraints: tuple[ConstraintGroup, ...]
     velocity_constraints: tuple[VelocityConstraintGroup, ...]
@@ -135,12 +134,15 @@ class RigidBodySystem(AbstractSystem):
         return rate_names(self.layout, self.body_names)
 
     def parameter_paths(self):
-        kinds = ("constraints", "velocity_constraints", "servos", "forces", "nonideal")
-        groups = {kind: getattr(self, kind) for kind in kinds}
-        return parameter_paths(self.body_names, self.layout.rotates, self._gravity_name, groups)
+        return parameter_paths(self._gravity_name, self._groups, self.servos)
 
     def positive_parameters(self):
-        return frozenset(f"{name}.{field}" for name in self.body_names for field in ("mass", "inertia"))
+        return frozenset(positive_parameters(self._groups))
+
+    @property
+    def _groups(self):
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal")
+        return {kind: getattr(self, kind) for kind in kinds}
 
     @property
     def _gravity_name(self):
@@ -212,6 +214,25 @@ class RigidBodySystem(AbstractSystem):
         points = attachments(groups, self.layout.bodies)
         poses = jax.vmap(self.poses)(ys.q)
         return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
+
+    # Bodies
+
+    @property
+    def mass(self) -> Float[Array, "b"]:
+        """Masses [kg] of the bodies."""
+        return self._in_order([g.mass for g in self.bodies])
+
+    @property
+    def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
+        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
+        return self._in_order([g.inertia for g in self.bodies])
+
+    def _in_order(self, of_groups):
+        """What bodies have, group by group, in the order of the bodies."""
+        if len(of_groups) == 1:
+            return of_groups[0]
+        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
+        return pick(jnp.concatenate(of_groups), order)
 
     # Kinematics
 
@@ -348,12 +369,15 @@ class RigidBodySystem(AbstractSystem):
 
     def inertia(self, t, q, u) -> AbstractInertia:
         if self.spatial and self.layout.uniform:
-            return BlockInertia(self.mass, self.rotary)
+            return BlockInertia(self.mass, self.moments_of_inertia)
         if self.spatial:
             points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            rotary = jnp.where(points, jnp.eye(3, dtype=self.rotary.dtype), self.rotary)
-            return _MixedInertia(BlockInertia(self.mass, rotary), self.layout)
-        bodies = jnp.concatenate([jnp.repeat(self.mass[:, None], 2, axis=1), self.rotary[:, None]], axis=1)
+            # Any moment of inertia serves a point mass; one makes the matrix regular.
+            moments = self.moments_of_inertia
+            moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
+            return _MixedInertia(BlockInertia(self.mass, moments), self.layout)
+        columns = [jnp.repeat(self.mass[:, None], 2, axis=1), self.moments_of_inertia[:, None]]
+        bodies = jnp.concatenate(columns, axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
@@ -384,7 +408,7 @@ class RigidBodySystem(AbstractSystem):
             parts.append(jnp.pad(self.mass[:, None] * self.gravity[None, :], ((0, 0), (0, size - dimension))))
         if self.spatial and any(self.layout.rotates):
             omega = self.velocities(u)[:, 3:]
-            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.rotary, omega)
+            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.moments_of_inertia, omega)
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         return sum(parts[1:], start=parts[0]) if parts else None
 
@@ -416,8 +440,8 @@ class RigidBodySystem(AbstractSystem):
         if not self.spatial:
             x, v = poses[:, :2], velocities[:, :2]
             orbital = self.mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])
-            return jnp.sum(orbital + self.rotary * velocities[:, 2])
-        spin = jax.vmap(lambda p, J, w: rotate(p, J @ w))(poses[:, 3:], self.rotary, velocities[:, 3:])
+            return jnp.sum(orbital + self.moments_of_inertia * velocities[:, 2])
+        spin = jax.vmap(lambda p, J, w: rotate(p, J @ w))(poses[:, 3:], self.moments_of_inertia, velocities[:, 3:])
         orbital = jax.vmap(cross)(poses[:, :3], self.mass[:, None] * velocities[:, :3])
         return jnp.sum(spin + orbital, axis=0)
 

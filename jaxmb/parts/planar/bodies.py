@@ -2,39 +2,27 @@
 
 from typing import ClassVar
 
-import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base import AbstractPart, number
-from ..resolve import positive, vector
+from .. import fields
+from ..base import AbstractBody, AbstractPlanarPart
 
 
-class Body(AbstractPart):
-    """A rigid body; its frame has its origin in the mass centre.
+class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
+    """A rigid body of the plane: the state that it is given with, for classes that know its mass and inertia.
 
-    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
-    mass centre, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and
-    `angular_velocity` [rad/s] likewise.
+    **Arguments:** `position` [m], shape (2,), of the mass centre, and `angle` [rad], a guess that `assemble` improves;
+    `velocity` [m/s], shape (2,), and `angular_velocity` [rad/s] likewise.
     """
 
-    name: str = eqx.field(static=True)
-    mass: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    inertia: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    position: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    angle: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    velocity: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    angular_velocity: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    dimension: ClassVar[int] = 2
+    name: str = fields.name()
+    position: Float[Array, "2"] = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
+    angle: Float[Array, ""] = fields.guess(unit="rad", default=0.0)
+    velocity: Float[Array, "2"] = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
+    angular_velocity: Float[Array, ""] = fields.guess(unit="rad/s", default=0.0)
     rotates: ClassVar[bool] = True
-
-    def check(self):
-        positive(self, "mass", self.mass)
-        positive(self, "inertia", self.inertia)
-        for field, size in (("position", 2), ("velocity", 2)):
-            vector(self, field, getattr(self, field), size)
-        for field in ("angle", "angular_velocity", "mass", "inertia"):
-            vector(self, field, getattr(self, field)[None], 1)
 
     def pose(self):
         return np.append(self.position, self.angle)
@@ -43,24 +31,33 @@ class Body(AbstractPart):
         return np.append(self.velocity, self.angular_velocity)
 
 
-class PointMass(AbstractPart):
+class Body(AbstractRigidBody):
+    """A rigid body; its frame has its origin in the mass centre.
+
+    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
+    mass centre, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and
+    `angular_velocity` [rad/s] likewise.
+    """
+
+    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
+    inertia: Float[Array, ""] = fields.parameter(unit="kg m²", sign="positive")
+
+
+class PointMass(AbstractPlanarPart, AbstractBody):
     """A mass without extension: two coordinates and no angle.
 
     **Arguments:** `mass` [kg] > 0; `position` [m] and `velocity` [m/s], shape (2,), a guess that `assemble` improves.
     """
 
-    name: str = eqx.field(static=True)
-    mass: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    position: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    velocity: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    dimension: ClassVar[int] = 2
+    name: str = fields.name()
+    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
+    position: Float[Array, "2"] = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
+    velocity: Float[Array, "2"] = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
     rotates: ClassVar[bool] = False
 
-    def check(self):
-        positive(self, "mass", self.mass)
-        vector(self, "position", self.position, 2)
-        vector(self, "velocity", self.velocity, 2)
-        vector(self, "mass", self.mass[None], 1)
+    @property
+    def inertia(self):
+        return jnp.zeros_like(self.mass)
 
     def pose(self):
         return self.position

@@ -1,18 +1,15 @@
 """Couplers between the vehicles of a train."""
 
-from typing import ClassVar
-
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
-from ..base import AbstractForce, number, optional_number
-from ..forces import between_points, fill_points, separation, separation_rate
-from ..resolve import fill, label, positive
+from .. import fields
+from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
+from ..space import force_pair, separation, separation_rate
 
 
-class DraftGear(AbstractForce):
+class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     r"""A friction draft gear: slack, then a preloaded spring with dry friction, then a solid stop; in both directions.
 
     The force acts along the line between the two points. With the extension `s` (length less `free_length`, negative
@@ -41,42 +38,28 @@ class DraftGear(AbstractForce):
         centres.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, default=1e7, kw_only=True)
-    unloading: Float[Array, ""] = eqx.field(converter=number, default=0.4, kw_only=True)
-    preload: Float[Array, ""] = eqx.field(converter=number, default=5e4, kw_only=True)
-    slack: Float[Array, ""] = eqx.field(converter=number, default=0.02, kw_only=True)
-    travel: Float[Array, ""] = eqx.field(converter=number, default=0.11, kw_only=True)
-    stop_stiffness: Float[Array, ""] = eqx.field(converter=number, default=1e8, kw_only=True)
-    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    transition: Float[Array, ""] = eqx.field(converter=number, default=0.01, kw_only=True)
-    smoothing: Float[Array, ""] = eqx.field(converter=number, default=0.005, kw_only=True)
-    free_length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_a: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "d"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
+    unloading: Float[Array, ""] = fields.parameter(sign="non-negative", default=0.4)
+    preload: Float[Array, ""] = fields.parameter(unit="N", sign="non-negative", default=5e4)
+    slack: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", default=0.02)
+    travel: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.11)
+    stop_stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
+    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    transition: Float[Array, ""] = fields.parameter(unit="m/s", sign="positive", default=0.01)
+    smoothing: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.005)
+    free_length: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", optional=True)
+    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
+    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        for field in ("travel", "transition", "smoothing"):
-            positive(self, field, getattr(self, field))
-        for field in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "damping"):
-            positive(self, field, getattr(self, field), zero=True)
+    def validate(self):
         if self.unloading > 1:
             raise ValueError(
-                f"{label(self)}: unloading is the share of the force that is left, at most 1, got {self.unloading}; "
+                f"{self.label}: unloading is the share of the force that is left, at most 1, got {self.unloading}; "
                 "a gear must not give back more than it took."
             )
-        part = fill_points(self, space)
-        if part.free_length is None:
-            part = fill(part, "free_length", norm(separation(space, part, poses)))
-        positive(part, "free_length", part.free_length, zero=True)
-        return part
+
+    def complete(self, space, poses):
+        return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
 
     def tension(self, extension: Float[Array, "..."], rate: Float[Array, "..."]) -> Float[Array, "..."]:
         """The force [N], positive in draft, at an extension [m] and its rate [m/s]."""
@@ -92,7 +75,7 @@ class DraftGear(AbstractForce):
         apart = square > 0
         length = jnp.sqrt(jnp.where(apart, square, 1.0))
         tension = self.tension(length - self.free_length, jnp.dot(d, rate) / length)
-        return between_points(space, self, poses, -jnp.where(apart, tension / length, 0.0) * d)
+        return force_pair(space, self, poses, -jnp.where(apart, tension / length, 0.0) * d)
 
     def energy(self, space, poses, t):
         return self.stored(norm(separation(space, self, poses)) - self.free_length)

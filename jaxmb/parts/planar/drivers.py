@@ -1,23 +1,20 @@
-"""Motions prescribed as functions of time."""
+"""Motions prescribed as functions of time, in the plane."""
 
 from collections.abc import Callable
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
 from ...linalg.rotations import norm
-from ..base import AbstractConstraint, optional_number
-from ..functions import numbers
-from ..resolve import fill, label, vector
-
-Quantity = Literal["angle", "x", "y", "distance"]
+from .. import fields
+from ..base import AbstractConstraint, AbstractPair, AbstractPlanarPart
+from .joints import relative_angle
 
 
-class Driver(AbstractConstraint):
+class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
     **Arguments:**
@@ -30,40 +27,25 @@ class Driver(AbstractConstraint):
     - `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    quantity: Quantity = eqx.field(static=True, kw_only=True)
-    motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    quantity: Literal["angle", "x", "y", "distance"] = fields.choice("angle", "x", "y", "distance")
+    motion: Callable[[Scalar, dict[str, Array]], Scalar] = fields.function(kw_only=True)
+    parameters: dict[str, Array] = fields.numbers()
+    point_a: Float[Array, "2"] = fields.point(body=0, optional=True)
+    point_b: Float[Array, "2"] = fields.point(body=1, optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
 
-    def __check_init__(self):
-        if self.quantity not in get_args(Quantity):
-            raise ValueError(f"{label(self)}: quantity must be one of {get_args(Quantity)}, got {self.quantity!r}.")
+    def validate(self):
+        if self.quantity == "angle" and not (self.point_a is None and self.point_b is None):
+            raise ValueError(f"{self.label}: quantity='angle' has no points; leave out point_a and point_b.")
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        if self.quantity == "angle":
-            if self.point_a is not None or self.point_b is not None:
-                raise ValueError(f"{label(self)}: quantity='angle' has no points; leave out point_a and point_b.")
-            return self
-        part = self
-        for field in ("point_a", "point_b"):
-            part = fill(part, field, np.zeros(2))
-            vector(part, field, getattr(part, field), 2)
-        return part
+    def complete(self, space, poses):
+        return self if self.quantity == "angle" else self.filled(point_a=np.zeros(2), point_b=np.zeros(2))
 
     def value(self, space, poses):
         """The driven quantity at given poses."""
         if self.quantity == "angle":
-            return poses[1, 2] - poses[0, 2]
+            return relative_angle(poses)
         point_b = space.point(poses[1], self.point_b)
         if self.quantity == "distance":
             return norm(point_b - space.point(poses[0], self.point_a))

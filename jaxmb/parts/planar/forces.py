@@ -1,78 +1,60 @@
 """Forces of the plane that have no counterpart of the same shape in space."""
 
-from typing import ClassVar
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..base import AbstractForce, number, optional_number
+from .. import fields
+from ..base import AbstractForce, AbstractPair, AbstractPlanarPart, AbstractPotentialForce
 from ..forces import generalized_force
-from ..resolve import fill, label, point_pair, positive, vector
 from ..smooth import ramp
+from .joints import relative_angle
 
 
-class Torque(AbstractForce):
+def _moment_pair(moment):
+    """Wrenches of a moment on the second body and of its reaction on the first."""
+    wrench = jnp.concatenate([jnp.zeros(2, moment.dtype), moment[None]])
+    return jnp.stack([-wrench, wrench])
+
+
+class Torque(AbstractPlanarPart, AbstractForce):
     """A constant moment on `body`, with its reaction on another one.
 
     **Arguments:** `torque` [N m]; `reaction`, the body that bears the reaction, default ground.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    torque: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    reaction: str = eqx.field(static=True, default="ground", kw_only=True)
-    conservative: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.reaction, self.body)
-
-    def resolve(self, space, poses):
-        vector(self, "torque", self.torque[None], 1)
-        return self
+    name: str = fields.name()
+    reaction: str = fields.body_name(default="ground")
+    body: str = fields.body_name()
+    torque: Float[Array, ""] = fields.parameter(unit="N m")
 
     def wrenches(self, space, poses, velocities, t):
-        wrench = jnp.concatenate([jnp.zeros(2, poses.dtype), self.torque[None]])
-        return jnp.stack([-wrench, wrench])
+        return _moment_pair(self.torque)
 
 
-class TorsionalSpringDamper(AbstractForce):
+class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """A linear spring and damper on the relative angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
 
     **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `free_angle` [rad] of `angle_b − angle_a`,
     default that of the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad", sign="non-negative")
+    damping: Float[Array, ""] = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
+    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        positive(self, "stiffness", self.stiffness, zero=True)
-        positive(self, "damping", self.damping, zero=True)
-        return fill(self, "free_angle", poses[1, 2] - poses[0, 2])
+    def complete(self, space, poses):
+        return self.filled(free_angle=relative_angle(poses))
 
     def wrenches(self, space, poses, velocities, t):
-        angle = poses[1, 2] - poses[0, 2] - self.free_angle
-        moment = -self.stiffness * angle - self.damping * (velocities[1, 2] - velocities[0, 2])
-        wrench = jnp.concatenate([jnp.zeros(2, poses.dtype), moment[None]])
-        return jnp.stack([-wrench, wrench])
+        angle = relative_angle(poses) - self.free_angle
+        return _moment_pair(-self.stiffness * angle - self.damping * (velocities[1, 2] - velocities[0, 2]))
 
     def energy(self, space, poses, t):
-        return 0.5 * self.stiffness * (poses[1, 2] - poses[0, 2] - self.free_angle) ** 2
+        return 0.5 * self.stiffness * (relative_angle(poses) - self.free_angle) ** 2
 
 
-class BumpStop(AbstractForce):
+class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """Progressive stops of a relative angle on both sides, `angle = angle_b − angle_a`.
 
     Beyond a limit the potential is `stiffness δ^(exponent + 1) / (exponent + 1)` of a smoothed depth
@@ -83,42 +65,28 @@ class BumpStop(AbstractForce):
     [rad] > 0.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    lower: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    upper: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    exponent: Float[Array, ""] = eqx.field(converter=number, default=3.0, kw_only=True)
-    smoothing: Float[Array, ""] = eqx.field(converter=number, default=1e-3, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad^exponent", sign="non-negative")
+    lower: Float[Array, ""] = fields.parameter(unit="rad")
+    upper: Float[Array, ""] = fields.parameter(unit="rad")
+    exponent: Float[Array, ""] = fields.parameter(sign="positive", default=3.0)
+    smoothing: Float[Array, ""] = fields.parameter(unit="rad", sign="positive", default=1e-3)
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        positive(self, "stiffness", self.stiffness, zero=True)
-        positive(self, "exponent", self.exponent)
-        positive(self, "smoothing", self.smoothing)
+    def validate(self):
         if not self.lower < self.upper:
-            raise ValueError(f"{label(self)}: lower must be less than upper, got {self.lower} and {self.upper}.")
-        return self
+            raise ValueError(f"{self.label}: lower must be less than upper, got {self.lower} and {self.upper}.")
 
     def _energy(self, angle):
         depth = ramp(jnp.stack([self.lower - angle, angle - self.upper]), self.smoothing)
         return self.stiffness * jnp.sum(depth ** (self.exponent + 1)) / (self.exponent + 1)
 
     def wrenches(self, space, poses, velocities, t):
-        moment = -jax.grad(self._energy)(poses[1, 2] - poses[0, 2])
-        wrench = jnp.concatenate([jnp.zeros(2, poses.dtype), moment[None]])
-        return jnp.stack([-wrench, wrench])
+        return _moment_pair(-jax.grad(self._energy)(relative_angle(poses)))
 
     def energy(self, space, poses, t):
-        return self._energy(poses[1, 2] - poses[0, 2])
+        return self._energy(relative_angle(poses))
 
 
-class Bushing(AbstractForce):
+class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """A compliant joint: springs and dampers on the three relative motions of a frame in B with respect to one in A.
 
     The motions are the position of B's point in the axes of `body_a` relative to A's point (2) [m] and the relative
@@ -128,30 +96,21 @@ class Bushing(AbstractForce):
     points as in `Revolute`; `free_angle` [rad], default that of the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    damping: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point_a: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "2"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, "3"] = fields.parameter(shape=(3,), unit="N/m, N m/rad", sign="non-negative")
+    damping: Float[Array, "3"] = fields.parameter(
+        shape=(3,), unit="N s/m, N m s/rad", sign="non-negative", default=(0.0, 0.0, 0.0)
+    )
+    point_a: Float[Array, "2"] = fields.point(body=0, optional=True)
+    point_b: Float[Array, "2"] = fields.point(body=1, optional=True)
+    point: Float[Array, "2"] = fields.point(body=None, gives=("point_a", "point_b"))
+    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        for field in ("stiffness", "damping"):
-            vector(self, field, getattr(self, field), 3)
-            positive(self, field, getattr(self, field), zero=True)
-        return fill(point_pair(self, space, poses), "free_angle", poses[1, 2] - poses[0, 2])
+    def complete(self, space, poses):
+        return self.filled(free_angle=relative_angle(poses))
 
     def _motions(self, space, poses):
         shift = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
-        return jnp.concatenate([shift, (poses[1, 2] - poses[0, 2] - self.free_angle)[None]])
+        return jnp.concatenate([shift, (relative_angle(poses) - self.free_angle)[None]])
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * x - self.damping * v

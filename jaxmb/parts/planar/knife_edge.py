@@ -1,15 +1,14 @@
-"""Constraints between velocities in the plane."""
+"""A blade in the plane."""
 
 from typing import ClassVar
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..base import AbstractVelocityConstraint, number
-from ..resolve import unit, vector
+from .. import fields
+from ..base import AbstractPlanarPart, AbstractVelocityConstraint
 
 
-class KnifeEdge(AbstractVelocityConstraint):
+class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
     """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n
     the normal of the blade.
 
@@ -17,22 +16,13 @@ class KnifeEdge(AbstractVelocityConstraint):
     the blade fixed in the body.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    point: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0), kw_only=True)
-    axis: Float[Array, "2"] = eqx.field(converter=number, default=(1.0, 0.0), kw_only=True)
+    name: str = fields.name()
+    body: str = fields.body_name()
+    point: Float[Array, "2"] = fields.point(body=0, default=(0.0, 0.0))
+    axis: Float[Array, "2"] = fields.axis(body=0, default=(1.0, 0.0))
     rows: ClassVar[int] = 1
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
-
-    @property
-    def bodies(self):
-        return (self.body,)
-
-    def resolve(self, space, poses):
-        vector(self, "point", self.point, 2)
-        unit(self, "axis", self.axis, 2)
-        return self
 
     def residual(self, space, poses, velocities, t):
         along = space.direction(poses[0], self.axis)

@@ -1,7 +1,7 @@
 """Tracks and belts: a closed elastic loop around wheels."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 
 from ..._types import VectorLike
 from ...linalg.rotations import norm
-from ..base import AbstractForce, number, optional_number
+from .. import fields
+from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..forces import generalized_force
-from ..resolve import fill, label, positive
 
 
-class Track(AbstractForce):
+class Track(AbstractPlanarPart, AbstractPotentialForce):
     """A closed elastic track or belt without mass around points of any number of bodies.
 
     Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential
@@ -36,15 +36,16 @@ class Track(AbstractForce):
     **Fields:** `bodies`, each once; `owners`, for each point the place of its body among them; `points`.
     """
 
-    name: str = eqx.field(static=True)
-    bodies: tuple[str, ...] = eqx.field(static=True)
+    name: str = fields.name()
+    bodies: tuple[str, ...] = fields.body_names()
     owners: tuple[int, ...] = eqx.field(static=True)
-    points: Float[Array, "n 2"]
-    pretension: Float[Array, ""]
-    stiffness: Float[Array, ""]
-    free_length: Float[Array, ""]
-    radii: Float[Array, "n"] | None
-    conservative: ClassVar[bool] = True
+    points: Float[Array, "n 2"] = fields.parameter(shape=None, unit="m", kw_only=False)
+    pretension: Float[Array, ""] = fields.parameter(unit="N", sign="non-negative", kw_only=False)
+    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", kw_only=False)
+    free_length: Float[Array, ""] = fields.parameter(unit="m", optional=True, kw_only=False)
+    radii: Float[Array, "n"] | None = fields.parameter(
+        shape=None, unit="m", sign="non-negative", optional=True, kw_only=False
+    )
 
     def __init__(
         self,
@@ -59,28 +60,26 @@ class Track(AbstractForce):
         self.name = name
         self.bodies = tuple(dict.fromkeys(body for body, _ in path))
         self.owners = tuple(self.bodies.index(body) for body, _ in path)
-        self.points = number([np.asarray(point, float) for _, point in path])
-        self.pretension, self.stiffness = number(pretension), number(stiffness)
-        self.free_length, self.radii = optional_number(free_length), optional_number(radii)
+        self.points = [np.asarray(point, float) for _, point in path]
+        self.pretension, self.stiffness = pretension, stiffness
+        self.free_length, self.radii = free_length, radii
 
     def __check_init__(self):
         n = len(self.owners)
         if n < 3 or self.points.shape != (n, 2):
             raise ValueError(
-                f"{label(self)}: path must hold at least 3 pairs (body, point) with points of shape (2,), got {n} with "
+                f"{self.label}: path must hold at least 3 pairs (body, point) with points of shape (2,), got {n} with "
                 f"points of shape {self.points.shape[1:]}."
             )
         if self.radii is not None and self.radii.shape != (n,):
-            raise ValueError(f"{label(self)}: radii must have shape ({n},), one each point, got {self.radii.shape}.")
+            raise ValueError(f"{self.label}: radii must have shape ({n},), one each point, got {self.radii.shape}.")
 
-    def resolve(self, space, poses):
-        for field in ("pretension", "stiffness", *(() if self.radii is None else ("radii",))):
-            positive(self, field, getattr(self, field), zero=True)
+    def complete(self, space, poses):
         if self.radii is not None:
             distance, more = norm(self._lines(space, poses)), jnp.roll(self.radii, -1) - self.radii
             if jnp.any(distance <= jnp.abs(more)):
-                raise ValueError(f"{label(self)}: a circle lies in its neighbour; leave it out, or make it smaller.")
-        return fill(self, "free_length", self.length(space, poses))
+                raise ValueError(f"{self.label}: a circle lies in its neighbour; leave it out, or make it smaller.")
+        return self.filled(free_length=self.length(space, poses))
 
     def _lines(self, space, poses):
         """From each point to the next."""

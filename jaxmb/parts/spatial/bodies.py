@@ -2,26 +2,50 @@
 
 from typing import Any, ClassVar, Literal, get_args
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from ...linalg import rotations as rot
 from ...linalg.arrays import namespace
-from ..base import AbstractPart, number
-from ..resolve import label, positive, vector
-from .axes import unit_euler
+from .. import fields
+from ..base import AbstractBody, AbstractSpatialPart
+from ..fields import as_parameter
 
 Axis = Literal["x", "y", "z"]
 
 
 def inertia_matrix(value: Any) -> Array:
     """An inertia matrix from itself or from its diagonal."""
-    value = number(value)
+    value = as_parameter(value)
     return namespace(value).diag(value) if value.shape == (3,) else value
 
 
-class Body(AbstractPart):
+class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
+    """A rigid body of space: the state that it is given with, for classes that know its mass and inertia.
+
+    **Arguments:** `position` [m], shape (3,), of the mass centre, and `orientation`, shape (4,), unit Euler parameters
+    (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,), of the mass
+    centre in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, likewise.
+    """
+
+    name: str = fields.name()
+    position: Float[Array, "3"] = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
+    orientation: Float[Array, "4"] = fields.attitude(state=True, default=(1.0, 0.0, 0.0, 0.0))
+    velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
+    angular_velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="rad/s", default=(0.0, 0.0, 0.0))
+    rotates: ClassVar[bool] = True
+
+    def pose(self):
+        return np.append(self.position, rot.normalize(self.orientation))
+
+    def velocities(self):
+        return np.append(self.velocity, self.angular_velocity)
+
+    def validate(self):
+        _check_inertia(self)
+
+
+class Body(AbstractRigidBody):
     """A rigid body; its frame has its origin in the mass centre.
 
     **Arguments:**
@@ -35,72 +59,50 @@ class Body(AbstractPart):
         in the body frame, likewise.
     """
 
-    name: str = eqx.field(static=True)
-    mass: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    inertia: Float[Array, "3 3"] = eqx.field(converter=inertia_matrix, kw_only=True)
-    position: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    orientation: Float[Array, "4"] = eqx.field(converter=number, default=(1.0, 0.0, 0.0, 0.0), kw_only=True)
-    velocity: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    angular_velocity: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    dimension: ClassVar[int] = 3
-    rotates: ClassVar[bool] = True
-
-    def check(self):
-        vector(self, "mass", self.mass[None], 1)
-        positive(self, "mass", self.mass)
-        _check_inertia(self)
-        for field in ("position", "velocity", "angular_velocity"):
-            vector(self, field, getattr(self, field), 3)
-        unit_euler(self, "orientation", self.orientation)
-
-    def pose(self):
-        return np.append(self.position, rot.normalize(self.orientation))
-
-    def velocities(self):
-        return np.append(self.velocity, self.angular_velocity)
+    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
+    inertia: Float[Array, "3 3"] = fields.parameter(
+        shape=None, unit="kg m²", sign="positive definite", converter=inertia_matrix
+    )
 
 
-def _check_inertia(body: Body) -> None:
+def _check_inertia(body: AbstractRigidBody) -> None:
     inertia = np.asarray(body.inertia)
     if inertia.shape != (3, 3):
-        raise ValueError(f"{label(body)}: inertia must have shape (3, 3) or (3,), got {inertia.shape}.")
+        raise ValueError(f"{body.label}: inertia must have shape (3, 3) or (3,), got {inertia.shape}.")
     if not np.all(np.isfinite(inertia)):
-        raise ValueError(f"{label(body)}: inertia must be finite, got {inertia.tolist()}.")
+        raise ValueError(f"{body.label}: inertia must be finite, got {inertia.tolist()}.")
     if not np.allclose(inertia, inertia.T, rtol=0.0, atol=1e-9 * np.max(np.abs(inertia))):
-        raise ValueError(f"{label(body)}: inertia must be symmetric, got {inertia.tolist()}; use (J + J.T) / 2.")
+        raise ValueError(f"{body.label}: inertia must be symmetric, got {inertia.tolist()}; use (J + J.T) / 2.")
     moments = np.linalg.eigvalsh(inertia)
     # Moments this far below the largest are rounding of a zero, not a thin body.
     if moments[0] <= 1e-14 * np.max(np.abs(moments)):
         raise ValueError(
-            f"{label(body)}: inertia must be positive definite, got principal moments {moments.tolist()} kg m²; a "
+            f"{body.label}: inertia must be positive definite, got principal moments {moments.tolist()} kg m²; a "
             "body without extension across an axis needs some: give a rod its radius, or use PointMass."
         )
     if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
         raise ValueError(
-            f"{label(body)}: inertia violates the triangle inequality, no principal moment may exceed the sum of the "
+            f"{body.label}: inertia violates the triangle inequality, no principal moment may exceed the sum of the "
             f"other two, got {moments.tolist()} kg m²; check that it is about the mass centre, in body axes, with "
             "products of inertia of the right sign."
         )
 
 
-class PointMass(AbstractPart):
+class PointMass(AbstractSpatialPart, AbstractBody):
     """A mass without extension: three coordinates and no orientation.
 
     **Arguments:** `mass` [kg] > 0; `position` [m] and `velocity` [m/s], shape (3,), a guess that `assemble` improves.
     """
 
-    name: str = eqx.field(static=True)
-    mass: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    position: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    velocity: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    dimension: ClassVar[int] = 3
+    name: str = fields.name()
+    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
+    position: Float[Array, "3"] = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
+    velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
     rotates: ClassVar[bool] = False
 
-    def check(self):
-        vector(self, "mass", self.mass[None], 1)
-        positive(self, "mass", self.mass)
-        vector(self, "position", self.position, 3)
-        vector(self, "velocity", self.velocity, 3)
+    @property
+    def inertia(self):
+        return np.zeros((3, 3), self.mass.dtype)
 
     def pose(self):
         return self.position
@@ -112,8 +114,8 @@ class PointMass(AbstractPart):
 def _axial(along: Any, across: Any, axis: Axis) -> Float[Array, "3 3"]:
     if axis not in get_args(Axis):
         raise ValueError(f"axis must be one of {get_args(Axis)}, got {axis!r}.")
-    moments = [number(across)] * 3
-    moments["xyz".index(axis)] = number(along)
+    moments = [as_parameter(across)] * 3
+    moments["xyz".index(axis)] = as_parameter(along)
     xp = namespace(*moments)
     return xp.diag(xp.stack(moments))
 
@@ -134,14 +136,14 @@ def disc(mass: float, radius: float, axis: Axis = "z") -> Float[Array, "3 3"]:
 
 def box(mass: float, x: float, y: float, z: float) -> Float[Array, "3 3"]:
     """Inertia [kg m²] of a uniform box with edges of lengths `x`, `y`, `z` [m] along the axes, about its centre."""
-    x2, y2, z2 = number(x) ** 2, number(y) ** 2, number(z) ** 2
-    moments = number(mass) / 12 * namespace(x2, y2, z2).stack([y2 + z2, z2 + x2, x2 + y2])
+    x2, y2, z2 = as_parameter(x) ** 2, as_parameter(y) ** 2, as_parameter(z) ** 2
+    moments = as_parameter(mass) / 12 * namespace(x2, y2, z2).stack([y2 + z2, z2 + x2, x2 + y2])
     return namespace(moments).diag(moments)
 
 
 def sphere(mass: float, radius: float) -> Float[Array, "3 3"]:
     """Inertia [kg m²] of a uniform solid sphere about its centre, `2 m r² / 5`."""
-    moment = 2 * number(mass) * number(radius) ** 2 / 5
+    moment = 2 * as_parameter(mass) * as_parameter(radius) ** 2 / 5
     return moment * np.eye(3, dtype=moment.dtype)
 
 

@@ -1,24 +1,20 @@
-"""Motions prescribed as functions of time."""
+"""Motions prescribed as functions of time, in space."""
 
 from collections.abc import Callable
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
 from ...linalg.rotations import norm
-from ..base import AbstractConstraint, optional_number
-from ..functions import numbers
-from ..resolve import fill, label, vector
-from .axes import angle, cosine_sine, resolve_axis, resolve_references, shift_in_a
-
-Quantity = Literal["angle", "x", "y", "z", "distance"]
+from .. import fields
+from ..base import AbstractConstraint, AbstractPair, AbstractSpatialPart
+from .axes import angle, cosine_sine, measured_from_given_poses, offset_in_a
 
 
-class Driver(AbstractConstraint):
+class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
     An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, so that any
@@ -38,47 +34,38 @@ class Driver(AbstractConstraint):
         that it is zero at the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    quantity: Quantity = eqx.field(static=True, kw_only=True)
-    motion: Callable[[Scalar, dict[str, Array]], Scalar] = eqx.field(static=True, kw_only=True)
-    parameters: dict[str, Array] = eqx.field(converter=numbers, default_factory=dict, kw_only=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    quantity: Literal["angle", "x", "y", "z", "distance"] = fields.choice("angle", "x", "y", "z", "distance")
+    motion: Callable[[Scalar, dict[str, Array]], Scalar] = fields.function(kw_only=True)
+    parameters: dict[str, Array] = fields.numbers()
+    point_a: Float[Array, "3"] = fields.point(body=0, optional=True)
+    point_b: Float[Array, "3"] = fields.point(body=1, optional=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",), needed=False)
+    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
 
     def __check_init__(self):
-        if self.quantity not in get_args(Quantity):
-            raise ValueError(f"{label(self)}: quantity must be one of {get_args(Quantity)}, got {self.quantity!r}.")
         turn, length = ("axis_a", "axis", "x_a", "x_b"), ("point_a", "point_b")
         for field in length if self.quantity == "angle" else turn:
-            if getattr(self, field) is not None:
-                raise ValueError(f"{label(self)}: {field} has no meaning for quantity={self.quantity!r}; leave it out.")
+            if getattr(self, field) is not None and self.quantity in ("angle", "x", "y", "z", "distance"):
+                raise ValueError(f"{self.label}: {field} has no meaning for quantity={self.quantity!r}; leave it out.")
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
+    def validate(self):
+        if self.quantity == "angle" and self.axis is None and self.axis_a is None:
+            raise ValueError(f"{self.label}: give axis_a (fixed in {self.body_a!r}) or axis (world).")
 
-    def resolve(self, space, poses):
+    def complete(self, space, poses):
         if self.quantity == "angle":
-            return resolve_references(resolve_axis(self, space, poses), space, poses)
-        part = self
-        for field in ("point_a", "point_b"):
-            part = fill(part, field, np.zeros(3))
-            vector(part, field, getattr(part, field), 3)
-        return part
+            return measured_from_given_poses(self, space, poses)
+        return self.filled(point_a=np.zeros(3), point_b=np.zeros(3))
 
     def value(self, space, poses):
         """The driven quantity at given poses; an angle in (−π, π]."""
         if self.quantity == "angle":
             return angle(space, self, poses)
-        shift = shift_in_a(space, self, poses)
+        shift = offset_in_a(space, self, poses)
         if self.quantity == "distance":
             return norm(shift)
         return shift["xyz".index(self.quantity)]

@@ -1,42 +1,28 @@
 """Forces of space that have no counterpart of the same shape in the plane."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..base import AbstractForce, number, optional_number
+from .. import fields
+from ..base import AbstractForce, AbstractPair, AbstractPotentialForce, AbstractSpatialPart
 from ..forces import generalized_force
-from ..resolve import fill, label, point_pair, positive, vector
-from .axes import angle, resolve_axis, resolve_orientation, resolve_references, shift_in_a, turn_vector
+from .axes import angle, measured_from_given_poses, offset_in_a, rotation_error, with_given_orientation
 
 
-class Torque(AbstractForce):
+class Torque(AbstractSpatialPart, AbstractForce):
     """A constant moment on `body`, with its reaction on another one.
 
     **Arguments:** `torque` [N m], shape (3,), in world axes or, with `frame="body"`, turning with the body; `reaction`,
     the body that bears the reaction, default ground.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    torque: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    reaction: str = eqx.field(static=True, default="ground", kw_only=True)
-    frame: Literal["world", "body"] = eqx.field(static=True, default="world", kw_only=True)
-    conservative: ClassVar[bool] = False
-
-    def __check_init__(self):
-        if self.frame not in ("world", "body"):
-            raise ValueError(f"{label(self)}: frame must be 'world' or 'body', got {self.frame!r}.")
-
-    @property
-    def bodies(self):
-        return (self.reaction, self.body)
-
-    def resolve(self, space, poses):
-        vector(self, "torque", self.torque, 3)
-        return self
+    name: str = fields.name()
+    reaction: str = fields.body_name(default="ground")
+    body: str = fields.body_name()
+    torque: Float[Array, "3"] = fields.parameter(shape=(3,), unit="N m")
+    frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
 
     def wrenches(self, space, poses, velocities, t):
         torque_W = self.torque if self.frame == "world" else space.direction(poses[1], self.torque)
@@ -44,7 +30,7 @@ class Torque(AbstractForce):
         return jnp.concatenate([jnp.zeros_like(moments), moments], axis=1)
 
 
-class TorsionalSpringDamper(AbstractForce):
+class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A linear spring and damper on an angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
 
     The angle is that from `x_a` to `x_b` about `axis_a`, in (−π, π]: it jumps half a turn away from `x_a`, so it suits
@@ -56,27 +42,17 @@ class TorsionalSpringDamper(AbstractForce):
     is zero at the given poses; `free_angle` [rad], default that of the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    damping: Float[Array, ""] = eqx.field(converter=number, default=0.0, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    free_angle: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad", sign="non-negative")
+    damping: Float[Array, ""] = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
+    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        positive(self, "stiffness", self.stiffness, zero=True)
-        positive(self, "damping", self.damping, zero=True)
-        part = resolve_references(resolve_axis(self, space, poses), space, poses)
-        return fill(part, "free_angle", angle(space, part, poses))
+    def complete(self, space, poses):
+        part = measured_from_given_poses(self, space, poses)
+        return part.filled(free_angle=angle(space, part, poses))
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * (x - self.free_angle) - self.damping * v
@@ -86,7 +62,7 @@ class TorsionalSpringDamper(AbstractForce):
         return 0.5 * self.stiffness * (angle(space, self, poses) - self.free_angle) ** 2
 
 
-class Bushing(AbstractForce):
+class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A compliant joint: springs and dampers on the six relative motions of a frame in B with respect to one in A.
 
     The motions are the position of B's point relative to A's point in the axes of `body_a` (3) [m], and twice the
@@ -100,29 +76,20 @@ class Bushing(AbstractForce):
     the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    stiffness: Float[Array, "6"] = eqx.field(converter=number, kw_only=True)
-    damping: Float[Array, "6"] = eqx.field(converter=number, default=(0.0,) * 6, kw_only=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    conservative: ClassVar[bool] = True
+    stiffness: Float[Array, "6"] = fields.parameter(shape=(6,), unit="N/m (3), N m/rad (3)", sign="non-negative")
+    damping: Float[Array, "6"] = fields.parameter(
+        shape=(6,), unit="N s/m (3), N m s/rad (3)", sign="non-negative", default=(0.0,) * 6
+    )
+    point_a: Float[Array, "3"] = fields.point(body=0, optional=True)
+    point_b: Float[Array, "3"] = fields.point(body=1, optional=True)
+    point: Float[Array, "3"] = fields.point(body=None, gives=("point_a", "point_b"))
+    orientation: Float[Array, "4"] = fields.attitude(optional=True)
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        for field in ("stiffness", "damping"):
-            vector(self, field, getattr(self, field), 6)
-            positive(self, field, getattr(self, field), zero=True)
-        return resolve_orientation(point_pair(self, space, poses), poses)
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
 
     def _motions(self, space, poses):
-        return jnp.concatenate([shift_in_a(space, self, poses), turn_vector(self, poses)])
+        return jnp.concatenate([offset_in_a(space, self, poses), rotation_error(self, poses)])
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * x - self.damping * v

@@ -9,29 +9,24 @@ all rows are Φ = 0.
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
-from ..base import AbstractConstraint, number, optional_number
-from ..resolve import axis_pair, fill, label, point_pair, positive, unit, vector
+from .. import fields
+from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
+from ..space import separation
 from .axes import (
     angle,
     cosine_sine,
     direction_in_a,
+    measured_from_given_poses,
+    offset_in_a,
     perpendiculars,
-    resolve_axis,
-    resolve_orientation,
-    resolve_references,
-    shift_in_a,
-    turn_vector,
+    rotation_error,
+    with_given_orientation,
 )
-
-
-def _separation(space, part, poses):
-    return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
 
 
 def _across(axis_a, w):
@@ -43,145 +38,77 @@ def _parallel(space, part, poses):
     return _across(part.axis_a, direction_in_a(space, poses, part.axis_b))
 
 
-class Spherical(AbstractConstraint):
+class Spherical(AbstractSpatialPart, AbstractJoint):
     """A ball: two points coincide. Rows 3: `d`.
 
     **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; or `point` [m], shape (3,), world.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
     rows: ClassVar[int] = 3
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return point_pair(self, space, poses)
 
     def residual(self, space, poses, t):
-        return _separation(space, self, poses)
+        return separation(space, self, poses)
 
 
-class Revolute(AbstractConstraint):
+class Revolute(AbstractSpatialPart, AbstractJoint):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, `u·b`, `v·b`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), direction of the hinge fixed in each
     body; or `axis`, unit, shape (3,), world.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 5
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return axis_pair(point_pair(self, space, poses), space, poses)
 
     def residual(self, space, poses, t):
-        return jnp.concatenate([_separation(space, self, poses), _parallel(space, self, poses)])
+        return jnp.concatenate([separation(space, self, poses), _parallel(space, self, poses)])
 
 
-class Universal(AbstractConstraint):
+class Universal(AbstractSpatialPart, AbstractJoint):
     """A Cardan joint: two points coincide and two axes stay perpendicular. Rows 4: `d`, `a·b`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), the arms of the cross, fixed in
     `body_a` and in `body_b`; each may be given in the world instead, as `axis_a_W` and `axis_b_W`.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a_W: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b_W: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    axis_a_W: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
+    axis_b_W: Float[Array, "3"] = fields.axis(body=None, gives=("axis_b",))
     rows: ClassVar[int] = 4
-    rheonomic: ClassVar[bool] = False
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        part = point_pair(self, space, poses)
-        axes = []
-        for k, field in enumerate(("axis_a", "axis_b")):
-            fixed, world = getattr(part, field), getattr(part, field + "_W")
-            if (fixed is None) == (world is None):
-                raise ValueError(
-                    f"{label(part)}: give {field} (fixed in {part.bodies[k]!r}) or {field}_W (world), and only one of "
-                    "them."
-                )
-            if world is None:
-                axes.append(unit(part, field, fixed, 3))
-            else:
-                axes.append(space.body_direction(poses[k], unit(part, field + "_W", world, 3)))
-        if part.axis_a_W is not None and part.axis_b_W is not None:
-            cosine = float(part.axis_a_W @ part.axis_b_W)
+    def validate(self):
+        if self.axis_a_W is not None and self.axis_b_W is not None:
+            cosine = float(self.axis_a_W @ self.axis_b_W)
             if abs(cosine) > 1e-6:
                 raise ValueError(
-                    f"{label(part)}: axis_a_W and axis_b_W must be perpendicular, their product is {cosine:.6g}."
+                    f"{self.label}: axis_a_W and axis_b_W must be perpendicular, their product is {cosine:.6g}."
                 )
-        where = lambda p: (p.axis_a, p.axis_b, p.axis_a_W, p.axis_b_W)
-        return eqx.tree_at(where, part, (*axes, None, None), is_leaf=lambda x: x is None)
 
     def residual(self, space, poses, t):
         cosine = jnp.dot(self.axis_a, direction_in_a(space, poses, self.axis_b))
-        return jnp.concatenate([_separation(space, self, poses), cosine[None]])
+        return jnp.concatenate([separation(space, self, poses), cosine[None]])
 
 
-class Cylindrical(AbstractConstraint):
+class Cylindrical(AbstractSpatialPart, AbstractJoint):
     """A turning slide: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
 
     **Arguments:** as in `Revolute`.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 4
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return axis_pair(point_pair(self, space, poses), space, poses)
 
     def residual(self, space, poses, t):
-        shift = shift_in_a(space, self, poses)
+        shift = offset_in_a(space, self, poses)
         return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift)])
 
 
-class Screw(AbstractConstraint):
+class Screw(AbstractSpatialPart, AbstractJoint):
     """A screw: two axes stay on one line and a turn advances B. Rows 5: those of `Cylindrical`, and the thread.
 
     With the angle θ from `x_a` to `x_b` about the axis and the shift s = a·d, the last row is `pitch/2π · sin(θ − 2π (s
@@ -194,36 +121,22 @@ class Screw(AbstractConstraint):
     shape (3,), body-fixed and across the axis, between which θ is measured, default zero angle at the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    pitch: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    x_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    offset: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    pitch: Float[Array, ""] = fields.parameter(unit="m", sign="nonzero")
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    offset: Float[Array, ""] = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
-    rheonomic: ClassVar[bool] = False
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        vector(self, "pitch", self.pitch[None], 1)
-        if float(self.pitch) == 0:
-            raise ValueError(f"{label(self)}: pitch must not be zero; use Revolute for a screw that does not advance.")
-        part = resolve_references(axis_pair(point_pair(self, space, poses), space, poses), space, poses)
+    def complete(self, space, poses):
+        part = measured_from_given_poses(self, space, poses)
         advance = part.pitch * angle(space, part, poses) / (2 * np.pi)
-        return fill(part, "offset", part.axis_a @ shift_in_a(space, part, poses) - advance)
+        return part.filled(offset=part.axis_a @ offset_in_a(space, part, poses) - advance)
 
     def residual(self, space, poses, t):
-        shift = shift_in_a(space, self, poses)
+        shift = offset_in_a(space, self, poses)
         lead = self.pitch / (2 * np.pi)
         turn = (jnp.dot(self.axis_a, shift) - self.offset) / lead
         c, s = cosine_sine(space, self, poses)
@@ -231,7 +144,7 @@ class Screw(AbstractConstraint):
         return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift), thread[None]])
 
 
-class Prismatic(AbstractConstraint):
+class Prismatic(AbstractSpatialPart, AbstractJoint):
     """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the turn (3).
 
     The turn is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the rotation
@@ -242,87 +155,51 @@ class Prismatic(AbstractConstraint):
     poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
+    orientation: Float[Array, "4"] = fields.attitude(optional=True)
     rows: ClassVar[int] = 5
-    rheonomic: ClassVar[bool] = False
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return resolve_orientation(resolve_axis(point_pair(self, space, poses), space, poses), poses)
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
-        return jnp.concatenate([_across(self.axis_a, shift_in_a(space, self, poses)), turn_vector(self, poses)])
+        return jnp.concatenate([_across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
 
 
-class Planar(AbstractConstraint):
+class Planar(AbstractSpatialPart, AbstractJoint):
     """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: `u·b`, `v·b`, `a·d`.
 
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 3
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return axis_pair(point_pair(self, space, poses), space, poses)
 
     def residual(self, space, poses, t):
-        height = jnp.dot(self.axis_a, shift_in_a(space, self, poses))
+        height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
         return jnp.concatenate([_parallel(space, self, poses), height[None]])
 
 
-class Fixed(AbstractConstraint):
+class Fixed(AbstractSpatialPart, AbstractJoint):
     """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the turn (3) as in `Prismatic`.
 
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    orientation: Float[Array, "4"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    orientation: Float[Array, "4"] = fields.attitude(optional=True)
     rows: ClassVar[int] = 6
-    rheonomic: ClassVar[bool] = False
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return resolve_orientation(point_pair(self, space, poses), poses)
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
-        return jnp.concatenate([_separation(space, self, poses), turn_vector(self, poses)])
+        return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])
 
 
-class Distance(AbstractConstraint):
+class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length)`.
 
     The multiplier is the rod force [N].
@@ -330,84 +207,45 @@ class Distance(AbstractConstraint):
     **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; `length` [m] > 0, default that of the given poses.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    length: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    point_a: Float[Array, "3"] = fields.point(body=0, default=(0.0, 0.0, 0.0))
+    point_b: Float[Array, "3"] = fields.point(body=1, default=(0.0, 0.0, 0.0))
+    length: Float[Array, ""] = fields.length(sign="positive", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        vector(self, "point_a", self.point_a, 3)
-        vector(self, "point_b", self.point_b, 3)
-        part = fill(self, "length", norm(_separation(space, self, poses)))
-        positive(part, "length", part.length)
-        return part
+    def complete(self, space, poses):
+        return self.filled(length=norm(separation(space, self, poses)))
 
     def residual(self, space, poses, t):
-        d = _separation(space, self, poses)
+        d = separation(space, self, poses)
         return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
 
 
-class PointOnPlane(AbstractConstraint):
+class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     """A point of B stays in a plane fixed in A, through A normal to the axis. Rows 1: `a·d`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), normal of the plane fixed in `body_a`, or
     `axis` in the world.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return resolve_axis(point_pair(self, space, poses), space, poses)
 
     def residual(self, space, poses, t):
-        return jnp.dot(self.axis_a, shift_in_a(space, self, poses))[None]
+        return jnp.dot(self.axis_a, offset_in_a(space, self, poses))[None]
 
 
-class PointOnLine(AbstractConstraint):
+class PointOnLine(AbstractSpatialPart, AbstractJoint):
     """A ball in a straight slot: a point of B stays on the line through A along the axis. Rows 2: `u·d`, `v·d`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slot fixed in `body_a`, or
     `axis` in the world.
     """
 
-    name: str = eqx.field(static=True)
-    body_a: str = eqx.field(static=True)
-    body_b: str = eqx.field(static=True)
-    point_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point_b: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis_a: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
+    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 2
-    rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body_a, self.body_b)
-
-    def resolve(self, space, poses):
-        return resolve_axis(point_pair(self, space, poses), space, poses)
 
     def residual(self, space, poses, t):
-        return _across(self.axis_a, shift_in_a(space, self, poses))
+        return _across(self.axis_a, offset_in_a(space, self, poses))

@@ -5,17 +5,16 @@ The plane is fixed in the world, given by a point and its normal `e`, which poin
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...linalg.rotations import cross, norm
-from ..base import AbstractConstraint, AbstractLink, AbstractVelocityConstraint, number, optional_number
-from ..resolve import positive, unit, vector
+from .. import fields
+from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
 from .axes import perpendiculars
 
 
-class KnifeEdge(AbstractVelocityConstraint):
+class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
     """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`.
 
     Here v is the velocity of the contact point and h the direction of the blade. It does not hold the body
@@ -25,28 +24,29 @@ class KnifeEdge(AbstractVelocityConstraint):
     blade fixed in the body; `normal`, unit, shape (3,), of the plane in the world.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=number, default=(1.0, 0.0, 0.0), kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 1.0), kw_only=True)
+    name: str = fields.name()
+    body: str = fields.body_name()
+    point: Float[Array, "3"] = fields.point(body=0, default=(0.0, 0.0, 0.0))
+    axis: Float[Array, "3"] = fields.axis(body=0, default=(1.0, 0.0, 0.0))
+    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
     rows: ClassVar[int] = 1
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
 
-    @property
-    def bodies(self):
-        return (self.body,)
-
-    def resolve(self, space, poses):
-        vector(self, "point", self.point, 3)
-        unit(self, "axis", self.axis, 3)
-        unit(self, "normal", self.normal, 3)
-        return self
-
     def residual(self, space, poses, velocities, t):
         v = space.point_velocity(poses[0], velocities[0], self.point)
         return jnp.dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
+
+
+class AbstractDisk(AbstractSpatialPart):
+    """What `RollingDisk` and its components share."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    radius: Float[Array, ""] = fields.length(sign="positive")
+    axis: Float[Array, "3"] = fields.axis(body=0, default=(0.0, 0.0, 1.0))
+    center: Float[Array, "3"] = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
 
 def _lowest_rim_point(space, part, pose):
@@ -65,7 +65,7 @@ def _tangential(normal, v):
     return jnp.sum(perpendiculars(normal) * v[None, :], axis=1)
 
 
-class RollingDisk(AbstractLink):
+class RollingDisk(AbstractDisk, AbstractCompound):
     """A thin disk that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, n the
@@ -76,76 +76,49 @@ class RollingDisk(AbstractLink):
     the world.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 1.0), kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 1.0), kw_only=True)
-
-    @property
-    def bodies(self):
-        return (self.body,)
-
-    def resolve(self, space, poses):
-        positive(self, "radius", self.radius)
-        unit(self, "axis", self.axis, 3)
-        unit(self, "normal", self.normal, 3)
-        vector(self, "center", self.center, 3)
-        vector(self, "point", self.point, 3)
-        return self
+    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
 
     def components(self):
         disk = {"radius": self.radius, "axis": self.axis, "center": self.center, "normal": self.normal}
         return (DiskContact(self.name, self.body, point=self.point, **disk), DiskRolling(self.name, self.body, **disk))
 
 
-class DiskContact(AbstractConstraint):
+class DiskContact(AbstractDisk, AbstractConstraint):
     """A disk that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisk`."""
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
+    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body,)
 
     def residual(self, space, poses, t):
         lowest = space.point(poses[0], self.center) + _lowest_rim_point(space, self, poses[0])
         return jnp.dot(self.normal, lowest - self.point)[None]
 
 
-class DiskRolling(AbstractVelocityConstraint):
+class DiskRolling(AbstractDisk, AbstractVelocityConstraint):
     """A disk whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisk`."""
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    axis: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
-
-    @property
-    def bodies(self):
-        return (self.body,)
 
     def residual(self, space, poses, velocities, t):
         rho = space.body_direction(poses[0], _lowest_rim_point(space, self, poses[0]))
         return _tangential(self.normal, space.point_velocity(poses[0], velocities[0], self.center + rho))
 
 
-class RollingSphere(AbstractLink):
+class AbstractBall(AbstractSpatialPart):
+    """What `RollingSphere` and its components share."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    radius: Float[Array, ""] = fields.length(sign="positive")
+    center: Float[Array, "3"] = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
+    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
+
+
+class RollingSphere(AbstractBall, AbstractCompound):
     """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     **Arguments:** `radius` [m] > 0; `center` [m], shape (3,), of the sphere, fixed in the body, default the mass
@@ -153,26 +126,7 @@ class RollingSphere(AbstractLink):
     rate at which the plane turns about its normal through `point`, default a plane at rest.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 0.0), kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, default=(0.0, 0.0, 1.0), kw_only=True)
-    spin: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
-
-    @property
-    def bodies(self):
-        return (self.body,)
-
-    def resolve(self, space, poses):
-        positive(self, "radius", self.radius)
-        unit(self, "normal", self.normal, 3)
-        vector(self, "center", self.center, 3)
-        vector(self, "point", self.point, 3)
-        if self.spin is not None:
-            vector(self, "spin", self.spin[None], 1)
-        return self
+    spin: Float[Array, ""] = fields.parameter(unit="rad/s", optional=True)
 
     def components(self):
         ball = {"radius": self.radius, "center": self.center, "point": self.point, "normal": self.normal}
@@ -182,50 +136,30 @@ class RollingSphere(AbstractLink):
         )
 
 
-class SphereContact(AbstractConstraint):
+class SphereContact(AbstractBall, AbstractConstraint):
     """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C its centre; else as in `RollingSphere`."""
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
-
-    @property
-    def bodies(self):
-        return (self.body,)
 
     def residual(self, space, poses, t):
         height = jnp.dot(self.normal, space.point(poses[0], self.center) - self.point)
         return (height - self.radius * norm(self.normal))[None]
 
 
-class SphereRolling(AbstractVelocityConstraint):
+class SphereRolling(AbstractBall, AbstractVelocityConstraint):
     """A sphere that moves with the plane where they touch. Rows 2: `Ċ − r ω × e − spin e × (C − point)` in the plane.
 
     Arguments as in `RollingSphere`; with a turntable the rows do not vanish at rest.
     """
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    radius: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
-    center: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    point: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    normal: Float[Array, "3"] = eqx.field(converter=number, kw_only=True)
-    spin: Float[Array, ""] = eqx.field(converter=optional_number, default=None, kw_only=True)
+    spin: Float[Array, ""] = fields.parameter(unit="rad/s", optional=True)
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
 
     @property
     def homogeneous(self):
         return self.spin is None
-
-    @property
-    def bodies(self):
-        return (self.body,)
 
     def residual(self, space, poses, velocities, t):
         e = self.normal / norm(self.normal)

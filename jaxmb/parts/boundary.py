@@ -1,0 +1,76 @@
+"""Checks of what the kernels of a part return, by abstract evaluation: nothing is computed or compiled."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .base import (
+    AbstractConstraint,
+    AbstractForce,
+    AbstractNonIdeal,
+    AbstractPotentialForce,
+    AbstractVelocityConstraint,
+)
+from .space import AbstractSpace
+
+
+def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
+    """Raise a `ValueError` that names the part unless its kernels return arrays of the right shape and dtype, and take
+    nothing from beyond the ends of what they are given.
+
+    Without this check a wrench of the wrong shape would be added to another body's.
+
+    **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
+    """
+    dtype = np.dtype(jnp.result_type(float))
+    poses = np.tile(np.asarray(space.prepare(jnp.asarray(space.ground, dtype))), (bodies, 1))
+    velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
+    of_bodies = velocities.shape
+    if isinstance(part, AbstractConstraint):
+        _check(part, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
+    elif isinstance(part, AbstractVelocityConstraint):
+        _check(part, "residual", (part.rows,), lambda x, v, t: part.residual(space, x, v, t), poses, velocities, t)
+    elif isinstance(part, AbstractNonIdeal):
+        kernel = lambda x, v, r, t: part.wrenches(space, x, v, r, t)
+        _check(part, "wrenches", of_bodies, kernel, poses, velocities, velocities, t)
+    elif isinstance(part, AbstractForce):
+        _check(part, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t)
+        if isinstance(part, AbstractPotentialForce):
+            if part.conservative:
+                _check(part, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
+        elif hasattr(part, "energy"):
+            raise ValueError(
+                f"{part.label} has an energy that nothing asks for; derive it from AbstractPotentialForce."
+            )
+
+
+def _check(part: Any, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
+    out = _evaluated(part, name, kernel, given)
+    if not hasattr(out, "shape") or out.shape != shape:
+        found = getattr(out, "shape", type(out).__name__)
+        raise ValueError(f"{part.label}: {name} must return shape {shape}, got {found}.")
+    if out.dtype != given[0].dtype:
+        raise ValueError(f"{part.label}: {name} must return {given[0].dtype} numbers, got {out.dtype}.")
+
+
+def _evaluated(part: Any, name: str, kernel: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    try:
+        # NumPy's arrays refuse an index past their end, which JAX's replace by the last one.
+        return jax.eval_shape(lambda: _as_array(kernel(*given)))
+    except IndexError as error:
+        if "out of bounds" in str(error):
+            raise ValueError(f"{part.label}: {name} takes what is not there: {error}.") from error
+    except Exception:
+        # What NumPy's arrays cannot do, such as `.at[...]`.
+        pass
+    try:
+        return jax.eval_shape(lambda *given: _as_array(kernel(*given)), *given)
+    except Exception as error:
+        raise ValueError(f"{part.label}: {name} cannot be evaluated: {str(error).strip().splitlines()[0]}") from error
+
+
+def _as_array(value: Any) -> Any:
+    return value if isinstance(value, jax.Array | np.ndarray | np.generic) else jnp.asarray(value)

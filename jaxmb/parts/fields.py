@@ -1,0 +1,410 @@
+"""Declarations of the fields of a part: what each one means, said once, for everything that asks.
+
+A part declares its fields with the helpers of this file, in place of `equinox.field`:
+
+    class Spring(AbstractForce):
+        name: str = name()
+        body: str = body_name()
+        stiffness: Float[Array, ""] = parameter(unit="N/m", sign="positive")
+        point: Float[Array, "d"] = point(body=0, default="mass centre")
+
+Numbers become read-only arrays and are the part's parameters, `"name.field"`; everything else is static. A declaration
+knows the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign, its unit, the body that it is fixed in,
+and whether it may be left out. Scenes check it and stack parts by it, `identify` keeps positive what it says is
+positive, and pictures and reactions take from it where a part acts.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..linalg.arrays import as_array, is_traced
+
+Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
+Size = int | Literal["d"]
+
+# A direction counts as a unit vector if its length differs from one by no more than this.
+_UNIT = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """What a field means.
+
+    **Fields:**
+
+    - `kind`: `"identity"` for a name that tells a part from its siblings, `"body"` for the name of a body (`"bodies"`
+        for several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with numbers of its own,
+        `"state"` for a number of the initial guess, which is no parameter.
+    - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
+    - `body`: place among the part's bodies of the one that a point or direction is fixed in; None for the world.
+    - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
+    - `sizes`: whether the number is a length that the scene's size is found from.
+    - `optional`: whether the field may be None, to be worked out from the given poses; `centred`: a point that is the
+        mass centre then.
+    - `gives`: of a point or direction in the world, the body-fixed fields that it stands for; `needed`: whether either
+        must be given.
+    - `of`: of a law, its type; `what` it is, for messages; of a choice, the words.
+    """
+
+    kind: str
+    shape: tuple[Size, ...] | None = None
+    sign: Sign | None = None
+    unit: str = ""
+    body: int | None = None
+    is_point: bool = False
+    is_direction: bool = False
+    is_attitude: bool = False
+    sizes: bool = False
+    optional: bool = False
+    centred: bool = False
+    gives: tuple[str, ...] = ()
+    needed: bool = True
+    of: Any = None
+    what: str = ""
+
+    @property
+    def is_number(self) -> bool:
+        return self.kind in ("number", "state")
+
+
+@functools.cache
+def declarations(cls: type) -> dict[str, Declaration]:
+    """The declared fields of a class, in their order."""
+    fields = dataclasses.fields(cls)
+    return {field.name: field.metadata["declaration"] for field in fields if "declaration" in field.metadata}
+
+
+# Conversion
+
+
+def as_parameter(value: Any) -> Any:
+    """A strongly typed array of floats.
+
+    It is JAX's where anything is traced, and else a read-only one of NumPy's, so that nothing is compiled to build a
+    scene.
+
+    **Raises:** `ValueError` for anything that is no real number or array of real numbers.
+    """
+    if not is_traced(value):
+        kind = np.asarray(value).dtype.kind if not isinstance(value, dict) else "O"
+        if kind not in "fiub":
+            raise ValueError(f"expected a real number or an array of real numbers, got {value!r}")
+    out = as_array(value, jnp.result_type(float))
+    if isinstance(out, np.ndarray):
+        out.flags.writeable = False
+    return out
+
+
+def as_jax(value: Any) -> Array:
+    """The same as an array of JAX's, for functions that may index it by what is traced."""
+    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
+        return value
+    value = as_parameter(value)
+    return value if isinstance(value, Array) else jax.device_put(value)
+
+
+def _lenient(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The converter of a field. It leaves what it cannot convert as it is: `check_kinds` then names part and field."""
+
+    def converter(value: Any) -> Any:
+        try:
+            return convert(value)
+        except (ValueError, TypeError):
+            return value
+
+    return converter
+
+
+def _as_numbers(values: Any) -> Any:
+    return {key: as_jax(value) for key, value in values.items()} if isinstance(values, dict) else values
+
+
+def _as_names(values: Any) -> Any:
+    return (values,) if isinstance(values, str) else tuple(values)
+
+
+_NUMBER, _NUMBERS, _NAMES = _lenient(as_parameter), _lenient(_as_numbers), _lenient(_as_names)
+
+
+# Helpers
+
+
+def _field(declaration: Declaration, **options: Any) -> Any:
+    static = declaration.kind in ("identity", "body", "bodies", "choice")
+    options = {name: value for name, value in options.items() if value is not dataclasses.MISSING}
+    return eqx.field(static=static, metadata={"declaration": declaration}, **options)
+
+
+def name() -> Any:
+    """The part's name; also of another part that it refers to. Stacked parts differ in it."""
+    return _field(Declaration("identity"))
+
+
+def body_name(*, default: Any = dataclasses.MISSING) -> Any:
+    """The name of a body that the part acts on. `part.bodies` lists them in the order of the fields."""
+    keyword = {} if default is dataclasses.MISSING else {"kw_only": True}
+    return _field(Declaration("body"), default=default, **keyword)
+
+
+def body_names() -> Any:
+    """The names of any number of bodies, in a field that must be called `bodies`; one name alone is a tuple of one."""
+    return _field(Declaration("bodies"), converter=_NAMES)
+
+
+def choice(*values: str, default: Any = dataclasses.MISSING) -> Any:
+    """One of several words; static."""
+    return _field(Declaration("choice", of=values), default=default, kw_only=True)
+
+
+def function(*, default: Any = dataclasses.MISSING, kw_only: bool = False) -> Any:
+    """A function of the user's; static."""
+    return eqx.field(static=True, kw_only=kw_only, **({} if default is dataclasses.MISSING else {"default": default}))
+
+
+def parameter(
+    *,
+    shape: tuple[Size, ...] | None = (),
+    unit: str = "",
+    sign: Sign | None = None,
+    default: Any = dataclasses.MISSING,
+    optional: bool = False,
+    sizes: bool = False,
+    kw_only: bool = True,
+    converter: Callable[[Any], Any] | None = None,
+) -> Any:
+    """A number or an array of numbers.
+
+    **Arguments:** `shape`, `"d"` in it for the dimension of the space, None for any; `unit`, for people; `sign` of
+    every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`;
+    `optional`: default None, which the part's `complete` replaces; `sizes`: a length that the scene's size is found
+    from; `converter`, before anything is checked.
+    """
+    declaration = Declaration("number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes)
+    default = None if optional else default
+    convert = _NUMBER if converter is None else _lenient(converter)
+    return _field(declaration, converter=_optional(convert), default=default, kw_only=kw_only)
+
+
+def length(**options: Any) -> Any:
+    """A length [m] that tells the size of the scene; arguments as those of `parameter`."""
+    return parameter(**({"unit": "m", "sizes": True} | options))
+
+
+def point(
+    *,
+    body: int | None,
+    default: Any = dataclasses.MISSING,
+    optional: bool = False,
+    sizes: bool = True,
+    gives: tuple[str, ...] = (),
+) -> Any:
+    """A point [m], fixed in a body, or in the world with `body=None`.
+
+    **Arguments:** `body`: its place among the part's bodies; `default`: `"mass centre"`, or coordinates; `optional`:
+    default None; `sizes`: whether the scene's size is found from it, among others; `gives`: of a point in the world,
+    the body-fixed points that it stands for at the given poses.
+    """
+    centred = isinstance(default, str)
+    declaration = Declaration(
+        "number",
+        shape=("d",),
+        unit="m",
+        body=body,
+        is_point=True,
+        sizes=sizes,
+        optional=optional or centred or bool(gives),
+        centred=centred,
+        gives=gives,
+    )
+    default = None if declaration.optional else default
+    return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
+
+
+def axis(
+    *,
+    body: int | None,
+    default: Any = dataclasses.MISSING,
+    optional: bool = False,
+    gives: tuple[str, ...] = (),
+    needed: bool = True,
+) -> Any:
+    """A unit vector, fixed in a body, or in the world with `body=None`; arguments as those of `point`.
+
+    `needed=False`: neither it nor what it gives has to be given.
+    """
+    declaration = Declaration(
+        "number",
+        shape=("d",),
+        body=body,
+        is_direction=True,
+        optional=optional or bool(gives),
+        gives=gives,
+        needed=needed,
+    )
+    default = None if declaration.optional else default
+    return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
+
+
+def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, state: bool = False) -> Any:
+    """Unit Euler parameters, scalar first."""
+    declaration = Declaration("state" if state else "number", shape=(4,), is_attitude=True, optional=optional)
+    default = None if optional else default
+    return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
+
+
+def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
+    """A number of the state that a body is given with: a guess that `assemble` improves, and no parameter."""
+    return _field(Declaration("state", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
+
+
+def numbers() -> Any:
+    """Numbers by name, the parameters of a function of the user's: parameters `"part.key"`."""
+    return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
+
+
+def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
+    """A module with numbers of its own, parameters `"part.field.number"`.
+
+    **Arguments:** `of`: its abstract type, `X | None` where there may be none; `what` it is, for messages.
+    """
+    return _field(Declaration("law", of=of, what=what), default=default, kw_only=kw_only)
+
+
+def _optional(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else convert(value)
+
+
+# Checks
+
+
+def check_kinds(part: Any, label: str) -> None:
+    """Raise a `ValueError` for a field that holds something of another kind: no number, no name, no choice, no law."""
+    for field, declared in declarations(type(part)).items():
+        value = getattr(part, field)
+        if declared.is_number:
+            if not _is_number(value) and not (value is None and declared.optional):
+                raise ValueError(
+                    f"{label}: {field}: expected a real number or an array of real numbers, got {value!r}."
+                )
+        elif declared.kind in ("identity", "body"):
+            if not isinstance(value, str):
+                raise ValueError(f"{label}: {field} must be a name, got {value!r}.")
+        elif declared.kind == "bodies":
+            if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not value:
+                raise ValueError(f"{label}: {field} must be the name of a body or several names, got {value!r}.")
+        elif declared.kind == "choice":
+            if value not in declared.of:
+                raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")
+        elif declared.kind == "numbers":
+            if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+                raise ValueError(f"{label}: {field} must be numbers by name, got {value!r}.")
+            for key, number in value.items():
+                if not _is_number(number):
+                    raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
+        elif not isinstance(value, declared.of):
+            raise ValueError(f"{label}: {field} must be {declared.what}, got {value!r}.")
+
+
+def _is_number(value: Any) -> bool:
+    # Also what a transformation puts in place of an array.
+    return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
+
+
+def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
+    """Raise a `ValueError` for a number of the wrong shape or sign, one that is not finite, or a direction that is not
+    of unit length; also in the laws of a part.
+    """
+    for field, declared in declarations(type(part)).items():
+        value, shown = getattr(part, field), prefix + field
+        if declared.kind == "law":
+            if value is not None:
+                check_numbers(value, label, dimension, f"{shown}.")
+        elif declared.kind == "numbers":
+            for key, number in value.items():
+                if not np.all(np.isfinite(number)):
+                    raise ValueError(f"{label}: {prefix}{key} must be finite, got {np.asarray(number)}.")
+        elif declared.is_number and value is not None and not is_traced(value):
+            _check_number(declared, label, shown, np.asarray(value), dimension)
+
+
+def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
+    if declared.shape is not None:
+        shape = tuple(dimension if size == "d" else size for size in declared.shape)
+        if value.shape != shape:
+            raise ValueError(f"{label}: {shown} must have shape {shape}, got {value.shape}.")
+    if not np.isfinite(value).all():
+        raise ValueError(f"{label}: {shown} must be finite, got {value.tolist()}.")
+    sign = declared.sign
+    if sign == "nonzero" and (value == 0).any():
+        raise ValueError(f"{label}: {shown} must not be zero.")
+    if (sign == "positive" and (value <= 0).any()) or (sign == "non-negative" and (value < 0).any()):
+        raise ValueError(f"{label}: {shown} must be {sign}, got {value.tolist()}.")
+    if declared.is_direction or declared.is_attitude:
+        size = float(np.linalg.norm(value))
+        if abs(size - 1.0) <= _UNIT:
+            return
+        if declared.is_attitude:
+            raise ValueError(
+                f"{label}: {shown} must be unit Euler parameters (e0, e1, e2, e3), scalar first, got {value.tolist()} "
+                f"of length {size:.6g}; normalise them, or make them with rotations.from_axis_angle."
+            )
+        cure = "divide it by its length" if size > 0 else "give a direction"
+        raise ValueError(f"{label}: {shown} must be a unit vector, got {value.tolist()} of length {size:.6g}; {cure}.")
+
+
+# What others ask
+
+
+def anonymous(part: Any) -> Any:
+    """The part without the names that tell it from its siblings, and without the state that bodies are given with."""
+    declared = declarations(type(part))
+    out = object.__new__(type(part))
+    for field in part.__dataclass_fields__:
+        value, kind = getattr(part, field), declared[field].kind if field in declared else None
+        if kind in ("identity", "body"):
+            value = ""
+        elif kind == "bodies":
+            value = ("",) * len(value)
+        elif kind == "state":
+            value = None
+        elif kind == "law" and hasattr(value, "bodies"):
+            value = anonymous(value)
+        object.__setattr__(out, field, value)
+    return out
+
+
+def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Sign | None]]:
+    """For every number among a part's parameters: the keys that lead to it, the same keys without the names of
+    dictionaries, as users call it, and its sign.
+    """
+    declared = declarations(type(part))
+    for field in part.__dataclass_fields__:
+        own = declared.get(field)
+        if own is None or own.kind != "state":
+            yield from _paths(getattr(part, field), (field,), (field,), None if own is None else own.sign)
+
+
+def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], sign: Sign | None):
+    if eqx.is_inexact_array(value):
+        yield keys, shown, sign
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), None)
+    elif isinstance(value, eqx.Module):
+        for inner, name, inner_sign in paths(value):
+            yield (*keys, *inner), (*shown, *name), inner_sign
+
+
+def entry(value: Any, keys: tuple[str, ...]) -> Any:
+    """What stands at the end of some keys, of attributes and dictionaries."""
+    for key in keys:
+        value = value[key] if isinstance(value, dict) else getattr(value, key)
+    return value
