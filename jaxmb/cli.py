@@ -4,6 +4,7 @@ import argparse
 import ast
 import dataclasses
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -29,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     **Arguments:** `argv`: the words after `jaxmb`, default those of the process.
 
-    **Returns:** the exit code: 0, 1 if a simulation failed, or 2 for a name or number that does not fit, with a message
-    on stderr.
+    **Returns:** the exit code: 0; with a message on stderr 1 if a simulation failed or a file could not be written, 2
+    for a name or value that does not fit, and 130 after Ctrl-C.
     """
     arguments = _parser().parse_args(argv)
     import jax
@@ -38,9 +39,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     try:
         arguments.command(arguments)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         print(f"jaxmb: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt:
+        print("jaxmb: interrupted", file=sys.stderr)
+        return 130
     return 0
 
 
@@ -72,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
         "mechanism", nargs="+", help="a name from `jaxmb mechanisms`; after the word `formulations`, the cost of those"
     )
     report.add_argument("--tolerances", type=float, nargs="+", metavar="RTOL", help="default 1e-4 1e-6 1e-8 1e-10")
-    report.add_argument("--repeats", type=int, default=5, help="timed runs of each solver (default %(default)d)")
+    report.add_argument("--repeats", type=_count, default=5, help="timed runs of each solver (default %(default)d)")
     report.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
     report.add_argument("--out", type=Path, help="folder for the table and the figure (default jaxmb-output/NAME)")
     report.set_defaults(command=_report)
@@ -89,6 +93,12 @@ def _add_parameters(command: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="a keyword argument of the mechanism, such as units=2; may be given more than once",
     )
+
+
+def _count(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a number of at least 1, got {text!r}")
+    return int(text)
 
 
 def _assignment(text: str) -> tuple[str, object]:
@@ -116,6 +126,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .report import work_precision
     from .report.work_precision import default_solvers
 
+    _check_out(arguments)
     mechanism = _mechanism(arguments)
     print(f"{mechanism.name}: {mechanism.description}\n\n{mechanism.system}\n")
 
@@ -152,6 +163,7 @@ def _report(arguments: argparse.Namespace) -> None:
     if words:
         print(formulation_costs(_mechanism(arguments), repeats=arguments.repeats))
         return
+    _check_out(arguments)
     mechanism, out = _mechanism(arguments), _folder(arguments)
     _measure(mechanism, arguments, out)
     if not arguments.set:
@@ -183,7 +195,16 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
     """The mechanism, ending at `--t1` with the reference values up to there."""
     from . import mechanisms
 
-    mechanism = mechanisms.get(arguments.mechanism, **dict(arguments.set))
+    parameters = dict(arguments.set)
+    try:
+        mechanism = mechanisms.get(arguments.mechanism, **parameters)
+    except Exception as error:
+        if not parameters:
+            raise
+        # A value of the wrong type may fail anywhere in the mechanism.
+        given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
+        reason = str(error).split("\n")[0]
+        raise ValueError(f"{arguments.mechanism} cannot be built with --set {given}: {reason}") from error
     t1, known = arguments.t1, mechanism.references
     if t1 is None:
         return mechanism
@@ -235,31 +256,30 @@ def _compare(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
 
 
 def _fit(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
-    """Estimate the parameter that the motion feels most from a noisy sample of it."""
+    """Estimate the parameter to which the motion is most sensitive from a noisy sample of it."""
     import numpy as np
 
     from .studies.identify import identify
-    from .studies.quantities import places, quantity
-    from .system import RigidBodySystem, parameters
+    from .system import parameters
 
     system = mechanism.system
     saved = np.asarray(trajectory.ts)
     own = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
     ts = saved[own]
-    name = _most_felt(mechanism, ts)
+    name = _most_sensitive(mechanism, ts)
     if name is None:
         print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
         return
     random = np.random.default_rng(0)
     measured, sigma = {}, {}
-    for place in places(system):
-        exact = np.asarray(quantity(trajectory, place))[own]
+    for place in system.position_quantities():
+        exact = np.asarray(trajectory.quantity(place))[own]
         noise = _NOISE * np.ptp(exact)
         if noise > 0:
             measured[place] = exact + noise * random.standard_normal(exact.shape)
             sigma[place] = noise
     true = float(parameters(system)[name])
-    what = "positions" if isinstance(system, RigidBodySystem) else "coordinates"
+    what = "positions" if system.has_bodies else "coordinates"
     print(
         f"\nIdentifying {name} from {what} at {ts.size} times up to {ts[-1]:g} s, "
         f"with noise of {_NOISE:.1%} of their range, from a start {_START - 1:.0%} off:"
@@ -278,7 +298,7 @@ def _fit(mechanism: "Mechanism", trajectory: "Trajectory") -> None:
     print(f"{fit}\ntrue value {true:.6g}")
 
 
-def _most_felt(mechanism: "Mechanism", ts) -> str | None:
+def _most_sensitive(mechanism: "Mechanism", ts) -> str | None:
     """The scalar parameter, in relative terms, that moves positions or coordinates most; None if none does."""
     import diffrax
     import equinox as eqx
@@ -288,7 +308,6 @@ def _most_felt(mechanism: "Mechanism", ts) -> str | None:
 
     from .simulate import simulate
     from .states.assembly import assemble
-    from .studies.quantities import places, quantity
     from .system import parameters, with_parameters
 
     known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
@@ -303,23 +322,36 @@ def _most_felt(mechanism: "Mechanism", ts) -> str | None:
             start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
             adjoint = diffrax.ForwardMode()
             motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, adjoint=adjoint, throw=False)
-            return jnp.concatenate([quantity(motion, place).reshape(-1) for place in places(system)])
+            return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
 
         return jax.jacfwd(positions)(jnp.ones(len(known)))
 
-    felt = np.linalg.norm(sensitivities(mechanism.system, mechanism.state), axis=0)
+    moved = np.linalg.norm(sensitivities(mechanism.system, mechanism.state), axis=0)
     size = float(mechanism.system.length)
-    return list(known)[int(np.argmax(felt))] if np.max(felt) > 1e-6 * size else None
+    return list(known)[int(np.argmax(moved))] if np.max(moved) > 1e-6 * size else None
+
+
+def _out(arguments: argparse.Namespace) -> Path:
+    return Path("jaxmb-output") / arguments.mechanism if arguments.out is None else arguments.out
+
+
+def _check_out(arguments: argparse.Namespace) -> None:
+    """Raise a `ValueError`, before anything is computed, for a folder that cannot be written to."""
+    out = _out(arguments)
+    existing = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise ValueError(f"--out {out}: {existing} is a file and not a folder; give another folder.")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {out}: {existing} is not writable; give another folder.")
 
 
 def _folder(arguments: argparse.Namespace) -> Path:
-    out = Path("jaxmb-output") / arguments.mechanism if arguments.out is None else arguments.out
+    out = _out(arguments)
     out.mkdir(parents=True, exist_ok=True)
     return out
 
 
 def _write_figures(out: Path, precision, trajectory: "Trajectory | None") -> None:
-    from .system import RigidBodySystem
     from .viz import plot_mechanism, plot_motion
 
     try:
@@ -327,7 +359,7 @@ def _write_figures(out: Path, precision, trajectory: "Trajectory | None") -> Non
         written = [out / "work_precision.png"]
         if trajectory is not None:
             figures = {"motion.png": plot_motion(trajectory)}
-            if isinstance(trajectory.system, RigidBodySystem):
+            if trajectory.system.has_bodies:
                 figures["mechanism.png"] = plot_mechanism(trajectory)
             for name, figure in figures.items():
                 figure.savefig(out / name, dpi=150)

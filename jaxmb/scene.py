@@ -29,7 +29,7 @@ from .parts.servo import Servo
 from .parts.spatial.kinematics import SPACE
 from .states.structure import find_structure
 from .system import RigidBodySystem
-from .system.describe import Description
+from .system.description import Description
 from .system.equation import Ranks
 from .system.groups import (
     BodyGroup,

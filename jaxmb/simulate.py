@@ -10,27 +10,31 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from ._results import RESULTS
 from ._types import Scalar, State
-from .formulations import AbstractFormulation, BlockMultipliers, Multipliers, NullSpace, Partitioned
-from .formulations.formulation import stages
+from .formulations import AbstractFormulation
 from .linalg.arrays import as_array, is_traced
-from .linalg.elimination import full_pivot
-from .manifold import AbstractManifold, Baumgarte, BlockProjection, Free, Partition, Projection, project
-from .manifold.partition import Chart
-from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController
+from .manifold import AbstractManifold, default_manifold
+from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .system import AbstractSystem
-from .system.chain import is_long
+from .system.arguments import check_kind, real_array
 from .trajectory import Trajectory
 
 # Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
 _CHECKPOINTS = 4096
 _CHECKPOINT_BYTES = 2**28
 
-# A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
-_SINGULAR_PIVOT = 1e-3
+_KINDS: dict[str, tuple[type, str]] = {
+    "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
+    "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
+    "manifold": (AbstractManifold, "jaxmb.manifold.Partition()"),
+    "stepsize_controller": (diffrax.AbstractStepSizeController, "jaxmb.solvers.MultistepController(rtol, atol)"),
+    "adjoint": (diffrax.AbstractAdjoint, "diffrax.ForwardMode()"),
+    "event": (diffrax.Event, "diffrax.Event(function)"),
+    "progress_meter": (diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
+}
 
 
 def simulate(
@@ -68,17 +72,17 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. With `"auto"` it is
-        `Adams`, which finds out whether stability limits its steps instead of accuracy: `stats["stiff"]`, and in how
-        many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion found stiff is
-        simulated again, with `Hermite` from `t0` on; not under `jit`, `vmap` or `grad`.
-    - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is
+        `Adams`, which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how
+        many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion that is detected
+        to be stiff is simulated again from `t0` with `Hermite`; not under `jit`, `vmap` or `grad`.
+    - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
         `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular;
         `BlockMultipliers()` for long chains of joints.
-    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
-        `Projection()` for others, and nothing of either for a system without constraints; for `Adams` on a planar scene
-        with 30 or more constraint rows whose joints form a chain, `BlockProjection()`, whose cost grows with the number
-        of joints and not with its cube.
+    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
+        `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a planar scene
+        with 30 or more constraint rows whose joints form a chain the default is `BlockProjection()`, whose cost grows
+        with the number of joints and not with its cube.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
@@ -88,27 +92,27 @@ def simulate(
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` for tolerances out of range and combinations that cannot work; `RuntimeError`, if
-    `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the trajectory up to
-    there is kept.
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work;
+    `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
+    trajectory up to there is kept.
 
     Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
     ones. A mesh is made for the motion it follows: from a state of rest in equilibrium it is coarse, and derivatives
     there need a bound on the step, `stepsize_controller=MultistepController(rtol, atol, dtmax=...)`.
     """
-    state = jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
-    if state.q.shape != (system.nq,) or state.u.shape != (system.nu,):
-        raise ValueError(
-            f"The state must have {system.nq} coordinates and {system.nu} velocities, got {state.q.shape} and "
-            f"{state.u.shape}."
-        )
+    check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
+    state = _checked_state(system, state)
     # Numbers become arrays, so that other tolerances and times do not compile anew.
-    number = lambda x: as_array(x, state.q.dtype)
-    relative: Any = number(_checked_tolerance(rtol, atol, state.q.dtype))
-    absolute: Any = relative / 100 if atol is None else number(atol)
-    times = number(t0), number(t1), None if dt0 is None else number(dt0)
+    relative, absolute = _tolerances(rtol, atol, state)
+    options = _times(t0, t1, dt0, state.q.dtype)
+    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
     choice = solver
     solver = _named(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
+    given = (solver, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
+    for (name, (kind, example)), value in zip(_KINDS.items(), given, strict=True):
+        if value is not None:
+            check_kind(name, value, kind, f"an object such as {example}", "leave it out for the default")
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=relative, atol=absolute)
@@ -116,30 +120,23 @@ def simulate(
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-
-    points = _save_at(saveat)
-    interpolated = event is not None or (points.subs is not None and points.subs.ts is not None)
+    saved = _save_at(saveat)
+    interpolated = event is not None or (saved.subs is not None and saved.subs.ts is not None)
+    options |= {
+        "y0": state,
+        "saveat": _with_end(saved),
+        "stepsize_controller": stepsize_controller,
+        "adjoint": adjoint,
+        "event": event,
+        "max_steps": max_steps,
+        "progress_meter": diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+    }
 
     def motion(solver):
-        policy = _manifold(system, solver, formulation) if manifold is None else manifold
-        road = _formulation(system, policy) if formulation is None else formulation
-        term, prepared = policy.prepare(system, road, solver, relative)
-        return _integrate(
-            system,
-            road,
-            term,
-            prepared,
-            times,
-            state,
-            points,
-            stepsize_controller,
-            adjoint,
-            event,
-            max_steps,
-            meter,
-            restore=_way_back(policy, interpolated),
-        )
+        policy = default_manifold(system, solver, formulation) if manifold is None else manifold
+        method = policy.default_formulation(system) if formulation is None else formulation
+        term, prepared = policy.prepare(system, method, solver, relative)
+        return _integrate(system, method, policy, term, prepared, options, interpolated)
 
     trajectory, failed = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
@@ -160,53 +157,31 @@ def simulate(
     return trajectory.trimmed()
 
 
-def _manifold(system, solver, formulation) -> AbstractManifold:
-    if system.acceleration_rows == 0:
-        return Free()
-    if isinstance(solver, Adams) and (is_long(system) if formulation is None else not formulation.assembles):
-        return BlockProjection()
-    return Partition() if isinstance(solver, AbstractMultistep) else Projection()
-
-
-def _formulation(system, manifold) -> AbstractFormulation:
-    if isinstance(manifold, Partition):
-        return Partitioned()
-    if isinstance(manifold, BlockProjection) or (isinstance(manifold, Projection) and is_long(system)):
-        return BlockMultipliers()
-    return Multipliers() if system.regular else NullSpace()
-
-
 @eqx.filter_jit
-def _integrate(
-    system, formulation, term, solver, times, state, saveat, controller, adjoint, event, max_steps, meter, *, restore
-):
-    t0, t1, dt0 = times
-    solution: Any = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0,
-        t1,
-        dt0,
-        state,
-        saveat=_with_end(saveat),
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        event=event,
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=meter,
-    )
+def _integrate(system, formulation, manifold, term, solver, options, interpolated):
+    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
     ts, saved = solution.ts[0], solution.ys[0]
+    correction = manifold.correction(interpolated)
+    # `SaveAt(fn=...)` may save something else than states.
+    are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
+    if are_states and correction is not None:
+        saved = _corrected(system, ts, saved, correction)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
-    if isinstance(saved, State) and restore is not None:
-        saved = _restore(system, ts, saved, restore)
-    result = _diagnose(system, state, end, solution)
+    result = RESULTS.promote(solution.result)
+    start = options["y0"]
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
+    stuck = _failed(result)
+    result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
+    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck & finite)
+    stats = dict(solution.stats)
+    if isinstance(solver, AbstractMultistep):
+        stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
     trajectory = Trajectory(
         system=system,
         formulation=formulation,
         ts=ts,
         ys=saved,
-        stats=_statistics(solution),
+        stats=stats | manifold.statistics(solution.solver_state),
         result=result,
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
@@ -214,9 +189,22 @@ def _integrate(
     return trajectory, _failed(result)
 
 
+def _failed(result) -> Any:
+    return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+
+
+def _corrected(system, ts, saved, correction):
+    """Saved states, returned to the constraints; entries after the end of a run stay as they are."""
+    finite = jnp.isfinite(ts)
+    first = lambda y: jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
+    inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(first(y))), saved)
+    corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, 0.0), inside)
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved)
+
+
 def _named(name: str, state: State) -> Adams:
     if name not in ("auto", "switch"):
-        raise ValueError(f"A solver is an object, or one of the words 'auto' and 'switch'; got {name!r}.")
+        raise ValueError(f"solver must be an object, or one of the words 'auto' and 'switch'; got {name!r}.")
     if name == "switch" and is_traced(state):
         raise ValueError(
             "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
@@ -225,23 +213,24 @@ def _named(name: str, state: State) -> Adams:
     return Adams(stiffness="count" if name == "auto" else "stop")
 
 
-def _checked_tolerance(rtol: Any, atol: Any, dtype) -> Any:
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        if value is None or isinstance(value, Tracer):
-            continue
-        if not np.all(np.isfinite(value)) or np.any(np.asarray(value) < 0) or np.any(np.asarray(value) >= 1):
-            raise ValueError(f"{name} must be between 0 and 1, got {value}.")
+def _tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
+    dtype = state.q.dtype
     least = 10 * float(jnp.finfo(dtype).eps)
-    if isinstance(rtol, Tracer) or rtol >= least:
-        return rtol
-    if dtype == jnp.float32:
+    relative = real_array("rtol", rtol, dtype)
+    absolute = None if atol is None else real_array("atol", atol, dtype, ((), (state.q.size + state.u.size,)))
+    for name, value in (("rtol", relative), ("atol", absolute)):
+        if value is not None and not is_traced(value) and (np.any(value < 0) or np.any(value >= 1)):
+            raise ValueError(f"{name} must be between 0 and 1, got {value}.")
+    if not is_traced(relative) and relative < least:
+        if dtype != jnp.float32:
+            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
         warnings.warn(
             f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
             'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
             stacklevel=3,
         )
-        return least
-    raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
+        relative = as_array(least, dtype)
+    return relative, relative / 100 if absolute is None else absolute
 
 
 def _save_at(saveat) -> diffrax.SaveAt:
@@ -251,7 +240,7 @@ def _save_at(saveat) -> diffrax.SaveAt:
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
         return saveat
-    ts = as_array(saveat, jnp.result_type(float))
+    ts = real_array("saveat", saveat, jnp.result_type(float), None)
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
     return diffrax.SaveAt(ts=jax.device_put(ts))
@@ -265,82 +254,30 @@ def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     )
 
 
-def _way_back(manifold: AbstractManifold, interpolated: bool) -> Any:
-    """What saved states need: those between steps are not on the constraints, and free ones never are quite."""
-    if isinstance(manifold, Baumgarte):
-        # How far its states are off is what one looks for.
-        return _normalized
-    return _on_manifold if interpolated or isinstance(manifold, Free) else None
+def _checked_state(system: AbstractSystem, state: Any) -> State:
+    cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u)"
+    # A concrete class: a state is nothing but its two fields.
+    check_kind("state", state, State, "a jaxmb.State", cure)
+    for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu)):
+        if np.result_type(getattr(value, "dtype", type(value))).kind not in "fiub":
+            raise ValueError(f"state.{name} must be an array of real numbers, got {value!r}; {cure}.")
+        if np.shape(value) != (size,):
+            raise ValueError(
+                f"The state must have {system.nq} coordinates and {system.nu} velocities, got state.{name} of shape "
+                f"{np.shape(value)}."
+            )
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
 
 
-def _restore(system, ts, saved, back):
-    """Bring states back to where they belong; entries after the end of a run stay as they are."""
-    finite = jnp.isfinite(ts)
-    inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(_first(y))), saved)
-    restored = jax.vmap(lambda t, y: back(system, t, y))(jnp.where(finite, ts, 0.0), inside)
-    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), restored, saved)
-
-
-def _first(y):
-    return jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
-
-
-def _normalized(system, t, y):
-    del t
-    return State(system.normalize(y.q), y.u)
-
-
-def _on_manifold(system, t, y):
-    return project(system, t, _normalized(system, t, y))
-
-
-def _diagnose(system, start, end, solution):
-    """Diffrax's outcome, made precise where mechanics knows more."""
-    result = RESULTS.promote(solution.result)
-    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
-    stuck = _failed(result)
-    result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
-    if system.velocity_rows == 0 or not isinstance(_chart(solution), Chart):
-        return result
-    stuck = stuck & finite
-    t, y = lax.stop_gradient(end)
-    system = lax.stop_gradient(system)
-
-    def smallest_pivot():
-        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
-        return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
-
-    pivot = lax.cond(stuck, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
-    singular = stuck & ((pivot < _SINGULAR_PIVOT) | _chart(solution).singular)
-    result = RESULTS.where(singular, RESULTS.singular_configuration, result)
-    newton = stuck & ~singular & (solution.result == diffrax.RESULTS.dt_min_reached)
-    return RESULTS.where(newton, RESULTS.newton_failed, result)
-
-
-def _failed(result) -> Any:
-    return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
-
-
-def _chart(solution) -> Any:
-    return getattr(solution.solver_state, "chart", None)
-
-
-def _statistics(solution) -> dict[str, Array]:
-    stats = dict(solution.stats)
-    state = solution.solver_state
-    if isinstance(state, AdamsState):
-        stats["num_evaluations"] = state.tally[0] + 2 * stats["num_steps"]
-        stats["orders"] = state.tally[1:]
-        if state.stiffness is not None:
-            stats["stiff"], stats["stiff_steps"] = state.stiffness.found, state.stiffness.steps
-    if isinstance(state, HermiteState):
-        is_own = lambda leaf: isinstance(leaf, ControllerState)
-        controllers = filter(is_own, jax.tree.leaves(solution.controller_state, is_leaf=is_own))
-        work = state.work + sum(controller.wasted for controller in controllers)
-        stats["num_evaluations"], stats["num_matrices"] = state.tally[0] + work[0], work[1]
-        stats["points"] = state.tally[1:]
-    chart = _chart(solution)
-    if isinstance(chart, Chart):
-        stats["newton_iterations"] = chart.newton
-        stats["charts"] = chart.charts
-    return stats
+def _times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
+    start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
+    if not is_traced(start) and not np.isfinite(start):
+        raise ValueError(f"t0 must be finite, got {t0}.")
+    if dt0 is None:
+        return {"t0": start, "t1": end, "dt0": None}
+    step = real_array("dt0", dt0, dtype)
+    if not is_traced((start, end, step)) and not (np.isfinite(step) and step * (1 if end >= start else -1) > 0):
+        raise ValueError(
+            f"dt0 must be a finite step from t0 = {t0} towards t1 = {t1}, got {dt0}; leave it out for the default."
+        )
+    return {"t0": start, "t1": end, "dt0": step}

@@ -15,10 +15,9 @@ from jaxtyping import Array, ArrayLike, Float
 from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
-from .manifold import project
+from .manifold import project_normalized
 from .parts.names import unknown
-from .system import RigidBodySystem
-from .system.reactions import Reaction, applied_force, constraint_force, force_names, joint_names, reaction
+from .system import Reaction
 
 
 class ConstraintViolation(NamedTuple):
@@ -28,23 +27,8 @@ class ConstraintViolation(NamedTuple):
     velocity: Float[Array, "times"]
 
 
-class BodyMotion(NamedTuple):
-    """Motion of one body; axis 0 is time.
-
-    **Fields:** `position` [m] of the mass centre and `velocity` [m/s], world axes, shape (times, 2) or (times, 3); in
-    the plane `angle` [rad] and `angular_velocity` [rad/s], shape (times,); in space `orientation` (Euler parameters,
-    (times, 4)) and `angular_velocity` [rad/s] in the body frame, (times, 3). A point mass has no attitude: None.
-    """
-
-    position: Array
-    velocity: Array
-    angle: Array | None
-    orientation: Array | None
-    angular_velocity: Array | None
-
-
 class _ByName(Mapping[str, Any]):
-    """Something of each part by name, worked out when asked for."""
+    """A lazy mapping from the names of parts to values."""
 
     def __init__(self, kind: str, names: tuple[str, ...], value: Callable[[str], Any]):
         self._kind, self._names, self._value = kind, names, value
@@ -62,14 +46,14 @@ class _ByName(Mapping[str, Any]):
 
 
 class Trajectory(eqx.Module):
-    """What `simulate` returns.
+    """The motion that `simulate` returns.
 
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
-    `num_evaluations` of f with its time derivative, `num_matrices` made, and `points`: accepted steps with 1, 2, …
-    points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, and of a
-    system with coordinates of the user's that of a coordinate, shape (times,).
+    `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
+    … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
+    `BodyMotion`; of a system in generalized coordinates it is that of a coordinate, shape (times,).
     """
 
     system: Any
@@ -81,25 +65,20 @@ class Trajectory(eqx.Module):
     interpolation: diffrax.AbstractPath | None
     event_mask: Any
 
-    def __getitem__(self, body: str) -> Any:
-        system = self.system
-        if not isinstance(system, RigidBodySystem):
-            names = system.coordinate_names()
-            if body not in names:
-                raise unknown("coordinate", body, names)
-            return self.ys.q[:, names[body][0]]
-        if body not in system.body_names:
-            raise unknown("body", body, system.body_names)
-        k = system.body_names.index(body)
-        d = system.layout.space.dimension
-        # Entries of a body follow one another.
-        i, j = int(system.layout.pose_index[k][0]), int(system.layout.velocity_index[k][0])
-        position, velocity = self.ys.q[:, i : i + d], self.ys.u[:, j : j + d]
-        if not system.layout.rotates[k]:
-            return BodyMotion(position, velocity, None, None, None)
-        if d == 2:
-            return BodyMotion(position, velocity, self.ys.q[:, i + 2], None, self.ys.u[:, j + 2])
-        return BodyMotion(position, velocity, None, self.ys.q[:, i + 3 : i + 7], self.ys.u[:, j + 3 : j + 6])
+    def __getitem__(self, name: str) -> Any:
+        names = self.system.motion_names()
+        if name not in names:
+            raise unknown("body" if self.system.has_bodies else "coordinate", name, names)
+        return self.system.motion(name, self.ys)
+
+    def quantity(self, name: str) -> Array:
+        """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` of a body, `"A.force"` of a
+        joint; in generalized coordinates `"theta"`, `"theta.rate"`, and `"A.force"` of a constraint.
+        """
+        known = self.system.quantities()
+        if name not in known:
+            raise unknown("quantity", name, known)
+        return known[name].value(self.ts, self.ys, self.multipliers if known[name].of_forces else None)
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints."""
@@ -144,10 +123,9 @@ class Trajectory(eqx.Module):
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
 
     @property
-    @eqx.filter_jit
     def rates(self) -> Float[Array, "times nq"]:
         """q̇ of every coordinate."""
-        return jax.vmap(lambda t, y: self.system.rates(t, y.q, y.u))(self.ts, self.ys)
+        return self.system.rates_along(self.ts, self.ys)
 
     @property
     def accelerations(self) -> Float[Array, "times nu"]:
@@ -167,28 +145,22 @@ class Trajectory(eqx.Module):
     @property
     def reactions(self) -> Mapping[str, Reaction]:
         """Forces of the joints of rigid bodies by name: `reactions["A"].force`."""
-        if not isinstance(self.system, RigidBodySystem):
-            raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
-        return self._by_constraint(reaction)
+        value = lambda name: self.system.reaction(name, self.ts, self.ys, self.multipliers)
+        return _ByName("joint", self.system.joint_names(), value)
 
     @property
     def constraint_forces(self) -> Mapping[str, Array]:
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
-        return self._by_constraint(constraint_force)
-
-    def _by_constraint(self, what):
-        value = lambda name: _of_constraint(what, self.system, name, self.ts, self.ys, self.multipliers)
-        return _ByName("joint", joint_names(self.system), value)
+        value = lambda name: self.system.generalized_constraint_force(name, self.ts, self.ys, self.multipliers)
+        return _ByName("joint", self.system.constraint_names(), value)
 
     @property
     def forces(self) -> Mapping[str, Array]:
         """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
         (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
         """
-        if not isinstance(self.system, RigidBodySystem):
-            raise ValueError("forces are of parts that act on bodies; this system has none.")
-        value = lambda name: _of_force(self.system, name, self.ts, self.ys)
-        return _ByName("force", force_names(self.system), value)
+        value = lambda name: self.system.applied_wrenches(name, self.ts, self.ys)
+        return _ByName("force", self.system.force_names(), value)
 
     @property
     @eqx.filter_jit
@@ -216,13 +188,9 @@ class Trajectory(eqx.Module):
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
-        if isinstance(self.system, RigidBodySystem):
-            for body in self.system.body_names:
-                for field, value in self[body]._asdict().items():
-                    if value is not None:
-                        out[f"{body}.{field}"] = np.asarray(value)
-        else:
-            out |= {name: np.asarray(self[name]) for name in self.system.coordinate_names()}
+        for name, quantity in self.system.quantities().items():
+            if not quantity.of_forces:
+                out[name] = np.asarray(quantity.value(self.ts, self.ys, None))
         out["energy"] = np.asarray(self.energy)
         for name, value in self.stats.items():
             if value is not None:
@@ -235,22 +203,8 @@ class Trajectory(eqx.Module):
 
 
 @eqx.filter_jit
-def _of_constraint(what, system, name, ts, ys, multipliers):
-    return jax.vmap(lambda t, y, own: what(system, name, t, y, own))(ts, ys, multipliers)
-
-
-@eqx.filter_jit
-def _of_force(system, name, ts, ys):
-    return jax.vmap(lambda t, y: applied_force(system, name, t, y))(ts, ys)
-
-
-@eqx.filter_jit
 def _between(system, interpolation, ts):
-    def single(t):
-        y = interpolation.evaluate(t)
-        return project(system, t, State(system.normalize(y.q), y.u))
-
-    return jax.vmap(single)(ts)
+    return jax.vmap(lambda t: project_normalized(system, t, interpolation.evaluate(t)))(ts)
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:

@@ -244,3 +244,109 @@ def test_lock_up_ends_with_its_own_result():
     assert float(jnp.max(short.constraint_violation.position)) < 1e-10
     with pytest.raises(RuntimeError, match="singular configuration"):
         turn(0.2361, throw=True)
+
+
+# Arguments of `simulate` that are refused before anything is compiled: the argument is named, and the cure.
+ARGUMENTS = {
+    "class of a solver": (
+        {"solver": mb.solvers.Adams},
+        r"solver must be an object .*Adams\(\).*the class Adams",
+    ),
+    "solver by a name": ({"solver": "adams"}, "solver must be an object, or one of the words 'auto' and 'switch'"),
+    "number as a solver": ({"solver": 3}, "solver must be .*got 3"),
+    "name of a manifold": ({"manifold": "partition"}, r"manifold must be .*Partition\(\), got 'partition'"),
+    "class of a manifold": ({"manifold": mb.manifold.Partition}, "manifold must be .*the class Partition"),
+    "solver as a manifold": ({"manifold": mb.solvers.Adams()}, "manifold must be .*got an object of type Adams"),
+    "name of a formulation": ({"formulation": "multipliers"}, r"formulation must be .*Multipliers\(\), got"),
+    "class of a formulation": (
+        {"formulation": mb.formulations.Multipliers},
+        "formulation must be .*the class",
+    ),
+    "controller": ({"stepsize_controller": 1e-6}, "stepsize_controller must be .*MultistepController"),
+    "adjoint": ({"adjoint": "forward"}, "adjoint must be .*ForwardMode"),
+    "event": ({"event": lambda t, y, args, **kwargs: t - 1.0}, "event must be .*diffrax.Event"),
+    "progress meter": ({"progress_meter": True}, "progress_meter must be .*got True"),
+    "no bound of steps": ({"max_steps": None}, "max_steps must be an integer of at least 1, got None"),
+    "no steps": ({"max_steps": 0}, "max_steps must be an integer of at least 1, got 0"),
+    "half a step": ({"max_steps": 1.5}, "max_steps must be an integer of at least 1, got 1.5"),
+    "first step of zero": ({"dt0": 0.0}, "dt0 must be a finite step from t0 = 0.0 towards t1 = 0.1.*leave it out"),
+    "first step back": ({"dt0": -1e-3}, "dt0 must be a finite step"),
+    "first step forward in time that runs back": ({"dt0": 1e-3, "t1": -1.0}, "dt0 must be a finite step"),
+    "endless first step": ({"dt0": np.inf}, "dt0 must be a finite step"),
+    "first step in words": ({"dt0": "small"}, "dt0 must be a real number, got 'small'"),
+    "no end": ({"t1": None}, "t1 must be a real number, got None"),
+    "NaN as the end": ({"t1": np.nan}, "t1 must not be NaN"),
+    "end in words": ({"t1": "10"}, "t1 must be a real number, got '10'"),
+    "two ends": ({"t1": [1.0, 2.0]}, "t1 must be a real number"),
+    "NaN as the start": ({"t0": np.nan}, "t0 must not be NaN"),
+    "endless past": ({"t0": -np.inf}, "t0 must be finite"),
+    "complex start": ({"t0": 1j}, "t0 must be a real number"),
+    "tolerance in words": ({"rtol": "1e-6"}, "rtol must be a real number"),
+    "no tolerance": ({"rtol": None}, "rtol must be a real number, got None"),
+    "tolerances of the wrong number": (
+        {"atol": [1e-6, 1e-6]},
+        r"atol must be .* an array of shape \(6,\)",
+    ),
+    "negative tolerance": ({"atol": -1e-6}, "atol must be between 0 and 1"),
+    "times in words": ({"saveat": "all"}, "saveat must be an array of real numbers, got 'all'"),
+    "times in a list of words": ({"saveat": ["0", "1"]}, "saveat must be an array of real numbers"),
+    "one time": ({"saveat": 0.05}, "saveat must be a vector of times"),
+    "no times": ({"saveat": []}, "saveat must be a vector of times"),
+    "NaN among the times": ({"saveat": [0.0, np.nan]}, "saveat must not be NaN"),
+    "no state": ({"state": None}, "state must be a jaxmb.State, got None; jaxmb.assemble"),
+    "state in words": ({"state": "rest"}, "state must be a jaxmb.State, got 'rest'"),
+    "state as a pair": ({"state": (np.zeros(3), np.zeros(3))}, "state must be a jaxmb.State, got"),
+    "empty state": ({"state": mb.State(None, None)}, "state.q must be an array of real numbers, got None"),
+    "complex state": ({"state": mb.State(np.zeros(3) + 0j, np.zeros(3))}, "state.q must be an array of real numbers"),
+    "system in words": ({"system": "pendulum"}, "system must be a compiled system, got 'pendulum'"),
+    "no system": ({"system": None}, "system must be a compiled system, got None"),
+    "scene that is not compiled": (
+        {"system": mb.Scene([bar()])},
+        r"system must be a compiled.*scene.compile\(\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ARGUMENTS)
+def test_arguments_of_simulate(pendulum, case):
+    changes, message = ARGUMENTS[case]
+    arguments = {"system": pendulum, "state": pendulum.guess, "t1": 0.1} | changes
+    with pytest.raises(ValueError, match=message) as refused:
+        mb.simulate(arguments.pop("system"), arguments.pop("state"), **arguments)
+    assert "\n" not in str(refused.value)
+
+
+NAMES = {
+    "an argument of numpy.savez": ("file", "'file' is something else"),
+    "a column of the motion": ("energy", "'energy' is something else"),
+    "a path": ("../x", "'../x' cannot be saved.*slashes"),
+    "a folder": ("a/b", "'a/b' cannot be saved"),
+    "a path of Windows": ("a\\b", "cannot be saved"),
+    "a drive": ("c:", "'c:' cannot be saved"),
+    "hidden": (".x", "'.x' cannot be saved"),
+    "empty": ("", "a string that is not empty, got ''"),
+    "number": (1, "a string that is not empty, got 1"),
+    "none": (None, "a string that is not empty, got None"),
+    "list": (["x"], "a string that is not empty"),
+}
+
+
+@pytest.mark.parametrize("case", NAMES)
+def test_names_of_coordinates(case):
+    name, message = NAMES[case]
+    with pytest.raises(ValueError, match=message):
+        mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0, 2.0], coordinates=("y", name))
+
+
+def test_what_only_bodies_have():
+    system = mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0])
+    motion = mb.simulate(system, system.guess, t1=0.1)
+    with pytest.raises(ValueError, match="this system has constraint_forces"):
+        _ = motion.reactions
+    with pytest.raises(ValueError, match="this system has none"):
+        _ = motion.forces
+    for name in ("linear_momentum", "angular_momentum"):
+        with pytest.raises(ValueError, match="Momentum is that of bodies"):
+            getattr(motion, name)
+    with pytest.raises(ValueError, match=r"Unknown quantity 'q0.rat'; did you mean 'q0.rate'"):
+        motion.quantity("q0.rat")

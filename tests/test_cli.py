@@ -39,7 +39,13 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "default_solvers", lambda: {"Dopri8": diffrax.Dopri8()})
     assert main(["run", "roller_racer", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    for text in ("Frame", "no constraints", "DOP853", "Identifying handle from coordinates", "true value 0.2"):
+    for text in (
+        "QuasiVelocityFrame",
+        "no constraints",
+        "DOP853",
+        "Identifying handle from coordinates",
+        "true value 0.2",
+    ):
         assert text in out
     assert mb.load(tmp_path / "motion.npz")["theta"][-1] == pytest.approx(6.2350455697, abs=1e-6)
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
@@ -71,11 +77,42 @@ def test_report(capsys, tmp_path, monkeypatch):
         (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
         (["report", "costs", "pendulum"], "got 'costs' before it"),
         (["run", "pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
+        (["run", "pendulum", "--set", "mass=heavy"], "pendulum cannot be built with --set mass='heavy'"),
+        (["run", "pendulum", "--set", "mass=[1, 2]"], "pendulum cannot be built with --set mass=[1, 2]"),
+        (["report", "n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
+        (["report", "train", "--set", "n={}"], "train cannot be built with --set n={}"),
     ],
 )
 def test_wrong_words(words, message, capsys, tmp_path):
     assert main([*words, "--out", str(tmp_path)]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_no_traceback_of_wrong_values(capsys, tmp_path):
+    """One line, whatever the mechanism did with the value."""
+    assert main(["run", "four_bar", "--set", "speed=fast", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_where_to_write_is_checked_first(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(mb.mechanisms, "get", lambda *args, **kwargs: pytest.fail("built before the check"))
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    for out in (taken, taken / "deeper"):
+        assert main(["run", "pendulum", "--out", str(out)]) == 2
+        assert "is a file and not a folder" in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda *args: False)
+    assert main(["report", "pendulum", "--out", str(tmp_path / "new")]) == 2
+    assert "is not writable" in capsys.readouterr().err
+
+
+def test_interrupted(capsys, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mb.mechanisms, "get", interrupt)
+    assert main(["run", "pendulum"]) == 130
+    assert capsys.readouterr().err == "jaxmb: interrupted\n"
 
 
 def test_no_command(capsys):

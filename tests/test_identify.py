@@ -13,7 +13,6 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
 from jaxmb.studies.minimise import levenberg_marquardt
-from jaxmb.studies.quantities import quantities, quantity
 from jaxmb.studies.ranges import free_parameters
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
@@ -104,8 +103,8 @@ def test_lengths_with_the_state_assembled_anew(system):
 
 
 def test_everything_listed_can_be_measured(system, motion):
-    for name, shape in quantities(system, TS.size).items():
-        assert eqx.filter_eval_shape(quantity, motion, name).shape == shape
+    for name, own in system.quantities().items():
+        assert eqx.filter_eval_shape(mb.Trajectory.quantity, motion, name).shape == (TS.size, *own.shape)
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +130,8 @@ def test_lagrangian_system(swing):
     np.testing.assert_allclose(fit.parameters["length"], 0.8, rtol=1e-6)
     np.testing.assert_allclose(fit.parameters["damping"], 0.3, rtol=1e-5)
     np.testing.assert_allclose([fit.state.q[0], fit.state.u[0]], [0.5, 1.0])
-    for name, shape in quantities(swing, TS.size).items():
-        assert quantity(motion, name).shape == shape
+    for name, own in swing.quantities().items():
+        assert motion.quantity(name).shape == (TS.size, *own.shape)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,15 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import mechanisms
-from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Nonholonomic, Pfaffian, Servo, Viscous
-from jaxmb.studies.quantities import quantities, quantity
+from jaxmb.lagrangian import (
+    Holonomic,
+    LagrangianSystem,
+    Nonholonomic,
+    Pfaffian,
+    QuasiVelocityFrame,
+    ServoConstraint,
+    Viscous,
+)
 
 TS = jnp.linspace(0.0, 1.0, 5)
 
@@ -36,7 +43,7 @@ def built(**changes):
     arguments = {
         "kinetic": kinetic,
         "potential": potential,
-        "constraints": [Holonomic("rod", rod), Servo("hold", off, 1.0, 1.0)],
+        "constraints": [Holonomic("rod", rod), ServoConstraint("hold", off, 1.0, 1.0)],
         "nonideal": [Viscous("rod", "c")],
         "q": [0.6, -0.8, 0.1],
         "coordinates": ("x", "y", "z"),
@@ -59,7 +66,7 @@ def system():
 @pytest.fixture(scope="module")
 def framed():
     """The same mass on its circle, by quasi-velocities."""
-    return built(constraints=[], nonideal=[], kinematics=Frame(turning, 2), u=[1.0, 0.5])
+    return built(constraints=[], nonideal=[], kinematics=QuasiVelocityFrame(turning, 2), u=[1.0, 0.5])
 
 
 @pytest.fixture(scope="module")
@@ -151,15 +158,15 @@ def test_description(system, framed):
         "3 coordinates: x, y, z",
         "2, of which 2 independent (1 between accelerations only)",
         "degrees of freedom  2",
-        "Holonomic  rod   1 row",
-        "Servo      hold  1 row",
+        "Holonomic        rod   1 row",
+        "ServoConstraint  hold  1 row",
         "Viscous  rod",
         "diagonal mass matrix",
     ):
         assert words in text
     assert "holonomic only" not in text
     assert "<b>constraints</b>" in system._repr_html_()
-    assert "2, of a Frame" in str(framed) and "no constraints" in str(framed)
+    assert "2, of a QuasiVelocityFrame" in str(framed) and "no constraints" in str(framed)
 
 
 def test_rates_are_those_of_the_coordinates(framed, motion):
@@ -199,5 +206,5 @@ def test_projection_keeps_wheels_from_slipping():
     np.testing.assert_allclose(projected.ys.q, expected.ys.q, rtol=0, atol=1e-7)
     np.testing.assert_allclose(projected.ys.u, expected.rates, rtol=0, atol=1e-7)
     assert np.max(projected.constraint_violation.velocity) <= 1e-12
-    for name, shape in quantities(held.system, 1).items():
-        assert eqx.filter_eval_shape(quantity, projected, name).shape == shape
+    for name, own in held.system.quantities().items():
+        assert eqx.filter_eval_shape(mb.Trajectory.quantity, projected, name).shape == (1, *own.shape)

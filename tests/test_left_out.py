@@ -123,7 +123,7 @@ def test_scleronomic_scene_has_no_time_derivative():
     drive = planar.Driver("drive", "ground", "body", quantity="angle", motion=turn, parameters={"rate": 1.0})
     still = mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin]).compile()
     driven = mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin, drive]).compile()
-    assert still.homogeneous and not driven.homogeneous
+    assert still.drift_free and not driven.drift_free
     assert program(still)["exp"] < program(driven)["exp"]
     assert "scleronomic: no derivative with respect to time" in str(still)
     assert "scleronomic" not in str(driven)

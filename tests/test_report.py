@@ -96,7 +96,7 @@ def test_evaluations_are_those_that_happen(solver):
     jax.effects_barrier()
     stats = dict(solution.stats)
     if isinstance(solver, Adams):
-        stats["num_evaluations"] = solution.solver_state.tally[0] + 2 * stats["num_steps"]
+        stats["num_evaluations"] = solution.solver_state.step_counts[0] + 2 * stats["num_steps"]
     uncounted = 0 if isinstance(solver, Adams) else 2
     assert 0 <= count - evaluations(solver, stats) <= uncounted
 

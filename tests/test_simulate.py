@@ -281,3 +281,25 @@ def test_derivatives_with_baumgarte():
     value = lambda x: forward_and_value(x[None], 1e-12)[1][0]
     central = [(value(start + h * e) - value(start - h * e)) / (2 * h) for e in np.eye(2)]
     np.testing.assert_allclose(forward, central, rtol=1e-5)
+
+
+def test_a_system_without_bodies_has_the_same_views(tmp_path):
+    """A train in relative coordinates is neither a scene nor a Lagrangian system."""
+    train = mb.mechanisms.longitudinal_train(n=3)
+    system = train.system
+    motion = mb.simulate(system, train.state, t1=0.2, rtol=1e-6, saveat=[0.0, 0.1, 0.2])
+    for name, own in system.quantities().items():
+        assert motion.quantity(name).shape == (3, *own.shape)
+    np.testing.assert_array_equal(motion["y1"], motion.ys.q[:, 1])
+    np.testing.assert_array_equal(motion.quantity("x1.rate"), motion.ys.u[:, 0])
+    assert system.position_quantities() == ("x1", "y1", "y2")
+    assert {"car1.mass", "car3.mass"} <= system.positive_parameters() <= set(mb.parameters(system))
+    motion.save(tmp_path / "motion.npz")
+    assert {"x1", "y2", "energy"} <= set(mb.load(tmp_path / "motion.npz"))
+    assert "3 vehicles" in str(system) and "no constraints" in system._repr_html_()
+    with pytest.raises(ValueError, match="Unknown coordinate 'y3'"):
+        motion["y3"]
+    with pytest.raises(ValueError, match="has none; plot_motion"):
+        mb.viz.plot_mechanism(motion)
+    coordinates = mb.viz.plot_motion(motion).axes[0]
+    assert [line.get_label() for line in coordinates.lines] == ["x1", "y1", "y2"]

@@ -71,7 +71,7 @@ def stages(system: AbstractSystem) -> Array:
 
 def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None:
     """Raise a `ValueError` for a formulation that needs the inverse of a mass matrix that is singular."""
-    if formulation.inverts_mass and not system.regular:
+    if formulation.inverts_mass and not system.positive_definite_mass:
         raise ValueError(
             f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these "
             "velocities. Use Partitioned(), NullSpace(), or UdwadiaKalaba('singular_mass')."

@@ -1,24 +1,26 @@
-"""Systems from a Lagrangian, in coordinates and velocities of the user's choice."""
+"""Systems from a Lagrangian, in any generalized coordinates and velocities."""
 
 from .constraints import (
+    AbstractCoordinateConstraint as AbstractCoordinateConstraint,
     AccelerationConstraint as AccelerationConstraint,
     Holonomic as Holonomic,
     Nonholonomic as Nonholonomic,
     Pfaffian as Pfaffian,
-    Servo as Servo,
+    ServoConstraint as ServoConstraint,
 )
-from .equations import AbstractEquations as AbstractEquations, Projected as Projected
+from .equations import Projected as Projected
 from .hamel import Hamel as Hamel, pivoted_frame as pivoted_frame, structure_functions as structure_functions
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,
     Connection as Connection,
-    Frame as Frame,
+    QuasiVelocityFrame as QuasiVelocityFrame,
     Rates as Rates,
 )
+from .model import AbstractEquations as AbstractEquations
 from .nonideal import (
-    AbstractNonIdeal as AbstractNonIdeal,
-    Friction as Friction,
-    NonIdeal as NonIdeal,
+    AbstractNonIdealForce as AbstractNonIdealForce,
+    CoulombFriction as CoulombFriction,
+    NonIdealForce as NonIdealForce,
     Viscous as Viscous,
 )
 from .quasi import (

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -19,39 +19,71 @@ else:
     from equinox import AbstractVar
 
 
-class AbstractConstraint(eqx.Module):
-    """Some rows of constraint equations, with a name."""
+class AbstractCoordinateConstraint(eqx.Module):
+    """Some rows of constraint equations in generalized coordinates, with a name.
+
+    `level` says what the rows bind: 0 for positions, 1 for velocities, 2 for accelerations.
+    """
 
     name: AbstractVar[str]
+    level: AbstractVar[int]
 
     @abc.abstractmethod
-    def __call__(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"], parameters: Parameters) -> Array:
-        """What vanishes, shape (rows,); of a constraint between positions `v` is not used."""
+    def value(
+        self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"], a: Float[Array, "nq"], parameters: Parameters
+    ) -> Float[Array, "rows"]:
+        """The residual, with `v = q̇` and `a = q̈`; derivatives above the constraint's level are not used."""
+
+    @abc.abstractmethod
+    def is_linear(self, q: Float[Array, "nq"], parameters: Parameters) -> bool:
+        """Whether the rows are linear in velocities up to a term without them; of a constraint between accelerations
+        always true.
+        """
+
+    @abc.abstractmethod
+    def is_drift_free(self, q: Float[Array, "nq"], parameters: Parameters) -> bool:
+        """Whether the rows between velocities vanish at rest; of a constraint between accelerations always true."""
 
 
-class Holonomic(AbstractConstraint):
+class Holonomic(AbstractCoordinateConstraint):
     """A constraint between positions, `residual(t, q, parameters) = 0`, shape (rows,); twice differentiable."""
 
     name: str = eqx.field(static=True)
     residual: Callable[..., Array] = eqx.field(static=True)
+    level: ClassVar[int] = 0
 
-    def __call__(self, t, q, v, parameters):
+    def value(self, t, q, v, a, parameters):
         return jnp.ravel(self.residual(t, q, parameters))
 
+    def is_linear(self, q, parameters):
+        return True
 
-class Nonholonomic(AbstractConstraint):
+    def is_drift_free(self, q, parameters):
+        t = jnp.zeros((), q.dtype)
+        return not depends(lambda t, q, p: self.value(t, q, q, q, p), (t, q, parameters), 0)
+
+
+class Nonholonomic(AbstractCoordinateConstraint):
     """A constraint between velocities, linear in them or not, `residual(t, q, v, parameters) = 0` with `v = q̇`, shape
     (rows,).
     """
 
     name: str = eqx.field(static=True)
     residual: Callable[..., Array] = eqx.field(static=True)
+    level: ClassVar[int] = 1
 
-    def __call__(self, t, q, v, parameters):
+    def value(self, t, q, v, a, parameters):
         return jnp.ravel(self.residual(t, q, v, parameters))
 
+    def is_linear(self, q, parameters):
+        return _is_linear(self, q, parameters)
 
-class Pfaffian(AbstractConstraint):
+    def is_drift_free(self, q, parameters):
+        # A function does not say so.
+        return False
+
+
+class Pfaffian(AbstractCoordinateConstraint):
     """A constraint linear in velocities, `matrix(t, q, parameters) q̇ + drift(t, q, parameters) = 0`.
 
     **Arguments:** `matrix`: shape (rows, nq); `drift`: shape (rows,), default zero.
@@ -60,13 +92,20 @@ class Pfaffian(AbstractConstraint):
     name: str = eqx.field(static=True)
     matrix: Callable[..., Array] = eqx.field(static=True)
     drift: Callable[..., Array] | None = eqx.field(static=True, default=None)
+    level: ClassVar[int] = 1
 
-    def __call__(self, t, q, v, parameters):
+    def value(self, t, q, v, a, parameters):
         out = jnp.atleast_2d(self.matrix(t, q, parameters)) @ v
         return out if self.drift is None else out + jnp.ravel(self.drift(t, q, parameters))
 
+    def is_linear(self, q, parameters):
+        return True
 
-class AccelerationConstraint(eqx.Module):
+    def is_drift_free(self, q, parameters):
+        return self.drift is None
+
+
+class AccelerationConstraint(AbstractCoordinateConstraint):
     """A constraint between accelerations, `matrix(t, q, v, parameters) q̈ = right(t, q, v, parameters)`.
 
     Nothing keeps the motion on a relation that such a constraint is a derivative of: it is what its rows say.
@@ -77,14 +116,20 @@ class AccelerationConstraint(eqx.Module):
     name: str = eqx.field(static=True)
     matrix: Callable[..., Array] = eqx.field(static=True)
     right: Callable[..., Array] = eqx.field(static=True)
+    level: ClassVar[int] = 2
 
-    def residual(self, t: Scalar, q: Array, v: Array, a: Array, parameters: Parameters) -> Array:
-        """`matrix q̈ − right` at accelerations `a`, shape (rows,)."""
+    def value(self, t, q, v, a, parameters):
         matrix = jnp.atleast_2d(self.matrix(t, q, v, parameters))
         return matrix @ a - jnp.ravel(self.right(t, q, v, parameters))
 
+    def is_linear(self, q, parameters):
+        return True
 
-class Servo(eqx.Module):
+    def is_drift_free(self, q, parameters):
+        return True
+
+
+class ServoConstraint(AbstractCoordinateConstraint):
     """A desired motion as a constraint: `deviation(t, q, parameters)` is brought to zero and kept there.
 
     The constraint acts on accelerations, `φ̈ + damping φ̇ + stiffness φ = 0`, so the motion may start off it. What it
@@ -106,37 +151,36 @@ class Servo(eqx.Module):
     deviation: Callable[..., Array] = eqx.field(static=True)
     damping: float = eqx.field(static=True, default=0.0)
     stiffness: float = eqx.field(static=True, default=0.0)
+    level: ClassVar[int] = 2
 
-    def residual(self, t: Scalar, q: Array, v: Array, a: Array, parameters: Parameters) -> Array:
-        """`φ̈ + damping φ̇ + stiffness φ` at accelerations `a`, shape (rows,)."""
+    def value(self, t, q, v, a, parameters):
         one = jnp.ones_like(t)
         phi = lambda t, q: jnp.ravel(self.deviation(t, q, parameters))
         first = lambda t, q, v: jax.jvp(phi, (t, q), (one, v))[1]
         rate, second = jax.jvp(first, (t, q, v), (one, v, a))
         return second + self.damping * rate + self.stiffness * phi(t, q)
 
+    def is_linear(self, q, parameters):
+        return True
+
+    def is_drift_free(self, q, parameters):
+        return True
+
 
 def check_names(constraints: tuple[Any, ...]) -> None:
-    """Raise a `ValueError` unless every constraint is one, with a name of its own."""
-    kinds = (AbstractConstraint, AccelerationConstraint, Servo)
+    """Raise a `ValueError` unless every entry is a constraint, with a name of its own."""
     for constraint in constraints:
-        if not isinstance(constraint, kinds):
+        if not isinstance(constraint, AbstractCoordinateConstraint):
             raise ValueError(
-                f"constraints must hold Holonomic, Nonholonomic, Pfaffian, AccelerationConstraint or Servo, got "
-                f"{constraint!r}."
+                f"constraints must hold Holonomic, Nonholonomic, Pfaffian, AccelerationConstraint or ServoConstraint, "
+                f"got {constraint!r}."
             )
     names = [constraint.name for constraint in constraints]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ValueError(f"Constraints need names of their own; {', '.join(map(repr, repeated))} is there twice.")
+        raise ValueError(f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs its own.")
 
 
-def is_linear(constraint: AbstractConstraint, arguments: tuple[Any, ...]) -> bool:
-    """Whether a constraint is linear in velocities up to a term without them."""
-    slope = lambda t, q, v, p: jax.jacfwd(constraint, 2)(t, q, v, p)
-    return not depends(slope, arguments, 2)
-
-
-def is_rheonomic(constraint: AbstractConstraint, arguments: tuple[Any, ...]) -> bool:
-    """Whether a constraint depends on time."""
-    return depends(constraint, arguments, 0)
+def _is_linear(constraint: AbstractCoordinateConstraint, q: Array, parameters: Parameters) -> bool:
+    slope = lambda t, q, v, p: jax.jacfwd(constraint.value, 2)(t, q, v, v, p)
+    return not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)

@@ -1,4 +1,4 @@
-"""What a function depends on, found without running it."""
+"""The arguments that a function depends on, found from its data flow without running it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from jax.extend.core import Literal
 def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:
     """Whether the data flow of a function leads from one of these arguments to its values.
 
-    An argument that only drops out numerically (a factor of zero) counts as one that it depends on.
+    An argument that drops out only numerically, by a factor of zero, counts as one that the function depends on.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     owner = [k for k, argument in enumerate(arguments) for _ in jax.tree.leaves(argument)]

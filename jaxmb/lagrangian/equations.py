@@ -1,31 +1,9 @@
-"""How the equations of motion of a Lagrangian system are written: the generalized force on its velocities."""
+"""Lagrange's equations projected on the directions of the velocities."""
 
-import abc
-from typing import TYPE_CHECKING
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from .._types import Scalar
-
-if TYPE_CHECKING:
-    from .system import LagrangianSystem
-
-
-class AbstractEquations(eqx.Module):
-    """A way to write `M u̇ = F + Aᵀ λ`; all ways give the same F."""
-
-    @abc.abstractmethod
-    def check(self, system: "LagrangianSystem") -> None:
-        """Raise a `ValueError` for a system that the equations cannot be written for."""
-
-    @abc.abstractmethod
-    def force(
-        self, system: "LagrangianSystem", t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-    ) -> Float[Array, "nu"]:
-        """`F(t, q, u)`."""
+from .model import AbstractEquations
 
 
 class Projected(AbstractEquations):

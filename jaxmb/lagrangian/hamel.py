@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.elimination import Order, factor, full_pivot
-from .equations import AbstractEquations
-from .kinematics import Frame
+from .kinematics import QuasiVelocityFrame
+from .model import AbstractEquations
 from .transposition import Transposition, check_shape, share_of_suslov
 
 
@@ -44,8 +44,11 @@ class Hamel(AbstractEquations):
         share_of_suslov(self.transposition)
 
     def check(self, system):
-        if not isinstance(system.kinematics, Frame):
-            raise ValueError(f"Hamel's equations need kinematics=Frame(...), got {type(system.kinematics).__name__}.")
+        # A concrete class: only it has the columns that the equations are written in.
+        if not isinstance(system.kinematics, QuasiVelocityFrame):
+            raise ValueError(
+                f"Hamel's equations need kinematics=QuasiVelocityFrame(...), got {type(system.kinematics).__name__}."
+            )
         frame = np.asarray(_frame_at(system.kinematics, system.guess.q, system.parameters))
         sizes = np.linalg.svd(frame, compute_uv=False)
         if not sizes[-1] > 1e-12 * sizes[0]:
@@ -87,7 +90,7 @@ class Hamel(AbstractEquations):
 
 
 @eqx.filter_jit
-def _frame_at(frame: Frame, q: Float[Array, "n"], parameters: dict[str, Array]) -> Float[Array, "n n"]:
+def _frame_at(frame: QuasiVelocityFrame, q: Float[Array, "n"], parameters: dict[str, Array]) -> Float[Array, "n n"]:
     return complete(frame.columns_of(jnp.zeros((), q.dtype), q, parameters))
 
 
@@ -106,7 +109,7 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return factor(matrix, full_pivot(matrix).order, n).correction
 
 
-def pivoted_frame(matrix: Callable[..., Array], order: Order, rank: int) -> Frame:
+def pivoted_frame(matrix: Callable[..., Array], order: Order, rank: int) -> QuasiVelocityFrame:
     """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
 
     **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
@@ -114,11 +117,11 @@ def pivoted_frame(matrix: Callable[..., Array], order: Order, rank: int) -> Fram
     that the pivots leave.
     """
     basis = lambda t, q, p: factor(jnp.asarray(matrix(t, q, p)), order, rank).basis
-    return Frame(basis, columns=order.n - rank)
+    return QuasiVelocityFrame(basis, columns=order.n - rank)
 
 
 def structure_functions(
-    frame: Frame, t: Scalar, q: Float[Array, "n"], parameters: dict[str, Array]
+    frame: QuasiVelocityFrame, t: Scalar, q: Float[Array, "n"], parameters: dict[str, Array]
 ) -> Float[Array, "n k k"]:
     """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c."""
     columns = lambda q: frame.columns_of(t, q, parameters)

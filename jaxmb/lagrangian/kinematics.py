@@ -1,4 +1,4 @@
-"""What velocities describe the motion of a Lagrangian system: `q̇ = K(t, q, u)`."""
+"""Velocities of a Lagrangian system, and the rates of the coordinates that follow from them: `q̇ = K(t, q, u)`."""
 
 import abc
 from collections.abc import Callable
@@ -24,16 +24,16 @@ class AbstractKinematics(eqx.Module):
     """The map from velocities u to rates q̇.
 
     - `identity`: whether u is q̇.
-    - `linear`: whether q̇ is linear in u up to a term without it; `homogeneous`: whether that term is zero.
+    - `linear`: whether q̇ is linear in u up to a term without it; `drift_free`: whether that term is zero.
     """
 
     identity: AbstractVar[bool]
     linear: AbstractVar[bool]
-    homogeneous: AbstractVar[bool]
+    drift_free: AbstractVar[bool]
 
     @abc.abstractmethod
     def count(self, nq: int) -> int:
-        """The number of velocities for so many coordinates."""
+        """The number of velocities of a system with nq coordinates."""
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], parameters: Parameters) -> Array:
@@ -45,7 +45,7 @@ class Rates(AbstractKinematics):
 
     identity: ClassVar[bool] = True
     linear: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = True
+    drift_free: ClassVar[bool] = True
 
     def count(self, nq):
         return nq
@@ -54,7 +54,7 @@ class Rates(AbstractKinematics):
         return u
 
 
-class Frame(AbstractKinematics):
+class QuasiVelocityFrame(AbstractKinematics):
     r"""Quasi-velocities in a frame, `q̇ = N(t, q) u + ν(t, q)`.
 
     With fewer columns than coordinates the frame eliminates constraints: `u` are then free velocities of a system whose
@@ -74,7 +74,7 @@ class Frame(AbstractKinematics):
     linear: ClassVar[bool] = True
 
     @property
-    def homogeneous(self) -> bool:
+    def drift_free(self) -> bool:
         return self.drift is None
 
     def count(self, nq):
@@ -113,7 +113,7 @@ class Connection(AbstractKinematics):
     linear: ClassVar[bool] = True
 
     @property
-    def homogeneous(self) -> bool:
+    def drift_free(self) -> bool:
         return self.drift is None
 
     def count(self, nq):

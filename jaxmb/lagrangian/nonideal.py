@@ -1,8 +1,8 @@
-"""What constraints do beyond d'Alembert's principle.
+"""Non-ideal constraint forces, which do virtual work.
 
 A constraint that is not ideal adds a force C, given by its work in displacements w that the constraints allow, `w · C`:
-what of C lies along the gradients of constraints has no effect. It may depend on the force that the constraint would
-exert if it were ideal.
+the components of C along the gradients of constraints have no effect. C may depend on the force that the constraint
+would exert if it were ideal.
 
 Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems", Proc.
 R. Soc. A 463, 2007.
@@ -10,7 +10,7 @@ R. Soc. A 463, 2007.
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -27,10 +27,15 @@ else:
     from equinox import AbstractVar
 
 
-class AbstractNonIdeal(eqx.Module):
-    """The force C of one constraint, by its name."""
+class AbstractNonIdealForce(eqx.Module):
+    """The force C of one constraint.
+
+    `constraint` is the name of the constraint, and `coefficients` are the names of the system's parameters that the law
+    uses.
+    """
 
     constraint: AbstractVar[str]
+    coefficients: AbstractVar[tuple[str, ...]]
 
     @abc.abstractmethod
     def force(
@@ -49,17 +54,18 @@ class AbstractNonIdeal(eqx.Module):
         """
 
 
-class NonIdeal(AbstractNonIdeal):
+class NonIdealForce(AbstractNonIdealForce):
     """C from a function, `function(t, q, v, multipliers, parameters)`, shape (nq,)."""
 
     constraint: str = eqx.field(static=True)
     function: Callable[..., Array] = eqx.field(static=True)
+    coefficients: ClassVar[tuple[str, ...]] = ()
 
     def force(self, t, q, v, ideal, multipliers, parameters):
         return jnp.asarray(self.function(t, q, v, multipliers, parameters))
 
 
-class Friction(AbstractNonIdeal):
+class CoulombFriction(AbstractNonIdealForce):
     """Coulomb friction: a force of `coefficient` times the constraint's own ideal force, against the slip s(t, q, q̇).
 
     Its work is `−μ N s·δs / √(s·s + ε²)`. Near rest it is smooth: full only where the slip is large against ε.
@@ -80,21 +86,29 @@ class Friction(AbstractNonIdeal):
     normal: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
     smoothing: float = eqx.field(static=True, default=1e-6, kw_only=True)
 
+    @property
+    def coefficients(self):
+        return (self.coefficient,)
+
     def force(self, t, q, v, ideal, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
         normal = norm(ideal) if self.normal is None else jnp.abs(self.normal(t, q, multipliers, parameters))
         return -parameters[self.coefficient] * normal * pull(s / jnp.sqrt(s @ s + self.smoothing**2))[0]
 
 
-class Viscous(AbstractNonIdeal):
+class Viscous(AbstractNonIdealForce):
     """Friction in proportion to the slip s(t, q, q̇): work `−coefficient s·δs`.
 
-    **Arguments:** `coefficient`: its name among the parameters [N s/m]; `slip` as in `Friction`.
+    **Arguments:** `coefficient`: its name among the parameters [N s/m]; `slip` as in `CoulombFriction`.
     """
 
     constraint: str = eqx.field(static=True)
     coefficient: str = eqx.field(static=True)
     slip: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
+
+    @property
+    def coefficients(self):
+        return (self.coefficient,)
 
     def force(self, t, q, v, ideal, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)

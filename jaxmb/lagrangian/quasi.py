@@ -1,4 +1,4 @@
-"""Nonlinear quasi-velocities, and what can be said about the ones that constraints hold."""
+"""Nonlinear quasi-velocities, and the forces that hold the dependent ones at zero."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -48,7 +48,7 @@ class QuasiVelocities(AbstractKinematics):
     dependent: tuple[int, ...] = eqx.field(static=True)
     identity: ClassVar[bool] = False
     linear: ClassVar[bool] = False
-    homogeneous: ClassVar[bool] = False
+    drift_free: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ def _solve(matrix, right):
 def kinetostatic_forces(
     system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
 ) -> Float[Array, "dependent"]:
-    """What holds the dependent quasi-velocities at zero: their generalized forces Λ_D, in the order of `dependent`.
+    """The generalized forces Λ_D that hold the dependent quasi-velocities at zero, in the order of `dependent`.
 
     `Λ_D = (∂q̇/∂ω_D)ᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q)`, the left sides of the equations of those velocities.
     """
@@ -139,7 +139,7 @@ def kinetostatic_forces(
 def johnsen_hamel_residual(
     system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
 ) -> Float[Array, "nq"]:
-    r"""What the Johnsen-Hamel equations leave at accelerations u̇, for all ω_k in order: zero for the independent ones
+    r"""Residuals of the Johnsen-Hamel equations at accelerations u̇, for all ω_k in order: zero for the independent ones
     of a motion, and Λ_k for the dependent ones. A diagnostic, in the equations' own terms:
 
     $$\frac{d}{dt} \frac{\partial L^*}{\partial \omega_k} - \frac{\partial L^*}{\partial \theta_k}
@@ -163,6 +163,7 @@ def johnsen_hamel_residual(
 
 
 def _quasi(system: LagrangianSystem) -> QuasiVelocities:
+    # A concrete class: only it has dependent velocities that forces hold at zero.
     if not isinstance(system.kinematics, QuasiVelocities):
         raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(system.kinematics).__name__}.")
     return system.kinematics

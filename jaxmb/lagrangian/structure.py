@@ -1,7 +1,8 @@
 """The structure of a Lagrangian system: shapes, ranks, and whether its mass matrix is diagonal."""
 
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,37 +10,49 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
 from ..states.assembly import nearest, residual_size, tolerance
 from ..system.equation import Ranks
-from .constraints import AbstractConstraint, Holonomic
+from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
+from .kinematics import AbstractKinematics
+from .model import AbstractLagrangian
 
-if TYPE_CHECKING:
-    from .system import LagrangianSystem
-
-# With so many sets of parameters a matrix is looked at.
+# Number of sets of parameters at which the entries of the mass matrix are compared with zero.
 _LOOKS = 3
 
 
-def count_rows(system: "LagrangianSystem") -> tuple[int, ...]:
+class Unanalysed(AbstractLagrangian):
+    """A Lagrangian system whose structure is not known yet; only `find_structure` evaluates it."""
+
+    diagonal: ClassVar[bool] = False
+    positive_definite_mass: ClassVar[bool] = False
+    linear: ClassVar[bool] = False
+    drift_free: ClassVar[bool] = False
+    ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
+
+
+def constraint_sizes(
+    lagrangian: Callable[..., Array],
+    applied: Callable[..., Array] | None,
+    constraints: tuple[AbstractCoordinateConstraint, ...],
+    kinematics: AbstractKinematics,
+    guess: State,
+    parameters: dict[str, Array],
+) -> tuple[int, ...]:
     """The number of rows of each constraint, from shapes alone.
 
     **Raises:** `ValueError` for functions of the wrong shape.
     """
-    q, p = system.guess.q, system.parameters
+    q, p = guess.q, parameters
     t = jnp.zeros((), q.dtype)
-    _shape("kinematics", (q.size,), lambda: system.rates(t, q, system.guess.u))
-    _shape("lagrangian", (), lambda: system.lagrangian(t, q, q, p))
-    if system.applied is not None:
-        applied = system.applied
+    _shape("kinematics", (q.size,), lambda: kinematics.rates(t, q, guess.u, p))
+    _shape("lagrangian", (), lambda: lagrangian(t, q, q, p))
+    if applied is not None:
         _shape("force", (q.size,), lambda: applied(t, q, q, p))
-    sizes = []
-    for c in system.constraints:
-        row = lambda c=c: c(t, q, q, p) if isinstance(c, AbstractConstraint) else c.residual(t, q, q, q, p)
-        sizes.append(int(np.prod(_shape(c.name, None, row))))
-    return tuple(sizes)
+    return tuple(math.prod(_shape(c.name, None, lambda c=c: c.value(t, q, q, q, p))) for c in constraints)
 
 
 def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[[], Any]) -> tuple[int, ...]:
@@ -53,18 +66,21 @@ def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[[], A
 
 
 class Structure(NamedTuple):
-    """What the numbers of a system tell.
+    """Static properties of a system, found from its functions and their values at the guess.
 
-    **Fields:** `diagonal`: whether the mass matrix is diagonal, and constant; `regular`: whether it is positive
-    definite, in the velocities and at the guess; `ranks`, near the guess on the constraints.
+    **Fields:** `diagonal`: whether the mass matrix is diagonal and constant; `positive_definite_mass`: whether the mass
+    matrix in the velocities is positive definite at the guess; `linear`, `drift_free`: as in `AbstractSystem`; `ranks`,
+    near the guess on the constraints.
     """
 
     diagonal: bool
-    regular: bool
+    positive_definite_mass: bool
+    linear: bool
+    drift_free: bool
     ranks: Ranks
 
 
-def find_structure(system: "LagrangianSystem") -> Structure:
+def find_structure(system: AbstractLagrangian) -> Structure:
     """Evaluate a system's functions at its guess, and eliminate.
 
     **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
@@ -89,7 +105,7 @@ def find_structure(system: "LagrangianSystem") -> Structure:
         if not np.all(np.isfinite(slope)):
             raise ValueError(f"{c.name}: its derivative with respect to the rates is not finite at the guess.")
     if not found.residual <= tolerance(q.dtype):
-        names = ", ".join(c.name for c in system.constraints if isinstance(c, Holonomic))
+        names = ", ".join(c.name for c in system.constraints if c.level == 0)
         raise ValueError(
             f"The constraints {names} cannot be satisfied near q = {q.tolist()}: a scaled residual of "
             f"{float(found.residual):.2g} remains."
@@ -97,17 +113,24 @@ def find_structure(system: "LagrangianSystem") -> Structure:
     if not np.all(np.isfinite(found.jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
     position, velocity, acceleration, *others = map(int, found.row_ranks)
-    if system.linear:
+    linear = system.kinematics.linear and all(c.is_linear(q, p) for c in system.constraints)
+    drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
+    if linear:
         rows = slice(0, system.velocity_rows)
         _check_consistent(system, "velocities", found.jacobian[rows], -found.unmet, rows)
-    # What binds velocities is left alone here: the guess need not satisfy it.
+    # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
     rows = slice(system.velocity_rows, system.acceleration_rows)
     _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
     _check_nonideal(system, acceleration, others)
     diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
     sizes = np.linalg.eigvalsh(found.inertia)
-    regular = bool(sizes[0] > np.finfo(q.dtype).eps ** 0.75 * sizes[-1])
-    return Structure(bool(diagonal), regular, Ranks(position, int(found.coordinate_rank), velocity, acceleration))
+    return Structure(
+        diagonal=bool(diagonal),
+        positive_definite_mass=bool(sizes[0] > np.finfo(q.dtype).eps ** 0.75 * sizes[-1]),
+        linear=linear,
+        drift_free=drift_free,
+        ranks=Ranks(position, int(found.coordinate_rank), velocity, acceleration),
+    )
 
 
 class _Numbers(NamedTuple):
@@ -130,7 +153,7 @@ class _Numbers(NamedTuple):
 
 
 @eqx.filter_jit
-def _evaluate(system: "LagrangianSystem", constant: bool) -> _Numbers:
+def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
     """All that needs the user's functions, in one compiled function."""
     q, u, p = system.guess.q, system.guess.u, system.parameters
     t = jnp.zeros((), q.dtype)
@@ -138,7 +161,7 @@ def _evaluate(system: "LagrangianSystem", constant: bool) -> _Numbers:
     hessian = jax.hessian(system.lagrangian, 2)
     looks = jnp.arange(_LOOKS if constant else 0, dtype=q.dtype)
     masses = jax.vmap(lambda k: hessian(t, q, v, jax.tree.map(lambda x: _shaken(x, k), p)))(looks)
-    slopes = tuple(jax.jacfwd(c, 2)(t, q, v, p) for c in _between_velocities(system))
+    slopes = tuple(jax.jacfwd(c.value, 2)(t, q, v, v, p) for c in _between_velocities(system))
     residual, coordinate_rank = jnp.zeros((), q.dtype), jnp.array(0)
     mass, inertia = hessian(t, q, v, p), system.inertia(t, q, u).product(jnp.eye(u.size, dtype=q.dtype))
     if system.position_rows:
@@ -163,11 +186,11 @@ def _evaluate(system: "LagrangianSystem", constant: bool) -> _Numbers:
 
 
 def _shaken(x: Array, k: Array) -> Array:
-    """A parameter with each of its numbers changed by a share of its own."""
+    """A parameter with each of its numbers changed by a different factor."""
     return x * (1 + 0.1 * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
 
 
-def _row_sets(system: "LagrangianSystem") -> np.ndarray:
+def _row_sets(system: AbstractLagrangian) -> np.ndarray:
     """Masks of the rows whose ranks are asked for: between positions, between velocities, all, and for each law that
     is not ideal those of the other constraints.
     """
@@ -177,12 +200,12 @@ def _row_sets(system: "LagrangianSystem") -> np.ndarray:
     return np.stack([rows < system.position_rows, rows < system.velocity_rows, rows >= 0, *others])
 
 
-def _between_velocities(system: "LagrangianSystem") -> list[AbstractConstraint]:
-    return [c for c in system.constraints if isinstance(c, AbstractConstraint) and not isinstance(c, Holonomic)]
+def _between_velocities(system: AbstractLagrangian) -> list[AbstractCoordinateConstraint]:
+    return [c for c in system.constraints if c.level == 1]
 
 
 def _check_consistent(
-    system: "LagrangianSystem", what: str, jacobian: np.ndarray, right: np.ndarray, rows: slice
+    system: AbstractLagrangian, what: str, jacobian: np.ndarray, right: np.ndarray, rows: slice
 ) -> None:
     """Raise a `ValueError` naming the constraints among some rows that contradict others at the guess."""
     if right.size == 0:
@@ -196,7 +219,7 @@ def _check_consistent(
         )
 
 
-def _check_nonideal(system: "LagrangianSystem", rank: int, others: list[int]) -> None:
+def _check_nonideal(system: AbstractLagrangian, rank: int, others: list[int]) -> None:
     """Raise a `ValueError` unless every law is of a constraint whose force is determined.
 
     `rank` of all rows; `others`: for each law that of the rows of the other constraints.
@@ -207,9 +230,9 @@ def _check_nonideal(system: "LagrangianSystem", rank: int, others: list[int]) ->
             raise ValueError(
                 f"{type(law).__name__} is of a constraint {law.constraint!r}, but there are {sorted(set(names))}."
             )
-        coefficient = getattr(law, "coefficient", None)
-        if coefficient is not None and coefficient not in system.parameters:
-            raise unknown("parameter", coefficient, system.parameters)
+        for coefficient in law.coefficients:
+            if coefficient not in system.parameters:
+                raise unknown("parameter", coefficient, system.parameters)
         if rest + names.count(law.constraint) > rank:
             raise ValueError(
                 f"{type(law).__name__} of {law.constraint!r}: the force of this constraint is not determined, because "

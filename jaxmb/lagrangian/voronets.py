@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .equations import AbstractEquations
 from .kinematics import Connection
+from .model import AbstractEquations
 from .transposition import Transposition, check_shape, share_of_suslov
 
 
@@ -39,6 +39,7 @@ class Voronets(AbstractEquations):
         share_of_suslov(self.transposition)
 
     def check(self, system):
+        # A concrete class: only it has a base, a fibre and the curvature that the equations are written with.
         if not isinstance(system.kinematics, Connection):
             raise ValueError(
                 f"Voronets' equations need kinematics=Connection(...), got {type(system.kinematics).__name__}."

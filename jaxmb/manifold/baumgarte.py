@@ -13,7 +13,7 @@ from .._types import State
 from ..formulations import AbstractFormulation, accelerations
 from ..formulations.formulation import check_mass
 from ..system import AbstractSystem
-from .manifold import AbstractManifold
+from .manifold import AbstractManifold, all_rows_formulation, normalize_state
 
 
 class Baumgarte(AbstractManifold):
@@ -35,6 +35,19 @@ class Baumgarte(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
+
+    def default_formulation(self, system):
+        return all_rows_formulation(system)
+
+    def correction(self, interpolated):
+        # How far the states are off the constraints is of interest, and stays.
+        return normalize_state
+
+    def statistics(self, solver_state):
+        return {}
+
+    def diagnose(self, system, t, y, solver_state, result, failed):
+        return result
 
 
 class StabilisedField(eqx.Module):

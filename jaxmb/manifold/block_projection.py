@@ -8,14 +8,14 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..formulations import BlockMultipliers
 from ..formulations.formulation import check_independent
-from ..solvers import AbstractManifoldTerm, AbstractMultistep, Adams, ManifoldEvaluation
+from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractSystem
 from ..system.chain import chain_of
 from ..system.corrector import corrector
-from .free import VectorField
 from .manifold import AbstractManifold, newton_tolerance
 from .nearest import nearest
-from .projection import ProjectedSolver
+from .projection import ProjectedSolver, project_normalized
+from .vector_field import VectorField
 
 
 class BlockProjection(AbstractManifold):
@@ -47,12 +47,24 @@ class BlockProjection(AbstractManifold):
             )
         if not isinstance(solver, AbstractMultistep):
             return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
-        if not isinstance(solver, Adams):
+        if solver.solves_implicitly:
             raise ValueError(
                 f"BlockProjection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() "
                 "with it."
             )
         return BlockTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
+
+    def default_formulation(self, system):
+        return BlockMultipliers()
+
+    def correction(self, interpolated):
+        return project_normalized if interpolated else None
+
+    def statistics(self, solver_state):
+        return {}
+
+    def diagnose(self, system, t, y, solver_state, result, failed):
+        return result
 
 
 class BlockTerm(AbstractManifoldTerm):

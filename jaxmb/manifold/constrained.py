@@ -100,7 +100,7 @@ def evaluate(
 def _evaluate(system, formulation, t, q, u, order):
     jacobian = system.jacobian(t, q, u)
     solved = factor(jacobian, order, system.velocity_rank)
-    if system.linear and system.homogeneous:
+    if system.linear and system.drift_free:
         u = solved.basis @ u[order.columns[system.velocity_rank :]]
     else:
         u = u - solved.correction @ system.velocity_residual(t, q, u)

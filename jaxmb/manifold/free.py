@@ -1,12 +1,10 @@
 """No constraints at all: the plain equations of motion."""
 
 import diffrax
-import equinox as eqx
 
-from .._types import State
-from ..formulations import AbstractFormulation, accelerations
-from ..system import AbstractSystem
-from .manifold import AbstractManifold
+from .manifold import AbstractManifold, all_rows_formulation
+from .projection import project_normalized
+from .vector_field import VectorField
 
 
 class Free(AbstractManifold):
@@ -19,15 +17,15 @@ class Free(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         return diffrax.ODETerm(VectorField(system, formulation)), solver
 
+    def default_formulation(self, system):
+        return all_rows_formulation(system)
 
-class VectorField(eqx.Module):
-    """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
+    def correction(self, interpolated):
+        # No step ends on the constraints, and Euler parameters are not of unit length.
+        return project_normalized
 
-    system: AbstractSystem
-    formulation: AbstractFormulation
+    def statistics(self, solver_state):
+        return {}
 
-    def __call__(self, t, y, args):
-        del args
-        q = self.system.normalize(y.q)
-        udot, _ = accelerations(self.system, self.formulation, t, q, y.u)
-        return State(self.system.rates(t, q, y.u), udot)
+    def diagnose(self, system, t, y, solver_state, result, failed):
+        return result

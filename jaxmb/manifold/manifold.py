@@ -1,16 +1,20 @@
 """What a manifold policy is: how the state stays on the constraints while it is integrated."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
-from .._types import Scalar
-from ..formulations import AbstractFormulation
+from .._types import Scalar, State
+from ..formulations import AbstractFormulation, Multipliers, NullSpace
 from ..linalg.arrays import as_array, namespace
 from ..system import AbstractSystem
+
+Correction = Callable[[AbstractSystem, Scalar, State], State]
 
 
 class AbstractManifold(eqx.Module):
@@ -24,6 +28,42 @@ class AbstractManifold(eqx.Module):
 
         **Raises:** `ValueError` for a solver that the policy cannot work with.
         """
+
+    @abc.abstractmethod
+    def default_formulation(self, system: AbstractSystem) -> AbstractFormulation:
+        """The formulation of a simulation that names none."""
+
+    @abc.abstractmethod
+    def correction(self, interpolated: bool) -> Correction | None:
+        """The function that returns saved states to the constraints; None where they are on them already.
+
+        **Arguments:** `interpolated`: whether states between steps are among those that are saved.
+        """
+
+    @abc.abstractmethod
+    def statistics(self, solver_state: Any) -> dict[str, Array]:
+        """Counts of the policy's work, from the final state of the solver."""
+
+    @abc.abstractmethod
+    def diagnose(
+        self, system: AbstractSystem, t: Scalar, y: State, solver_state: Any, result: Any, failed: Bool[Array, ""]
+    ) -> Any:
+        """The outcome of a simulation, made precise where the policy knows why it failed.
+
+        **Arguments:** `t`, `y`: the last state; `result`: a `RESULTS`; `failed`: whether it is a failure that starts
+        from finite numbers.
+        """
+
+
+def normalize_state(system: AbstractSystem, t: Scalar, y: State) -> State:
+    """The state with its coordinates' own invariants satisfied."""
+    del t
+    return State(system.normalize(y.q), y.u)
+
+
+def all_rows_formulation(system: AbstractSystem) -> AbstractFormulation:
+    """A formulation that needs no partition of the velocities: the cheapest one that the mass matrix allows."""
+    return Multipliers() if system.positive_definite_mass else NullSpace()
 
 
 def newton_tolerance(given: float | None, rtol: Scalar) -> Any:

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import State
-from ..formulations import AbstractFormulation
+from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, stages
 from ..linalg.elimination import factor, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
@@ -30,8 +30,10 @@ from .constrained import (
     restore_positions,
     shared,
 )
-from .free import VectorField
+from .diagnosis import diagnose
 from .manifold import AbstractManifold, newton_tolerance
+from .projection import project_normalized
+from .vector_field import VectorField
 
 # A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
 _AGE = 4
@@ -82,6 +84,18 @@ class Partition(AbstractManifold):
                 f"{type(formulation).__name__} finds no independent coordinates; use BlockProjection() with it."
             )
         return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
+
+    def default_formulation(self, system):
+        return Partitioned()
+
+    def correction(self, interpolated):
+        return project_normalized if interpolated else None
+
+    def statistics(self, solver_state):
+        return {"newton_iterations": solver_state.chart.newton, "charts": solver_state.chart.charts}
+
+    def diagnose(self, system, t, y, solver_state, result, failed):
+        return diagnose(system, t, y, solver_state.chart.singular, result, failed)
 
 
 class Chart(eqx.Module):
@@ -147,7 +161,7 @@ class PartitionTerm(AbstractManifoldTerm):
         if system.acceleration_rows == 0:
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
-            if system.plain:
+            if system.ideal_on_velocities:
                 out = evaluate(system, self.formulation, t, q, u, split.velocity)
             else:
                 out = evaluate_general(system, self.formulation, t, q, u, split)
@@ -160,7 +174,7 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def restore(self, t, y, near, args):
         system, chart = self.system, near.chart
-        if system.acceleration_rows == 0 or not system.plain:
+        if system.acceleration_rows == 0 or not system.ideal_on_velocities:
             return self._settle(t, y, chart, chart.split)
         before = lax.stop_gradient((near.y.u, near.f.u))
         before = Evaluation(*before, near.factors)
@@ -170,7 +184,7 @@ class PartitionTerm(AbstractManifoldTerm):
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
 
     def settle(self, t, y, chart, args):
-        if not (self.system.plain and self.system.linear):
+        if not (self.system.ideal_on_velocities and self.system.linear):
             return super().settle(t, y, chart, args)
         split = chart.split
         if split.coordinate is None:

@@ -13,14 +13,15 @@ from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar, State
+from ..formulations import BlockMultipliers
 from ..linalg.elimination import full_pivot, solve_positive
-from ..solvers import Adams
+from ..solvers import AbstractMultistep
 from ..system import AbstractSystem, DiagonalInertia
 from ..system.chain import is_long
 from ..system.corrector import corrector
-from .free import VectorField
-from .manifold import AbstractManifold
+from .manifold import AbstractManifold, all_rows_formulation, normalize_state
 from .nearest import nearest
+from .vector_field import VectorField
 
 _ITERATIONS = 8
 
@@ -33,11 +34,23 @@ class Projection(AbstractManifold):
     """
 
     def prepare(self, system, formulation, solver, rtol):
-        if isinstance(solver, Adams):
+        if isinstance(solver, AbstractMultistep) and not solver.solves_implicitly:
             raise ValueError(
                 "Projection is for one-step solvers; use manifold=Partition() with Adams, which loses no history."
             )
         return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
+
+    def default_formulation(self, system):
+        return BlockMultipliers() if is_long(system) else all_rows_formulation(system)
+
+    def correction(self, interpolated):
+        return project_normalized if interpolated else None
+
+    def statistics(self, solver_state):
+        return {}
+
+    def diagnose(self, system, t, y, solver_state, result, failed):
+        return result
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
@@ -111,6 +124,11 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
             ahead = jacobian[rows] * square[None, :]
             u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
     return State(q, u)
+
+
+def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
+    """`project` from coordinates that need not satisfy their own invariants, such as interpolated ones."""
+    return project(system, t, normalize_state(system, t, y))
 
 
 def _project_chain(system, t, y):

@@ -10,7 +10,7 @@ so the mass matrix is full, but its inverse tridiagonal.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,8 +18,10 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..planar import DraftGear
-from ..system import AbstractInertia, AbstractSystem, DenseInertia
-from ..system.equation import Ranks
+from ..system import AbstractGeneralizedSystem, AbstractInertia, DenseInertia
+from ..system.describe import count_independent, shorten, specialised_constraints
+from ..system.description import Description
+from ..system.equation import ParameterPath, Ranks
 
 
 class RelativeInertia(AbstractInertia):
@@ -58,7 +60,7 @@ def _scaled(by, v):
     return (by if v.ndim == 1 else by[:, None]) * v
 
 
-class RelativeTrain(AbstractSystem):
+class RelativeTrain(AbstractGeneralizedSystem):
     """A train on a straight track; every number a leaf.
 
     **Fields:** `mass` [kg], shape (n,); `couplers`, a draft gear whose numbers have shape (n − 1,); `law(t, v,
@@ -80,15 +82,21 @@ class RelativeTrain(AbstractSystem):
     velocity_rows: ClassVar[int] = 0
     acceleration_rows: ClassVar[int] = 0
     ideal: ClassVar[bool] = True
-    regular: ClassVar[bool] = True
+    positive_definite_mass: ClassVar[bool] = True
     rates_are_velocities: ClassVar[bool] = True
     linear: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = True
+    drift_free: ClassVar[bool] = True
     ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
     rows: ClassVar[tuple[tuple[str, int], ...]] = ()
 
-    def __str__(self) -> str:
-        return f"train of {self.nq} vehicles on a straight track, in relative coordinates; no constraints"
+    def describe(self):
+        facts = (
+            ("system", f"train of {self.nq} vehicles on a straight track, in relative coordinates"),
+            ("velocities", f"{self.nu}, rates of the coordinates: {shorten(self.coordinate_names())}"),
+            ("degrees of freedom", str(self.nu)),
+            ("independent", count_independent(self)),
+        )
+        return Description(facts, {}, {"specialised away": tuple(specialised_constraints(self))})
 
     @property
     def nq(self) -> int:
@@ -104,19 +112,22 @@ class RelativeTrain(AbstractSystem):
     def rate_names(self):
         return self.coordinate_names()
 
-    def parameter_places(self):
-        places: dict[str, list[tuple[Callable[[Any], Array], int | None]]] = {}
+    def parameter_paths(self):
+        paths: dict[str, list[ParameterPath]] = {}
         for k in range(self.nq):
-            places[f"car{k + 1}.mass"] = [(lambda s: s.mass, k)]
+            paths[f"car{k + 1}.mass"] = [(lambda s: s.mass, k)]
             for part, numbers in self.numbers.items():
                 for name, value in numbers.items():
                     index = k if value.ndim else None
-                    places[f"{part}{k + 1 if value.ndim else ''}.{name}"] = [(_number(part, name), index)]
+                    paths[f"{part}{k + 1 if value.ndim else ''}.{name}"] = [(_number(part, name), index)]
         for k in range(self.nq - 1):
             for name in self.couplers.__dataclass_fields__:
                 if eqx.is_inexact_array(getattr(self.couplers, name)) and name not in _ATTACHMENT:
-                    places[f"coupler{k + 1}.{name}"] = [(_gear(name), k)]
-        return places
+                    paths[f"coupler{k + 1}.{name}"] = [(_gear(name), k)]
+        return paths
+
+    def positive_parameters(self):
+        return frozenset(f"car{k + 1}.mass" for k in range(self.nq))
 
     def rates(self, t, q, u):
         return u

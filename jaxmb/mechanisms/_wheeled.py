@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
-from ..lagrangian import AbstractEquations, Connection, Frame, LagrangianSystem, Pfaffian, Rates
+from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame, Rates
 from ..parts.fields import as_jax
 from ..scene import Scene
 from ..system import parameters as parameters_of
@@ -55,7 +55,7 @@ def build_wheeled(
 def _lagrangian(parameters, start, form, equations) -> LagrangianSystem:
     parameters, q, u, v = _start(parameters, *start)
     kinematics, velocities, constraints = {
-        "frame": (Frame(frame, 2), u, ()),
+        "frame": (QuasiVelocityFrame(frame, 2), u, ()),
         "constraints": (Rates(), v, (Pfaffian("wheels", wheels),)),
         "connection": (Connection((2, 3), (0, 1), connection), v[2:], ()),
     }[form]

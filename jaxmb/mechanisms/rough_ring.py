@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from ..lagrangian import Friction, Holonomic, LagrangianSystem
+from ..lagrangian import CoulombFriction, Holonomic, LagrangianSystem
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
@@ -42,7 +42,7 @@ def rough_ring(
             kinetic=lambda t, q, v, p: 0.5 * p["mass"] * jnp.dot(v, v),
             potential=lambda t, q, p: p["mass"] * p["gravity"] * q[1],
             constraints=[Holonomic("ring", lambda t, q, p: 0.5 * (jnp.dot(q, q) / p["radius"] - p["radius"]))],
-            nonideal=[Friction("ring", "friction")],
+            nonideal=[CoulombFriction("ring", "friction")],
             q=(radius, 0.0),
             u=(0.0, speed),
             parameters={"radius": radius, "friction": friction, "mass": mass, "gravity": gravity},

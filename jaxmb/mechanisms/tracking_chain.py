@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
-from ..lagrangian import LagrangianSystem, Servo
+from ..lagrangian import LagrangianSystem, ServoConstraint
 from ..parts.functions import Constraint, Force
-from ..parts.servo import Servo as ServoOfJoint
+from ..parts.servo import Servo
 from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import lagrangian_coordinates
@@ -54,7 +54,7 @@ def tracking_chain(
             kinetic=lambda t, q, v, p: 0.5 * jnp.dot(p["masses"], v * v),
             potential=_potential,
             force=_applied,
-            constraints=[Servo("track", _deviation, damping=gains[0], stiffness=gains[1])],
+            constraints=[ServoConstraint("track", _deviation, damping=gains[0], stiffness=gains[1])],
             q=q,
             u=u,
             parameters={"masses": masses, **numbers},
@@ -97,7 +97,7 @@ def _points(masses, numbers, gains, q, u) -> Scene:
     springs = Force(
         "springs", _MASSES, _wrenches, parameters=numbers, potential=lambda x, t, p: _potential(t, x[:, 0], p)
     )
-    return Scene(bodies, joints=[*rails, ServoOfJoint(track, damping=gains[0], stiffness=gains[1])], forces=[springs])
+    return Scene(bodies, joints=[*rails, Servo(track, damping=gains[0], stiffness=gains[1])], forces=[springs])
 
 
 def _wrenches(poses, velocities, t, p):

@@ -104,7 +104,7 @@ def formulation_costs(
     if system.acceleration_rows == 0:
         raise ValueError(f"{mechanism.name!r} has no constraints: its accelerations are M⁻¹F by any formulation.")
     every = every_formulation() if formulations is None else dict(formulations)
-    chosen = {name: f for name, f in every.items() if system.regular or not f.inverts_mass}
+    chosen = {name: f for name, f in every.items() if system.positive_definite_mass or not f.inverts_mass}
     if not chosen:
         raise ValueError(
             f"The mass matrix of {mechanism.name!r} is singular; give a formulation for it, such as NullSpace()."

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._results import RESULTS
 from .._types import State
-from ..formulations import Multipliers, NullSpace, Partitioned
+from ..formulations import Multipliers
 from ..manifold import AbstractManifold, Baumgarte, Partition
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
@@ -183,8 +183,7 @@ def _simulation(
     matrix: float,
 ) -> _Method:
     t1 = float(known.times[-1])
-    others = Multipliers() if mechanism.system.regular else NullSpace()
-    formulation = Partitioned() if isinstance(manifold, Partition) else others
+    formulation = manifold.default_formulation(mechanism.system)
 
     @eqx.filter_jit
     def compiled(system: AbstractSystem, state: State, rtol: Any) -> Trajectory:

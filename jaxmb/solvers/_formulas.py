@@ -72,7 +72,7 @@ class Formulas(NamedTuple):
     """The coefficients of one step, for every number m of nodes of the past.
 
     With `z = f`: `y_{n+1} = y_n + h (past[m] @ differences + slope[m] f_{n+1} + curvature[m] h g_{n+1})`, with
-    `z = y`: `y_{n+1} = past[m] @ differences + slope[m] h f_{n+1} + curvature[m] h² g_{n+1}`. Row zero means nothing.
+    `z = y`: `y_{n+1} = past[m] @ differences + slope[m] h f_{n+1} + curvature[m] h² g_{n+1}`. Row 0 is unused.
     """
 
     past: Float[Array, "length length"]
@@ -124,8 +124,8 @@ def double(history: History, slope: Float[Array, " n"]) -> History:
     slopes = jnp.asarray(np.arange(length) > 0, dtype) * (own / gaps).astype(dtype)
     before = jnp.asarray(before_each(length), dtype)
     new = own.astype(dtype) * slope[None] - (before * slopes[None]) @ history.differences
-    new = jnp.where((np.arange(length, dtype=np.int32) <= history.points)[:, None], new, jnp.zeros((), dtype))
+    new = jnp.where((np.arange(length, dtype=np.int32) <= history.known)[:, None], new, jnp.zeros((), dtype))
     new = jnp.concatenate([history.differences[:1], new[1:]])
-    doubled = History(new, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.points + 1, length).astype(np.int32))
+    doubled = History(new, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.known + 1, length).astype(np.int32))
     already = mesh[0] == mesh[1]
     return jax.tree.map(lambda old, new: jnp.where(already, old, new), history, doubled)

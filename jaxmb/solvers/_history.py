@@ -31,14 +31,14 @@ class History(eqx.Module):
 
     **Fields:**
 
-    - `differences`: scaled divided differences of the raveled derivative, one row each; zero from row `points` on.
-    - `mesh`: `t_n, t_{n-1}, ...`, latest first. Entries from `points` on are placeholders that keep the spans nonzero.
-    - `points`: how many mesh points have been visited since the start (or the last restart), at most `LENGTH`.
+    - `differences`: scaled divided differences of the raveled derivative, one row each; zero from row `known` on.
+    - `mesh`: `t_n, t_{n-1}, ...`, latest first. Entries from `known` on are placeholders that keep the spans nonzero.
+    - `known`: how many mesh points have been visited since the start (or the last restart), at most `LENGTH`.
     """
 
     differences: Float[Array, "length n"]
     mesh: Float[Array, " length"]
-    points: Int[Array, ""]
+    known: Int[Array, ""]
 
 
 def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
@@ -70,7 +70,7 @@ def basis_means(
     """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
     dtype = mesh.dtype
     table = basis(mesh, a + (b - a) * jnp.asarray(np.append(NODES, 1.0), dtype))
-    # Written out: in a batch XLA's sum over so short an axis is ten times as dear.
+    # Written out: in a batch XLA's sum over so short an axis is ten times as expensive.
     means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(WEIGHTS))
     return jnp.asarray(means), table[:, -1]
 
@@ -94,10 +94,10 @@ def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float
     """The history with one mesh point more; `partial_sums` are the polynomials of all orders, evaluated there."""
     # Rows that would mix in the placeholders are kept at zero: they are never used, but would grow without bound.
     length = history.mesh.shape[0]
-    known = history.points >= np.arange(length, dtype=np.int32)
+    known = history.known >= np.arange(length, dtype=np.int32)
     zero = jnp.zeros((), z.dtype)
     return History(
         differences=jnp.where(known[:, None], z[None] - partial_sums, zero),
         mesh=jnp.concatenate([t[None], history.mesh[:-1]]),
-        points=jnp.minimum(history.points + 1, length).astype(np.int32),
+        known=jnp.minimum(history.known + 1, length).astype(np.int32),
     )

@@ -221,20 +221,20 @@ def solve(
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 
-    From the `predicted` y and rate, with the matrix that is there. Where its iterations would cost more than a new one,
-    that is made at the nearest y so far, for the rate there. The prediction is not near enough where the direction of a
-    stiff spring turns: what a rate that is off by the stiffness does to the matrix is not small.
+    The iteration starts from the `predicted` y and rate, with the current iteration matrix (modified Newton). Where
+    iterations with it would cost more than a new matrix, a new one is made at the nearest y so far, for the rate there.
+    The prediction is not near enough where the direction of a stiff spring turns: a rate that is off by the stiffness
+    changes the matrix considerably.
 
-    **Arguments:** `before`: the state before the step and its rate, where Newton's method is begun anew if the field
-    was not finite; `matrix`: the one that is there; `size`: the norm of a correction in units of the tolerance, and
-    `tol`: of the last one, which is not applied to y, and to f and g only with the matrix that is there: what is left
-    of it would be multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state, for a
-    rate.
+    **Arguments:** `before`: the state before the step and its rate, where Newton's method restarts if the field was not
+    finite; `matrix`: the current one; `size`: the norm of a correction in units of the tolerance, and `tol`: the norm
+    of the last correction, which is not applied to y, and to f and g only by the current matrix: its remainder would be
+    multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state, for a rate.
 
-    g is taken along the rate that was predicted, then along what each correction makes of f. In f itself the error of y
-    is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the square
-    of the step: Newton's method would converge from near by only, on Robertson's reaction from nearer than rounding
-    allows.
+    g is taken along the rate that was predicted, then along the f that each correction leads to. In f itself the error
+    of y is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the
+    square of the step: Newton's method would converge only from nearby, and on Robertson's reaction only inside a basin
+    smaller than round-off.
 
     After a prediction that is as wrong as the state is large, as at the end of a fast transient, the matrix there may
     be so much too large that the second correction seems to be nothing, far from any solution. It is not asked for one.

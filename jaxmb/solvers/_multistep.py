@@ -1,4 +1,4 @@
-"""What the multistep solvers have in common: tolerances, starts and restarts, and how errors are measured."""
+"""The common base of the multistep solvers: tolerances, starts and restarts, and how errors are measured."""
 
 import abc
 from collections.abc import Callable
@@ -28,9 +28,14 @@ _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
 class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
-    """A multistep method under a `MultistepController`."""
+    """A multistep method under a `MultistepController`.
+
+    `solves_implicitly` says whether a step solves an equation for the independent components of the state, which an
+    `AbstractManifoldTerm` then has to name (`free`).
+    """
 
     tolerances: AbstractVar[Tolerances]
+    solves_implicitly: AbstractVar[bool]
 
     # The place from which diffrax fills in the tolerances of a step size controller. There is no root to find.
     @property
@@ -48,9 +53,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         self.tolerances.check(type(self).__name__)
         check_term(terms)
         check_real(y0)
-        return self._start(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
+        return self._initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
-    # A program in the program: it is traced once, not anew in each loop and each transformation around it.
+    # Nested jit: a step is traced once, not anew in each loop and each transformation around it.
     @eqx.filter_jit
     def step(
         self,
@@ -64,21 +69,28 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], Any, diffrax.RESULTS]:
         def restart():
             chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return self._start(terms, t0, t1, y0, args, chart, solver_state)
+            return self._initial_state(terms, t0, t1, y0, args, chart, solver_state)
 
         state = _restart_after(made_jump, restart, solver_state)
-        y1, estimate, dense_info, state, failed = self._take(terms, t1, y0, args, state)
+        y1, estimate, dense_info, state, failed = self._advance(terms, t1, y0, args, state)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
         return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
 
     @abc.abstractmethod
-    def _start(self, terms, t0, t1, y0, args, chart: Chart | None, before: Any) -> Any:
+    def statistics(self, solver_state: Any, controller_state: Any, stats: dict[str, Any]) -> dict[str, Any]:
+        """Counts of an integration, from the final states and diffrax's own `stats`.
+
+        Among them is `num_evaluations` of the vector field; with `SaveAt(solver_state=True, controller_state=True)`.
+        """
+
+    @abc.abstractmethod
+    def _initial_state(self, terms, t0, t1, y0, args, chart: Chart | None, before: Any) -> Any:
         """The solver state at a start; `before`: that before a jump, None at the first start."""
 
     @abc.abstractmethod
-    def _take(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
+    def _advance(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
         """A step: what `step` returns, but whether it failed instead of the result."""
 
     def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:

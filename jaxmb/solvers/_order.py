@@ -18,7 +18,7 @@ GAIN = 0.85
 
 
 class StepEstimate(eqx.Module):
-    """What a multistep solver tells its step size controller, as its `y_error`.
+    """The error estimate that a multistep solver passes to its step size controller, as its `y_error`.
 
     **Fields:**
 

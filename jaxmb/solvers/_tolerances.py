@@ -39,6 +39,7 @@ class Tolerances(eqx.Module):
 
     def check(self, solver: str) -> None:
         """Raise a `ValueError` if they come from a controller that cannot read the estimates of a multistep method."""
+        # A concrete class: the norm comes from the controller, and only that of `MultistepController` is of it.
         if not self.fixed and not isinstance(self.norm, MultistepNorm):
             raise ValueError(
                 f"`{solver}` chooses its order together with its step, which only `MultistepController` understands. "

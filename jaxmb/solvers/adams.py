@@ -31,22 +31,22 @@ _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
 
 class AdamsState(eqx.Module):
-    """What `Adams` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+    """The state of `Adams` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 
     - `history`: the mesh and the scaled divided differences of all components.
     - `order`: the order of the next step.
-    - `tally`: `tally[0]` counts the starts (the first, and the restarts after jumps), `tally[k]` the accepted steps of
-        order `k`. The number of evaluations of the vector field, rejected steps included, is
-        `tally[0] + 2 * solution.stats["num_steps"]`, and two more if the first step was not given as `dt0`.
+    - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
+        accepted steps of order `k`. The number of evaluations of the vector field, rejected steps included, is
+        `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more if the first step was not given as `dt0`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: what the accepted steps show of it, if that was asked for, otherwise `None`.
     """
 
     history: History
     order: Int[Array, ""]
-    tally: Int[Array, " length"]
+    step_counts: Int[Array, " length"]
     chart: Chart | None
     stiffness: Stiffness | None
 
@@ -93,6 +93,7 @@ class Adams(AbstractMultistep):
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RateInterpolation]] = RateInterpolation
+    solves_implicitly: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -132,19 +133,28 @@ class Adams(AbstractMultistep):
         del terms
         return self.max_order + 1
 
-    def _start(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
+    def statistics(self, solver_state: AdamsState, controller_state, stats):
+        out = {
+            "num_evaluations": solver_state.step_counts[0] + 2 * stats["num_steps"],
+            "orders": solver_state.step_counts[1:],
+        }
+        if solver_state.stiffness is not None:
+            out |= {"stiff": solver_state.stiffness.found, "stiff_steps": solver_state.stiffness.steps}
+        return out
+
+    def _initial_state(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
         first = evaluate(terms, t0, ravel(y0), y0, chart, args)
         f, chart = first.f, first.chart
         if first.failed is not False:
-            # It spreads to the error estimate, and fails the step.
+            # The NaN reaches the error estimate, so the step is rejected.
             f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
         if before is None:
-            tally, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
+            step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
         else:
-            tally, stiffness = before.tally, before.stiffness
-        return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), tally.at[0].add(1), chart, stiffness)
+            step_counts, stiffness = before.step_counts, before.stiffness
+        return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), step_counts.at[0].add(1), chart, stiffness)
 
-    def _take(self, terms, t1, y0, args, state: AdamsState):
+    def _advance(self, terms, t1, y0, args, state: AdamsState):
         history, order, chart = state.history, state.order, state.chart
         before = ravel(y0)
         dtype = before.dtype
@@ -183,7 +193,7 @@ class Adams(AbstractMultistep):
             jnp.asarray(_RESPONSES, dtype)[order],
             may_fall=order > self.min_order,
             may_rise=order < self.max_order,
-            known=order < history.points,
+            known=order < history.known,
             target=_TARGET,
             work=jnp.asarray(_WORK),
         )
@@ -191,7 +201,7 @@ class Adams(AbstractMultistep):
         new_state = AdamsState(
             history=advance(history, end, f, partial_sums),
             order=order + change,
-            tally=state.tally + (order == INDEX).astype(np.int32),
+            step_counts=state.step_counts + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, second.chart, args),
             stiffness=self._observed(state, h, before, predicted, after, first.f, f, y0),
         )

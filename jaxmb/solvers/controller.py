@@ -31,7 +31,7 @@ _CAUTION, _CAUTIOUS = 4, 1.4
 
 
 class ControllerState(eqx.Module):
-    """What `MultistepController` remembers between steps; `diffrax.SaveAt(controller_state=True)` returns it.
+    """The state of `MultistepController` between steps; `diffrax.SaveAt(controller_state=True)` returns it.
 
     **Fields:**
 
@@ -156,6 +156,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         controller_state: ControllerState,
     ) -> tuple[Any, Any, Any, bool, ControllerState, diffrax.RESULTS]:
         del y0, y1_candidate, args, error_order
+        # A concrete class: other solvers return an error of another type, which this controller cannot read.
         if not isinstance(y_error, StepEstimate):
             raise ValueError(
                 "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams` or "

@@ -22,6 +22,7 @@ from ._interpolation import MultistepInterpolation, RateInterpolation, StateInte
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._tolerances import Tolerances
+from .controller import ControllerState
 from .manifold_term import Chart
 
 # Newton's method ends when its correction would be smaller than this, in units of the tolerance.
@@ -31,26 +32,26 @@ _TARGET = 0.05
 
 
 class HermiteState(eqx.Module):
-    """What `Hermite` remembers between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+    """The state of `Hermite` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 
     - `history`: the mesh, and scaled divided differences: of f and y in the families that integrate, otherwise of y.
     - `slope`: the time derivatives of the same at the latest point.
-    - `points`: the number of points of the past in the formula of the next step.
+    - `order_index`: k, the number of points of the past in the formula of the next step.
     - `matrix`: what Newton's method works with.
-    - `tally`: `tally[0]` counts the starts (the first, and the restarts after jumps), `tally[k]` the accepted steps
-        with k points.
+    - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
+        accepted steps with k points.
     - `work`: evaluations of f with g, and matrices made, in accepted steps; the first evaluation after a start is in
-        `tally`, those of rejected steps are in `ControllerState`.
+        `step_counts`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     """
 
     history: History
     slope: Float[Array, " m"]
-    points: Int[Array, ""]
+    order_index: Int[Array, ""]
     matrix: Linearization
-    tally: Int[Array, " length"]
+    step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
 
@@ -71,7 +72,7 @@ class Hermite(AbstractMultistep):
 
     Formulas that are not A-stable make lightly damped vibrations grow when a step covers a few radians of them. They
     are only chosen for steps with which no eigenvalue of the Jacobian does that, as computed whenever Newton's method
-    needs a new one; unless `points` leaves no A-stable formula to choose instead. In large steps implicit
+    needs a new one; unless `past_points` leaves no A-stable formula to choose instead. In large steps implicit
     formulas damp what should grow: none covers more than two e-foldings of it.
 
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
@@ -98,14 +99,15 @@ class Hermite(AbstractMultistep):
 
     tolerances: Tolerances
     family: str = eqx.field(static=True)
-    points: tuple[int, ...] = eqx.field(static=True)
+    past_points: tuple[int, ...] = eqx.field(static=True)
 
     term_structure: ClassVar = diffrax.AbstractTerm
+    solves_implicitly: ClassVar[bool] = True
 
     def __init__(
         self,
         family: Literal["E", "B", "H", "Y"] = "E",
-        points: Sequence[int] | None = None,
+        past_points: Sequence[int] | None = None,
         *,
         rtol: Any = None,
         atol: Any = None,
@@ -114,9 +116,9 @@ class Hermite(AbstractMultistep):
         """**Arguments:**
 
         - `family`: of formulas.
-        - `points`: the numbers $k$ of points of the past to choose from, increasing; default all that are of use. A
-            pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a single
-            one fixes the order. The first of them is approached from $k = 1$.
+        - `past_points`: the numbers $k$ of points of the past to choose from, increasing; default all that are of use.
+            A pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a
+            single one fixes the order. The first of them is approached from $k = 1$.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
             leave them out.
@@ -127,16 +129,16 @@ class Hermite(AbstractMultistep):
         if family not in FAMILIES:
             raise ValueError(f"`Hermite` has the families {', '.join(FAMILIES)}; got `family={family!r}`.")
         highest = FAMILIES[family].highest
-        points = tuple(range(1, highest + 1) if points is None else points)
-        increasing = list(points) == sorted(set(points))
-        if not points or not increasing or any(k != int(k) or not 1 <= k <= highest for k in points):
+        past_points = tuple(range(1, highest + 1) if past_points is None else past_points)
+        increasing = list(past_points) == sorted(set(past_points))
+        if not past_points or not increasing or any(k != int(k) or not 1 <= k <= highest for k in past_points):
             raise ValueError(
-                f"The formulas of family {family} have 1 to {highest} points of the past; `points` lists some of these "
-                f"numbers, increasing. Got `points={points}`."
+                f"The formulas of family {family} have 1 to {highest} points of the past; `past_points` lists some of "
+                f"these numbers, increasing. Got `past_points={past_points}`."
             )
         self.tolerances = tolerances_of("Hermite", rtol, atol, norm)
         self.family = family
-        self.points = points
+        self.past_points = past_points
 
     @property
     def interpolation_cls(self) -> Callable[..., MultistepInterpolation]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -144,13 +146,24 @@ class Hermite(AbstractMultistep):
 
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:
         del terms
-        return FAMILIES[self.family].order(self.points[-1])
+        return FAMILIES[self.family].order(self.past_points[-1])
 
-    def _start(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
+    def statistics(self, solver_state: HermiteState, controller_state, stats):
+        # A concrete class: the controller's own state may stand within that of a `diffrax.ClipStepSizeController`.
+        is_own = lambda leaf: isinstance(leaf, ControllerState)
+        own = filter(is_own, jax.tree.leaves(controller_state, is_leaf=is_own))
+        work = solver_state.work + sum(controller.wasted for controller in own)
+        return {
+            "num_evaluations": solver_state.step_counts[0] + work[0],
+            "num_matrices": work[1],
+            "past_points": solver_state.step_counts[1:],
+        }
+
+    def _initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
         first = (probed_derivatives if before is None else derivatives)(field_of(terms, t0, y0, chart, args), t0, flat)
         chart, failed = first.rest
-        # It spreads to the error estimate, and fails the step.
+        # The NaN reaches the error estimate, so the step is rejected.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         free = free_components(terms, flat, chart)
         if free.size == 0:
@@ -163,13 +176,13 @@ class Hermite(AbstractMultistep):
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         if before is None:
-            tally, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
+            step_counts, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
         else:
-            tally, work = before.tally, before.work
-        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, tally.at[0].add(1), work, chart)
+            step_counts, work = before.step_counts, before.work
+        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, step_counts.at[0].add(1), work, chart)
 
-    def _take(self, terms, t1, y0, args, state: HermiteState):
-        family, history, k = FAMILIES[self.family], state.history, state.points
+    def _advance(self, terms, t1, y0, args, state: HermiteState):
+        family, history, k = FAMILIES[self.family], state.history, state.order_index
         before = ravel(y0)
         n, dtype = before.size, before.dtype
         nodes = family.multiplicity * k
@@ -207,7 +220,7 @@ class Hermite(AbstractMultistep):
             + (h * coefficients.slope)[:, None] * f[None]
             + (h**2 * coefficients.curvature)[:, None] * g[None]
         )
-        ladder = _ladder(self.points)
+        ladder = _ladder(self.past_points)
         around = jnp.asarray(ladder)[k]
         candidates = jnp.append(around, self._stable or 1)
         sizes = self._sizes(ends, candidates, family, newton, free, scale, y0)
@@ -217,20 +230,20 @@ class Hermite(AbstractMultistep):
             sizes[:3],
             family.order(around) + 1,
             jnp.asarray(_responses(family), dtype)[k],
-            may_fall=k > self.points[0],
-            may_rise=(k < self.points[-1]) & (family.multiplicity * (around[2] - 1) <= history.points),
-            known=family.multiplicity * (around[2] + 1) <= history.points,
+            may_fall=k > self.past_points[0],
+            may_rise=(k < self.past_points[-1]) & (family.multiplicity * (around[2] - 1) <= history.known),
+            known=family.multiplicity * (around[2] + 1) <= history.known,
             target=_TARGET,
             work=newton.work,
             limit=jnp.asarray((1.0, *family.growth), dtype)[k],
             bounded=bounded,
         )
-        points = around[1 + change]
+        order_index = around[1 + change]
         if self._stable is not None:
             # Between here and there may be formulas for which this step is of just the wrong length.
             growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
             better = (k > self._stable) & (growth > estimate.growth)
-            points = jnp.where(better, candidates[3], points)
+            order_index = jnp.where(better, candidates[3], order_index)
             estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))
 
         z, slope = self._recorded(y, f, g)
@@ -240,15 +253,15 @@ class Hermite(AbstractMultistep):
         renewed = next_chart(terms, t1, y1, chart, args)
         matrix = newton.matrix
         if chart is not None:
-            # Of other components it is another matrix.
+            # A new choice of components invalidates the matrix.
             changed = jnp.any(free_components(terms, before, renewed) != free)
             matrix = eqx.tree_at(lambda m: m.renewals, matrix, jnp.maximum(matrix.renewals, changed.astype(jnp.int32)))
         new_state = HermiteState(
             history=doubled if family.multiplicity == 2 else advanced,
             slope=slope,
-            points=points,
+            order_index=order_index,
             matrix=matrix,
-            tally=state.tally + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
+            step_counts=state.step_counts + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
             work=state.work + newton.work,
             chart=renewed,
         )
@@ -281,8 +294,8 @@ class Hermite(AbstractMultistep):
     @property
     def _stable(self) -> int | None:
         """The A-stable formula with the most points, if others may be chosen instead of it."""
-        stable = [k for k in self.points if k <= FAMILIES[self.family].stable]
-        return stable[-1] if stable and stable[-1] < self.points[-1] else None
+        stable = [k for k in self.past_points if k <= FAMILIES[self.family].stable]
+        return stable[-1] if stable and stable[-1] < self.past_points[-1] else None
 
     def _bounded(self, points, h, spectrum, factors) -> Float[Array, " formulas"]:
         """The factors by which steps may grow, where those of that length damp what should be damped."""
@@ -293,16 +306,16 @@ class Hermite(AbstractMultistep):
         return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
 
     def _recorded(self, y, f, g):
-        """What the history is of, and its slope."""
+        """The values that the history holds, and their time derivatives."""
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
 
 
-def _ladder(points: tuple[int, ...]) -> np.ndarray:
+def _ladder(past_points: tuple[int, ...]) -> np.ndarray:
     """For each number of points the one below in order, itself, and the one above."""
-    steps = [*range(1, points[0]), *points]
-    out = np.zeros((points[-1] + 1, 3), np.int32)
+    steps = [*range(1, past_points[0]), *past_points]
+    out = np.zeros((past_points[-1] + 1, 3), np.int32)
     for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
         out[own] = lower, own, upper
     return out

@@ -1,4 +1,4 @@
-"""What the multistep solvers ask of a term that also knows a manifold.
+"""The interface between the multistep solvers and a term that also knows a manifold.
 
 A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` is the same equation together with
 invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart).
@@ -19,7 +19,7 @@ Args: TypeAlias = Any
 
 
 class ManifoldEvaluation(NamedTuple):
-    """What an `AbstractManifoldTerm` returns.
+    """The value of an `AbstractManifoldTerm` at a state.
 
     **Fields:**
 

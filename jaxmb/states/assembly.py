@@ -17,8 +17,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import as_array, is_traced
 from ..linalg.elimination import full_pivot
-from ..linalg.rotations import normalize
-from ..system import AbstractSystem, RigidBodySystem
+from ..system import AbstractSystem
 from ..system.chain import VERY_LONG, is_long
 from ..system.coordinates import prescribe
 from . import chain_assembly as _chain_assembly
@@ -68,7 +67,7 @@ def assemble(
     q, _, ok = configuration(system, guess.q, fix, t, throw)
     # At rest, where nothing asks for motion, there is nothing to compile.
     known = not is_traced((system, guess, fix, u, t))
-    at_rest = known and system.homogeneous and not np.any(np.asarray(u)) and not np.any(fixed_rates)
+    at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     # Under a trace what comes of known numbers is traced as well.
     if throw and not is_traced((ok, ok_rates)):
@@ -94,9 +93,7 @@ def configuration(
     q, fixed = prescribe("coordinate", names, fix or {}, guess)
     if not is_traced(q):
         _check_finite(q, "coordinates")
-    whole = 0
-    if isinstance(system, RigidBodySystem):
-        q, whole = _normalize_fixed(system, q, fixed)
+    q, whole = system.normalize_fixed(q, fixed)
     q, ok = positions(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if throw and not is_traced(ok) and not ok:
         raise ValueError(_cannot_assemble(system, t, q, fixed, names))
@@ -249,20 +246,6 @@ def residual_size(
 def tolerance(dtype) -> float:
     """What counts as zero for a scaled residual: 1e-10 in double precision."""
     return float(jnp.finfo(dtype).eps) ** 0.64
-
-
-def _normalize_fixed(system, q, fixed):
-    """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of
-    those.
-    """
-    whole = [
-        row[3:]
-        for row in system.layout.pose_index[:-1]
-        if system.spatial and row[-1] < system.nq and fixed[row[3:]].all()
-    ]
-    for index in whole:
-        q = q.at[index].set(normalize(q[index]))
-    return q, len(whole)
 
 
 def _check_finite(vector, what):

@@ -60,7 +60,7 @@ def equilibrium(
     equilibrium; the message names the coordinates whose forces nothing balances. Under `jit` a run-time error without
     the names.
     """
-    if not system.plain:
+    if not system.ideal_on_velocities:
         raise ValueError("Equilibria are of systems whose constraints are ideal and bind positions or velocities.")
     guess = system.guess if guess is None else guess
     time: Any = as_array(t, guess.q.dtype)

@@ -97,7 +97,7 @@ def _analyse(system):
     out["acceleration rank"] = every.rank
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
-    if system.linear and (system.servos or not system.homogeneous):
+    if system.linear and (system.servos or not system.drift_free):
         # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is
         # contradiction.
         if system.velocity_rows:

@@ -1,1 +1,1 @@
-"""What motions are simulated for."""
+"""Studies that simulate a system many times."""

@@ -20,13 +20,13 @@ from ..states.assembly import assemble
 from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory
 from .minimise import Minimum, descend, levenberg_marquardt
-from .quantities import quantities, quantity
 from .ranges import Bounds, FreeParameters, free_parameters
 
 # A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
 _NO_EFFECT = 1e-10
 
-# Directions of parameters that the residuals feel less than this, relative to the strongest one, are not determined.
+# Directions of parameters to which the residuals are less sensitive than this, relative to the strongest direction, are
+# not determined.
 _UNDETERMINED = 1e-6
 # Parameters with at least this share in such a direction are named.
 _SHARE = 0.1
@@ -36,7 +36,7 @@ _ITERATIONS = {"lm": 100, "optax": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class Identification:
-    """What `identify` returns; `print` shows a table.
+    """The result of `identify`; `print` shows a table.
 
     **Fields:**
 
@@ -172,7 +172,7 @@ class _Measured(eqx.Module):
     def __call__(self, trajectory: Trajectory) -> Float[Array, "residuals"]:
         out = []
         for name, value in self.values.items():
-            difference = (quantity(trajectory, name) - value) * self.weights[name]
+            difference = (trajectory.quantity(name) - value) * self.weights[name]
             out.append(difference.reshape(-1)[self.present[name]])
         return jnp.concatenate(out)
 
@@ -218,9 +218,9 @@ class _Problem(eqx.Module):
         )
 
     def residuals(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Float[Array, "residuals"]:
-        return self.judged(z, adjoint)[0]
+        return self.residuals_and_result(z, adjoint)[0]
 
-    def judged(
+    def residuals_and_result(
         self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None
     ) -> tuple[Float[Array, "residuals"], RESULTS]:
         """Residuals, infinite if anything failed, and how the simulation ended."""
@@ -259,7 +259,7 @@ def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
         return _Residual(residual, jnp.ones((), ts.dtype))
     if not measured:
         raise ValueError("measured is empty: give at least one quantity by name.")
-    known = quantities(system, ts.shape[0])
+    known = {name: (ts.shape[0], *own.shape) for name, own in system.quantities().items()}
     for name in (*measured, *(sigma or {})):
         if name not in known:
             raise unknown("quantity", name, known)
@@ -302,7 +302,7 @@ def _linearised(problem: _Problem, z: Float[Array, "n"]):
     """Residuals, their Jacobian, and how the simulation ended."""
 
     def fn(z):
-        residuals, result = problem.judged(z, diffrax.ForwardMode())
+        residuals, result = problem.residuals_and_result(z, diffrax.ForwardMode())
         return residuals, (residuals, result)
 
     jacobian, (residuals, result) = jax.jacfwd(fn, has_aux=True)(z)

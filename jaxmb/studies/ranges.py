@@ -1,4 +1,4 @@
-"""Free parameters by name as one vector without constraints: zero at the start, about one where a parameter doubles."""
+"""Bijections between bounded parameters and an unconstrained vector, which is zero at the starting values."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._types import VectorLike
 from ..parts.names import unknown
-from ..system import AbstractSystem, RigidBodySystem, parameters
+from ..system import AbstractSystem, parameters
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -117,8 +117,8 @@ def free_parameters(
     """Free parameters with their starting values and ranges.
 
     **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
-    `(low, high)` by name, either of them None. Masses and moments of inertia of bodies stay positive, and inertia
-    matrices positive definite, without being told.
+    `(low, high)` by name, either of them None. The system's `positive_parameters`, such as masses and moments of
+    inertia of bodies, stay positive, or positive definite if they are matrices, without bounds.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
     bounds.
@@ -136,10 +136,9 @@ def free_parameters(
     for name in bounds:
         if name not in starts:
             raise unknown("free parameter with bounds", name, starts)
-    of_bodies = isinstance(system, RigidBodySystem)
+    positive = system.positive_parameters()
     ranges = [
-        _range(name, value, known[name], bounds.get(name), positive=of_bodies and name.endswith((".mass", ".inertia")))
-        for name, value in starts.items()
+        _range(name, value, known[name], bounds.get(name), positive=name in positive) for name, value in starts.items()
     ]
     return FreeParameters(tuple(starts), tuple(ranges))
 

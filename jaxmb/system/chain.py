@@ -20,7 +20,6 @@ from ..linalg.block_tridiagonal import BlockTridiagonal
 from .equation import AbstractSystem
 from .inertia import AbstractInertia
 from .layout import Layout, pick
-from .rigid_bodies import RigidBodySystem
 
 # From this number of rows on, motions of chains are eliminated block by block. A step of `Adams` on a chain of 5, 10,
 # 20, 35 rods takes 28, 46, 23, 33 µs that way and 39, 32, 111, 1076 µs by partitioning.
@@ -110,14 +109,13 @@ class BlockJacobian(eqx.Module):
         return pick(of_bodies.reshape(-1, of_bodies.shape[2]), self.chain.layout.velocity_place)
 
 
-def block_jacobian(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> BlockJacobian:
+def block_jacobian(system: Any, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> BlockJacobian:
     """A of a system whose joints form a chain.
 
     **Raises:** `ValueError` for other systems; the message names a joint that closes a loop or a body where the chain
     branches.
     """
     chain = chain_of(system)
-    assert isinstance(system, RigidBodySystem)
     poses, velocities = system.prepared_poses(q), system.all_velocities(u)
     groups = (*system.constraints, *system.velocity_constraints)
     flat = [g.jacobian(t, poses, velocities).reshape(-1) for g in groups]
@@ -130,11 +128,11 @@ def is_long(system: AbstractSystem, rows: int = LONG) -> bool:
     return may_be_long(system, rows) and system.velocity_rank == system.velocity_rows
 
 
-def may_be_long(system: AbstractSystem, rows: int = LONG) -> bool:
+def may_be_long(system: Any, rows: int = LONG) -> bool:
     """The same before ranks are known."""
-    if not isinstance(system, RigidBodySystem) or system.spatial or not rows <= system.velocity_rows < system.nu:
+    if not system.has_bodies or system.spatial or not rows <= system.velocity_rows < system.nu:
         return False
-    if system.velocity_rows > system.position_rows or not system.plain:
+    if system.velocity_rows > system.position_rows or not system.ideal_on_velocities:
         return False
     try:
         chain_of(system)
@@ -143,14 +141,14 @@ def may_be_long(system: AbstractSystem, rows: int = LONG) -> bool:
     return True
 
 
-def chain_of(system: AbstractSystem) -> Chain:
+def chain_of(system: Any) -> Chain:
     """The chain of a system's joints.
 
     **Raises:** `ValueError` as `block_jacobian`.
     """
-    if not isinstance(system, RigidBodySystem):
+    if not system.has_bodies:
         raise ValueError("Only scenes have a joint graph; use Multipliers() and Partition() or Projection().")
-    if not system.plain:
+    if not system.ideal_on_velocities:
         names = [name for g in (*system.servos, *system.nonideal) for name in g.group.names]
         raise ValueError(
             f"Chains are of ideal joints and without programs, and there is {', '.join(names)}; use Partition() or "

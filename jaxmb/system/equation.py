@@ -6,8 +6,8 @@
 
 `Φ` holds the constraints between positions; `ψ` their time derivatives followed by the nonholonomic rows; the first
 rows of A are ∂ψ/∂u, and those of constraints that bind accelerations only may follow. Coordinates may have invariants
-of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those. `C` is what constraints that are
-not ideal do beyond d'Alembert's principle; M depends on u only where velocities are nonlinear in q̇.
+of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those. `C` holds the forces of
+constraints that do virtual work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
@@ -15,15 +15,24 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
+from .description import Description
 from .inertia import AbstractInertia
+from .quantities import Quantity, Reaction
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
+
+
+# An accessor of an array of the system, and the index of the parameter along axis 0 where parts are stacked.
+ParameterPath = tuple[Callable[[Any], Array], int | None]
 
 
 class Ranks(eqx.Module):
@@ -45,9 +54,12 @@ class AbstractSystem(eqx.Module):
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
     - `acceleration_rows`, `acceleration_rank`: rows of A and the number of independent ones.
-    - `ideal`: whether C is zero; `regular`: whether M is positive definite, for motions against constraints as well.
+    - `ideal`: whether C is zero; `positive_definite_mass`: whether M is positive definite, for motions against
+        constraints as well.
     - `rates_are_velocities`: whether q̇ = u.
-    - `linear`: whether ψ is linear in u up to a constant term; `homogeneous`: whether that term is zero.
+    - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
+    - `has_bodies`: whether the system is made of bodies, and `Trajectory[...]` gives the motion of a body by its name;
+        otherwise it gives that of a coordinate.
     - `guess`: a state to begin an assembly with; `length` [m]: the size that residuals of positions are relative to.
     - `rows`: name of the part, and number within it, of every row of A.
     """
@@ -59,10 +71,11 @@ class AbstractSystem(eqx.Module):
     velocity_rows: AbstractVar[int]
     acceleration_rows: AbstractVar[int]
     ideal: AbstractVar[bool]
-    regular: AbstractVar[bool]
+    positive_definite_mass: AbstractVar[bool]
     rates_are_velocities: AbstractVar[bool]
     linear: AbstractVar[bool]
-    homogeneous: AbstractVar[bool]
+    drift_free: AbstractVar[bool]
+    has_bodies: AbstractVar[bool]
     guess: AbstractVar[State]
     length: AbstractVar[Float[Array, ""]]
     ranks: AbstractVar[Ranks]
@@ -77,8 +90,40 @@ class AbstractSystem(eqx.Module):
         """Indices in u of every name of a rate, or of several."""
 
     @abc.abstractmethod
-    def parameter_places(self) -> dict[str, list[tuple[Callable[[Any], Array], int | None]]]:
-        """Where each parameter stands: accessors of leaves, and the index in it where parts are stacked."""
+    def parameter_paths(self) -> dict[str, list[ParameterPath]]:
+        """Paths to the arrays that hold each parameter, by name."""
+
+    @abc.abstractmethod
+    def positive_parameters(self) -> frozenset[str]:
+        """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
+
+    @abc.abstractmethod
+    def describe(self) -> Description:
+        """Parts, rows, degrees of freedom, redundant rows, and what is specialised away, as text and as HTML."""
+
+    # A motion, with time as axis 0: `ts` of shape (times,), `ys` a `State`, `multipliers` of shape (times, rows).
+
+    @abc.abstractmethod
+    def motion_names(self) -> tuple[str, ...]:
+        """Names of the bodies, or of the coordinates of a system without bodies."""
+
+    @abc.abstractmethod
+    def motion(self, name: str, ys: State) -> Any:
+        """The motion of one of `motion_names`: a `BodyMotion`, or the values of a coordinate, shape (times,)."""
+
+    @abc.abstractmethod
+    def quantities(self) -> dict[str, Quantity]:
+        """The quantities that can be measured of a motion, by name."""
+
+    @abc.abstractmethod
+    def position_quantities(self) -> tuple[str, ...]:
+        """Names of the quantities that determine the configuration up to the attitude of bodies."""
+
+    @abc.abstractmethod
+    def outline(self, ys: State) -> dict[str, Float[Array, "times points d"]]:
+        """The points that a picture of each body shows along a motion, world axes [m]: its mass centre, and the points
+        where joints and forces act on it. Empty for a system without bodies.
+        """
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:
@@ -139,6 +184,13 @@ class AbstractSystem(eqx.Module):
         """The nearest coordinates that satisfy the coordinates' own invariants."""
 
     @abc.abstractmethod
+    def normalize_fixed(self, q: Float[Array, "nq"], fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
+        """Coordinates whose invariants between fixed entries alone are satisfied, and the number of those invariants.
+
+        No free coordinate is left to satisfy them with.
+        """
+
+    @abc.abstractmethod
     def coordinate_scale(self) -> Float[Array, "nq"]:
         """Size of a typical change of each coordinate; without derivative."""
 
@@ -153,6 +205,36 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def potential_energy(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, ""]:
         """Potential energy [J] of gravity and of every conservative force."""
+
+    # Of bodies; a system without bodies raises a `ValueError`.
+
+    @abc.abstractmethod
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+
+    @abc.abstractmethod
+    def reaction(
+        self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"]
+    ) -> Reaction:
+        """Reactions of one joint along a motion."""
+
+    @abc.abstractmethod
+    def force_names(self) -> tuple[str, ...]:
+        """Names of the force elements."""
+
+    @abc.abstractmethod
+    def applied_wrenches(self, name: str, ts: Float[Array, "times"], ys: State) -> Float[Array, "times bodies v"]:
+        """Wrenches of one force element on its bodies along a motion."""
+
+    @abc.abstractmethod
+    def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
+        """`Σ m v` [kg m/s], world axes."""
+
+    @abc.abstractmethod
+    def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
+        space.
+        """
 
     @property
     def position_rank(self) -> int:
@@ -171,7 +253,7 @@ class AbstractSystem(eqx.Module):
         return self.ranks.acceleration
 
     @property
-    def plain(self) -> bool:
+    def ideal_on_velocities(self) -> bool:
         """Whether every constraint is ideal and binds velocities."""
         return self.ideal and self.acceleration_rows == self.velocity_rows
 
@@ -180,3 +262,27 @@ class AbstractSystem(eqx.Module):
     ) -> Float[Array, "velocity_rows nu"]:
         """`∂ψ/∂u`, the first rows of A."""
         return self.jacobian(t, q, u)[: self.velocity_rows]
+
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names of the parts that exert constraint forces."""
+        return tuple(dict.fromkeys(name for name, _ in self.rows))
+
+    @eqx.filter_jit
+    def rates_along(self, ts: Float[Array, "times"], ys: State) -> Float[Array, "times nq"]:
+        """q̇ along a motion."""
+        return jax.vmap(lambda t, y: self.rates(t, y.q, y.u))(ts, ys)
+
+    @eqx.filter_jit
+    def generalized_constraint_force(
+        self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"]
+    ) -> Float[Array, "times nu"]:
+        """The share of one constraint in `Aᵀ λ`, along a motion."""
+        own = jnp.array([row == name for row, _ in self.rows])
+        multipliers = jnp.where(own[None, :], multipliers, jnp.zeros_like(multipliers))
+        return jax.vmap(lambda t, y, own: self.constraint_force(t, y.q, y.u, own))(ts, ys, multipliers)
+
+    def __str__(self) -> str:
+        return str(self.describe())
+
+    def _repr_html_(self) -> str:
+        return self.describe()._repr_html_()

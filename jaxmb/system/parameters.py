@@ -24,8 +24,8 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
     shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`.
     """
     leaves = {}
-    for name, places in system.parameter_places().items():
-        where, index = places[0]
+    for name, paths in system.parameter_paths().items():
+        where, index = paths[0]
         value = where(system)
         leaves[name] = value if index is None else _of(value, index)
     return leaves
@@ -40,12 +40,12 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
 
     **Raises:** `ValueError` for an unknown name (with the nearest ones) or a wrong shape.
     """
-    places = system.parameter_places()
+    paths = system.parameter_paths()
     for name, value in values.items():
-        if name not in places:
-            raise unknown("parameter", name, places)
+        if name not in paths:
+            raise unknown("parameter", name, paths)
         value = as_jax(value)
-        for where, index in places[name]:
+        for where, index in paths[name]:
             old = where(system)
             shape = old.shape if index is None else old.shape[1:]
             if value.shape != shape:

@@ -1,6 +1,6 @@
 """Rigid bodies joined by constraints and forces: the compiled form of a scene."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,8 +10,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..linalg.rotations import cross, rotate
+from ..linalg.rotations import cross, normalize, rotate
+from .body_motion import attachments, body_motion, body_quantities, outline
 from .coordinates import coordinate_names, rate_names
+from .describe import describe_scene
 from .equation import AbstractSystem, Ranks
 from .groups import (
     AbstractConstraintGroup,
@@ -24,10 +26,9 @@ from .groups import (
 )
 from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
-from .places import parameter_places
-
-if TYPE_CHECKING:
-    from .describe import Description
+from .parameter_paths import parameter_paths, positive_parameters
+from .quantities import Quantity
+from .reactions import applied_wrenches, reaction
 
 
 class Implied(NamedTuple):
@@ -59,20 +60,6 @@ class RigidBodySystem(AbstractSystem):
     gravity_name: str = eqx.field(static=True)
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
-
-    def __str__(self) -> str:
-        return str(self.describe())
-
-    def _repr_html_(self) -> str:
-        return self.describe()._repr_html_()
-
-    def describe(self) -> "Description":
-        """Bodies, joints, rows, degrees of freedom, redundant rows by name, and what was left out; as text and as
-        HTML.
-        """
-        from .describe import describe
-
-        return describe(self)
 
     # Sizes
 
@@ -110,11 +97,15 @@ class RigidBodySystem(AbstractSystem):
         return (*self.constraints, *self.velocity_constraints, *self.servos)
 
     @property
+    def has_bodies(self) -> bool:
+        return True
+
+    @property
     def ideal(self) -> bool:
         return not self.nonideal
 
     @property
-    def regular(self) -> bool:
+    def positive_definite_mass(self) -> bool:
         return True
 
     @property
@@ -126,7 +117,7 @@ class RigidBodySystem(AbstractSystem):
         return all(g.group.part.linear for g in self.velocity_constraints)
 
     @property
-    def homogeneous(self) -> bool:
+    def drift_free(self) -> bool:
         return not any(g.group.part.rheonomic for g in self.constraints) and all(
             g.group.part.homogeneous for g in self.velocity_constraints
         )
@@ -142,8 +133,86 @@ class RigidBodySystem(AbstractSystem):
     def rate_names(self):
         return rate_names(self.layout, self.body_names)
 
-    def parameter_places(self):
-        return parameter_places(self)
+    def parameter_paths(self):
+        return parameter_paths(self._gravity_name, self._groups, self.servos)
+
+    def positive_parameters(self):
+        return frozenset(positive_parameters(self._groups))
+
+    @property
+    def _groups(self):
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal")
+        return {kind: getattr(self, kind) for kind in kinds}
+
+    @property
+    def _gravity_name(self):
+        return None if self.gravity is None else self.gravity_name
+
+    def describe(self):
+        kinds: dict[str, list[str]] = {}
+        for g in self.bodies:
+            kinds.setdefault(type(g.group.part).__name__, []).extend(g.group.names)
+        return describe_scene(
+            self,
+            spatial=self.spatial,
+            bodies=kinds,
+            joints=[
+                (self.constraints, ""),
+                (self.velocity_constraints, ", between velocities"),
+                (self.servos, ", a program of a Servo"),
+            ],
+            forces=self.forces,
+            laws=self.nonideal,
+            gravity=self._gravity_name,
+            implied=self.implied,
+        )
+
+    # Views of a motion
+
+    def motion_names(self):
+        return self.body_names
+
+    def motion(self, name, ys):
+        return body_motion(self.layout, self.body_names.index(name), ys)
+
+    def quantities(self):
+        out = body_quantities(self.layout, self.body_names)
+        d = self.layout.space.dimension
+        for name in self.joint_names():
+            for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
+                value = lambda *along, name=name, field=field: getattr(self.reaction(name, *along), field)
+                out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
+        return out
+
+    def position_quantities(self):
+        return tuple(f"{name}.position" for name in self.body_names)
+
+    def joint_names(self):
+        return self.constraint_names()
+
+    @eqx.filter_jit
+    def reaction(self, name, ts, ys, multipliers):
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            return reaction(self.joints, name, t, poses, velocities, own)
+
+        return jax.vmap(single)(ts, ys, multipliers)
+
+    def force_names(self):
+        return tuple(dict.fromkeys(name for g in self.forces for name in g.group.names))
+
+    @eqx.filter_jit
+    def applied_wrenches(self, name, ts, ys):
+        def single(t, y):
+            return applied_wrenches(self.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
+
+        return jax.vmap(single)(ts, ys)
+
+    def outline(self, ys):
+        groups = (*self.constraints, *self.velocity_constraints, *self.forces)
+        points = attachments(groups, self.layout.bodies)
+        poses = jax.vmap(self.poses)(ys.q)
+        return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
 
     # Bodies
 
@@ -198,6 +267,16 @@ class RigidBodySystem(AbstractSystem):
         if self.rates_are_velocities:
             return q
         return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
+
+    def normalize_fixed(self, q, fixed):
+        whole = [
+            row[3:]
+            for row in self.layout.pose_index[:-1]
+            if self.spatial and row[-1] < self.nq and fixed[row[3:]].all()
+        ]
+        for index in whole:
+            q = q.at[index].set(normalize(q[index]))
+        return q, len(whole)
 
     def _pack(self, poses):
         if self.layout.uniform:

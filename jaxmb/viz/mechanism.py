@@ -2,11 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ..system import RigidBodySystem
 from ..trajectory import Trajectory
 from .figure import new_figure
 
@@ -27,48 +24,30 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}.")
-    system = trajectory.system
-    if not isinstance(system, RigidBodySystem):
+    bodies = trajectory.system.outline(trajectory.ys)
+    if not bodies:
         raise ValueError(
-            f"plot_mechanism draws bodies, and a {type(system).__name__} has none; plot_motion shows its coordinates."
+            f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "
+            "coordinates."
         )
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
-    poses = jax.vmap(system.poses)(trajectory.ys.q)
-    world = lambda pose, point: np.asarray(system.layout.space.point(pose, jnp.asarray(point)))
     figure = new_figure(6.0, 6.0)
-    axes = figure.add_subplot(projection="3d" if system.spatial else None)
-    for k, (name, points) in enumerate(zip(system.body_names, _attachments(system), strict=True)):
-        centre = np.asarray(poses[:, k, : system.layout.space.dimension])
-        axes.plot(*centre.T, color=f"C{k % 10}", linewidth=0.8, alpha=0.5)
+    outlines = {name: np.asarray(points) for name, points in bodies.items()}
+    spatial = next(iter(outlines.values())).shape[-1] == 3
+    axes = figure.add_subplot(projection="3d" if spatial else None)
+    for k, (name, points) in enumerate(outlines.items()):
+        color = f"C{k % 10}"
+        centre = points[:, 0]
+        axes.plot(*centre.T, color=color, linewidth=0.8, alpha=0.5)
         for order, time in enumerate(shown):
             fade = (order + 1) / len(shown)
-            for point in points:
-                axes.plot(
-                    *np.stack([centre[time], world(poses[time, k], point)]).T,
-                    color=f"C{k % 10}",
-                    linewidth=2,
-                    alpha=fade,
-                )
+            for point in points[time, 1:]:
+                axes.plot(*np.stack([centre[time], point]).T, color=color, linewidth=2, alpha=fade)
             last = order == len(shown) - 1
-            axes.plot(*centre[time], "o", color=f"C{k % 10}", markersize=4, alpha=fade, label=name if last else None)
+            axes.plot(*centre[time], "o", color=color, markersize=4, alpha=fade, label=name if last else None)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(fontsize="small")
     return figure
-
-
-def _attachments(system: RigidBodySystem) -> list[list[np.ndarray]]:
-    """For every body the body-fixed points [m] of the joints and forces on it, each once."""
-    points: list[dict[tuple, np.ndarray]] = [{} for _ in system.body_names]
-    for group in (*system.constraints, *system.velocity_constraints, *system.forces):
-        stacked = group.group
-        for which, field in enumerate(("point_a", "point_b")):
-            values = getattr(stacked.part, field, None)
-            if values is None or stacked.body_index.shape[1] <= which:
-                continue
-            for body, point in zip(stacked.body_index[:, which], np.asarray(values), strict=True):
-                if body < len(points):
-                    points[body][tuple(np.round(point, 12))] = point
-    return [list(own.values()) for own in points]

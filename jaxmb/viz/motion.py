@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..parts.names import unknown
-from ..system import RigidBodySystem
 from ..trajectory import Trajectory
 from .figure import new_figure
 
@@ -24,7 +23,7 @@ def plot_motion(trajectory: Trajectory, names: Sequence[str] | None = None) -> "
     """Plot positions or angles, velocities, energy and constraint residuals against time.
 
     **Arguments:** `trajectory`: a motion saved at several times; `names` of the bodies to show, or of the coordinates
-    of a system that has no bodies, default all.
+    of a system without bodies, default all.
 
     **Returns:** a matplotlib `Figure` [s; m or rad and their rates; J]: angles for rigid bodies of the plane, positions
     of the mass centres for point masses and in space, or coordinates and their rates q̇. `figure.savefig(path)` writes
@@ -33,18 +32,17 @@ def plot_motion(trajectory: Trajectory, names: Sequence[str] | None = None) -> "
     **Raises:** `ValueError` for an unknown name or fewer than two times; `ImportError` without matplotlib.
     """
     system = trajectory.system
-    bodies = isinstance(system, RigidBodySystem)
-    known = tuple(system.body_names if bodies else system.coordinate_names())
-    names = known if names is None else tuple(names)
+    known = system.motion_names()
+    names = tuple(names or known)
     for name in names:
         if name not in known:
-            raise unknown("body" if bodies else "coordinate", name, known)
+            raise unknown("body" if system.has_bodies else "coordinate", name, known)
     if trajectory.ts.shape[0] < 2:
         raise ValueError("plot_motion needs a motion saved at two times or more; give simulate saveat=…")
     t = np.asarray(trajectory.ts)
     figure = new_figure(9.0, 6.0)
     (position, rate), (energy, residual) = figure.subplots(2, 2, sharex=True)
-    (_draw_bodies if bodies else _draw_coordinates)(trajectory, names, position, rate)
+    _draw(trajectory, names, position, rate)
 
     energy.plot(t, trajectory.kinetic_energy, label="kinetic")
     energy.plot(t, trajectory.potential_energy, label="potential")
@@ -62,30 +60,27 @@ def plot_motion(trajectory: Trajectory, names: Sequence[str] | None = None) -> "
     return figure
 
 
-def _draw_bodies(trajectory: Trajectory, names: Sequence[str], position: "Axes", rate: "Axes") -> None:
-    t = np.asarray(trajectory.ts)
-    angles = [name for name in names if trajectory[name].angle is not None]
-    for name in names:
-        motion = trajectory[name]
-        if motion.angle is not None:
-            position.plot(t, motion.angle, label=name)
-            rate.plot(t, motion.angular_velocity, label=name)
-        else:
-            for k, axis in enumerate("xyz"[: motion.position.shape[1]]):
-                position.plot(t, motion.position[:, k], label=f"{name} {axis}")
-                rate.plot(t, motion.velocity[:, k], label=f"{name} {axis}")
-    units = ("[rad]", "[rad/s]") if len(angles) == len(names) else ("[m]", "[m/s]") if not angles else ("", "")
-    _finish(position, f"angle {units[0]}" if angles else f"position {units[0]}")
-    _finish(rate, f"angular velocity {units[1]}" if angles else f"velocity {units[1]}")
+# What is drawn of a body or coordinate, the first that its system measures: quantity, its rate, their names and units.
+_DRAWN = (
+    (".angle", ".angular_velocity", ("angle", "angular velocity"), ("[rad]", "[rad/s]")),
+    (".position", ".velocity", ("position", "velocity"), ("[m]", "[m/s]")),
+    ("", ".rate", ("coordinate", "rate of the coordinate"), ("", "")),
+)
 
 
-def _draw_coordinates(trajectory: Trajectory, names: Sequence[str], position: "Axes", rate: "Axes") -> None:
-    index, rates = trajectory.system.coordinate_names(), np.asarray(trajectory.rates)
+def _draw(trajectory: Trajectory, names: Sequence[str], position: "Axes", rate: "Axes") -> None:
+    t, known = np.asarray(trajectory.ts), trajectory.system.quantities()
+    kinds = []
     for name in names:
-        position.plot(trajectory.ts, trajectory[name], label=name)
-        rate.plot(trajectory.ts, rates[:, index[name][0]], label=name)
-    _finish(position, "coordinate")
-    _finish(rate, "rate of the coordinate")
+        kinds.append(next(kind for kind in _DRAWN if name + kind[0] in known))
+        for axes, field in zip((position, rate), kinds[-1][:2], strict=True):
+            values = np.asarray(known[name + field].value(trajectory.ts, trajectory.ys, None))
+            for k, value in enumerate(values.reshape(t.size, -1).T):
+                axes.plot(t, value, label=name if values.ndim == 1 else f"{name} {'xyz'[k]}")
+    _, _, labels, _ = min(kinds, key=_DRAWN.index)
+    units = kinds[0][3] if len(set(kinds)) == 1 else ("", "")
+    for axes, label, unit in zip((position, rate), labels, units, strict=True):
+        _finish(axes, f"{label} {unit}".rstrip())
 
 
 def _finish(axes: "Axes", label: str) -> None:

@@ -107,7 +107,7 @@ def ode_solvers(key: str) -> dict[str, Solver]:
             work = None
             if isinstance(solver, Hermite):
                 state, controller_state = solution.solver_state, solution.controller_state
-                work = state.tally[0] + state.work[0] + controller_state.wasted[0]
+                work = state.step_counts[0] + state.work[0] + controller_state.wasted[0]
             return solution.ys[-1], solution.stats, solution.result == diffrax.RESULTS.successful, work
 
         run = jax.jit(lambda rtol: solve(problem.vector_field, rtol))

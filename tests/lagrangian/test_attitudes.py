@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba, accelerations
-from jaxmb.lagrangian import Frame, Holonomic, LagrangianSystem, Servo
+from jaxmb.lagrangian import Holonomic, LagrangianSystem, QuasiVelocityFrame, ServoConstraint
 from jaxmb.linalg import rotations
 
 ROADS = [Partitioned(), Multipliers(), NullSpace(), Poincare(), UdwadiaKalaba()]
@@ -38,7 +38,7 @@ def turning(t, q, p):
 def bodies(inertias, constraint, q, u):
     return LagrangianSystem(
         kinetic=kinetic,
-        kinematics=Frame(turning, u.size),
+        kinematics=QuasiVelocityFrame(turning, u.size),
         constraints=[constraint],
         q=q,
         u=u,
@@ -113,7 +113,7 @@ def tracked(t, p, omega):
 @pytest.fixture(scope="module")
 def tracking():
     q, u = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, -0.2, 0.5])
-    return bodies(INERTIAS[:1], Servo("track", off, *GAINS), q, u)
+    return bodies(INERTIAS[:1], ServoConstraint("track", off, *GAINS), q, u)
 
 
 def on_direction(t, spin):

@@ -14,16 +14,16 @@ from jaxmb.formulations import Multipliers, Partitioned, accelerations
 from jaxmb.lagrangian import (
     AccelerationConstraint,
     Connection,
-    Frame,
-    Friction,
+    CoulombFriction,
     Hamel,
     Holonomic,
     LagrangianSystem,
     Nonholonomic,
-    NonIdeal,
+    NonIdealForce,
     Pfaffian,
     QuasiVelocities,
-    Servo,
+    QuasiVelocityFrame,
+    ServoConstraint,
     Viscous,
     Voronets,
 )
@@ -50,7 +50,7 @@ def circle(t):
 def test_a_closed_path_of_shapes_moves_the_snake():
     mechanism = library("three_platform_snake", gait=circle)
     system, state = mechanism.system, mechanism.state
-    assert system.velocity_rank == system.nu and system.linear and not system.homogeneous
+    assert system.velocity_rank == system.nu and system.linear and not system.drift_free
     run = lambda y, t0, t1: mb.simulate(system, y, t0=t0, t1=t1, rtol=1e-12, atol=1e-14)
     last = lambda out: jax.tree.map(lambda y: y[-1], out.ys)
     once = last(run(state, 0.0, 2 * np.pi))
@@ -98,7 +98,7 @@ def test_the_control_force_is_the_least_one():
 def test_a_servo_beside_constraints_that_are_kept():
     """A pendulum in Cartesian coordinates whose height follows: one chart for the bar, its force and the control's."""
     bar = Holonomic("bar", lambda t, q, p: jnp.dot(q, q) - 1.0)
-    follow = Servo("follow", lambda t, q, p: q[1] + 0.8 - 0.1 * jnp.sin(3 * t), damping=8.0, stiffness=16.0)
+    follow = ServoConstraint("follow", lambda t, q, p: q[1] + 0.8 - 0.1 * jnp.sin(3 * t), damping=8.0, stiffness=16.0)
     system = LagrangianSystem(
         kinetic=free, potential=lambda t, q, p: 9.81 * q[1], constraints=[follow, bar], q=(0.6, -0.8), u=(0.0, 0.0)
     )
@@ -136,21 +136,21 @@ def ring(*laws, extra=(), **kwargs):
 def test_work_of_constraint_forces(formulation):
     """`w · (M u̇ − F) = w · C` in every displacement w that is allowed, and the constraint holds whatever C is."""
     along = jnp.array([-0.8, 0.6])
-    wild = NonIdeal("ring", lambda t, q, v, multipliers, p: jnp.array([0.7, -0.4]) * multipliers[0] ** 2)
+    wild = NonIdealForce("ring", lambda t, q, v, multipliers, p: jnp.array([0.7, -0.4]) * multipliers[0] ** 2)
     system = ring(wild)
     q, u = system.guess.q, system.guess.u
     udot, _ = accelerations(system, formulation, ZERO, q, u)
     np.testing.assert_allclose(along @ udot, along @ np.array([0.7, -0.4]), rtol=0, atol=1e-14)
     np.testing.assert_allclose(system.acceleration_residual(ZERO, q, u, udot), 0.0, atol=1e-14)
     # What is normal to the ring has no effect.
-    normal = ring(NonIdeal("ring", lambda t, q, v, multipliers, p: 5.0 * q))
+    normal = ring(NonIdealForce("ring", lambda t, q, v, multipliers, p: 5.0 * q))
     ideal = accelerations(ring(), formulation, ZERO, q, u)[0]
     np.testing.assert_allclose(accelerations(normal, formulation, ZERO, q, u)[0], ideal, rtol=0, atol=1e-14)
 
 
 def test_energy_goes_into_friction():
     """Of both kinds, by their power."""
-    system = ring(Friction("ring", "mu"), Viscous("ring", "c"))
+    system = ring(CoulombFriction("ring", "mu"), Viscous("ring", "c"))
     ts = np.linspace(0.0, 2.0, 400)
     run = mb.simulate(system, system.guess, t1=2.0, rtol=1e-11, saveat=ts)
     speed = np.linalg.norm(np.asarray(run.ys.u), axis=1)
@@ -262,7 +262,7 @@ BAD = {
     "both L and T": ({"lagrangian": free}, "either `lagrangian` or `kinetic`"),
     "not differentiable twice": ({"kinetic": lambda t, q, v, p: jnp.sum(jnp.abs(v))}, "second derivatives"),
     "force of another shape": ({"force": lambda t, q, v, p: jnp.zeros(3)}, "force must have shape"),
-    "one name twice": ({"constraints": [ONE, ONE]}, "'ring' is there twice"),
+    "one name twice": ({"constraints": [ONE, ONE]}, "'ring' is used twice"),
     "no constraint": ({"constraints": [free]}, "constraints must hold"),
     "names of coordinates": ({"coordinates": ("x", "x")}, "all different"),
     "cannot be satisfied": ({"constraints": [Holonomic("far", lambda t, q, p: jnp.dot(q, q) + 1.0)]}, "far"),
@@ -270,28 +270,28 @@ BAD = {
         {"constraints": [Nonholonomic("cone", lambda t, q, v, p: jnp.sqrt(jnp.dot(v, v)))]},
         "cone: its derivative",
     ),
-    "frame of too many": ({"kinematics": Frame(lambda t, q, p: jnp.ones((2, 3)), 3)}, "at most as many"),
+    "frame of too many": ({"kinematics": QuasiVelocityFrame(lambda t, q, p: jnp.ones((2, 3)), 3)}, "at most as many"),
     "frame that does not span": (
-        {"kinematics": Frame(lambda t, q, p: jnp.ones((2, 2)), 2), "equations": Hamel()},
+        {"kinematics": QuasiVelocityFrame(lambda t, q, p: jnp.ones((2, 2)), 2), "equations": Hamel()},
         "not independent",
     ),
-    "no frame": ({"equations": Hamel()}, "kinematics=Frame"),
+    "no frame": ({"equations": Hamel()}, "kinematics=QuasiVelocityFrame"),
     "no connection": ({"equations": Voronets()}, "kinematics=Connection"),
     "base and fibre": ({"kinematics": Connection((0,), (0,), lambda t, q, p: jnp.ones((1, 1)))}, "each of them once"),
     "not invertible": (
         {"kinematics": QuasiVelocities(lambda t, q, v, p: v[0] * jnp.ones(2), (1.0, 1.0))},
         "not invertible",
     ),
-    "unknown constraint": ({"nonideal": [Friction("wire", "mu")]}, "'wire'"),
+    "unknown constraint": ({"nonideal": [CoulombFriction("wire", "mu")]}, "'wire'"),
     "redundant friction": (
         {
             "constraints": [ONE, Holonomic("same", lambda t, q, p: 2 * jnp.dot(q, q) - 2.0)],
-            "nonideal": [Friction("ring", "mu")],
+            "nonideal": [CoulombFriction("ring", "mu")],
             "parameters": {"mu": 0.1},
         },
         "not determined",
     ),
-    "unknown coefficient": ({"constraints": [ONE], "nonideal": [Friction("ring", "mu")]}, "'mu'"),
+    "unknown coefficient": ({"constraints": [ONE], "nonideal": [CoulombFriction("ring", "mu")]}, "'mu'"),
 }
 
 
@@ -305,7 +305,7 @@ def test_refused(case):
 def test_bad_transpositions():
     with pytest.raises(ValueError, match="'holder', 'suslov'"):
         Hamel("vakonomic")
-    frame = Frame(lambda t, q, p: jnp.eye(2), 2)
+    frame = QuasiVelocityFrame(lambda t, q, p: jnp.eye(2), 2)
     with pytest.raises(ValueError, match="must have shape"):
         system(kinematics=frame, equations=Hamel(lambda t, q, v, dq, p: jnp.zeros(3)))
 
@@ -325,7 +325,7 @@ def test_contradicting_rows_leave_a_residual():
 def test_pfaffian_with_a_drift():
     moving = Pfaffian("belt", lambda t, q, p: jnp.array([[0.0, 1.0]]), lambda t, q, p: -p["speed"])
     belt = system(constraints=[moving], parameters={"speed": 0.3})
-    assert belt.linear and not belt.homogeneous
+    assert belt.linear and not belt.drift_free
     start = mb.assemble(belt, rates={"q0": 0.5})
     np.testing.assert_allclose(start.u, (0.5, 0.3), rtol=0, atol=1e-15)
     run = mb.simulate(belt, start, t1=1.0)

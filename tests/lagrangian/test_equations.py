@@ -12,12 +12,12 @@ from jaxmb import mechanisms
 from jaxmb.formulations import Multipliers, Partitioned, accelerations
 from jaxmb.lagrangian import (
     Connection,
-    Frame,
     Hamel,
     Holonomic,
     LagrangianSystem,
     Nonholonomic,
     QuasiVelocities,
+    QuasiVelocityFrame,
     Voronets,
     johnsen_hamel_residual,
     kinetostatic_forces,
@@ -142,7 +142,7 @@ def test_the_snake_in_a_frame_as_well():
     system = library("three_platform_snake").system
     frame = LagrangianSystem(
         system.lagrangian,
-        kinematics=Frame(columns_of_the_snake, 2),
+        kinematics=QuasiVelocityFrame(columns_of_the_snake, 2),
         equations=Hamel("suslov"),
         q=system.guess.q,
         parameters=system.parameters,
@@ -180,7 +180,7 @@ def test_a_drift_and_time_in_the_frame_and_in_the_connection():
 
     columns = lambda t, q, p: jax.jacfwd(lambda u: connection.rates(t, q, u, p))(jnp.zeros(2))
     drift = lambda t, q, p: connection.rates(t, q, jnp.zeros(2), p)
-    frame = Frame(columns, 2, drift)
+    frame = QuasiVelocityFrame(columns, 2, drift)
     for kinematics, equations in (
         (connection, Voronets()),
         (connection, Voronets("holder")),
@@ -213,7 +213,7 @@ def test_a_frame_chosen_by_pivots_has_no_singularity_of_its_own():
 
 def test_structure_functions_of_rotations():
     """In body axes `[X_1, X_2] = X_3`, and in turn."""
-    frame = Frame(lambda t, q, p: _body_axes(q), 3)
+    frame = QuasiVelocityFrame(lambda t, q, p: _body_axes(q), 3)
     c = structure_functions(frame, ZERO, jnp.array([0.5, 0.4, -0.3]), {})
     expected = np.zeros((3, 3, 3))
     for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -247,7 +247,11 @@ def test_a_body_in_euler_parameters_and_in_angular_velocities():
     expected = np.linalg.solve(J, -np.cross(w, J @ w))
     for equations in (None, Hamel()):
         body = LagrangianSystem(
-            kinetic=kinetic, kinematics=Frame(columns, 3), equations=equations, q=q, parameters={"inertia": J}
+            kinetic=kinetic,
+            kinematics=QuasiVelocityFrame(columns, 3),
+            equations=equations,
+            q=q,
+            parameters={"inertia": J},
         )
         np.testing.assert_allclose(solved(body, q, w)[0], expected, rtol=0, atol=1e-13)
     unit = Holonomic("unit", lambda t, q, p: q @ q - 1.0)

@@ -85,7 +85,7 @@ def test_batch_equals_loop():
 
     def run(omega):
         solution = _solve(omega=omega, dt0=0.5, saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 4.0, 5), solver_state=True))
-        return solution.ys, solution.stats["num_rejected_steps"], solution.solver_state.tally
+        return solution.ys, solution.stats["num_rejected_steps"], solution.solver_state.step_counts
 
     batch = jax.jit(jax.vmap(run))(omegas)
     single = jax.jit(run)
@@ -105,12 +105,12 @@ def test_continuation_repeats_the_unbroken_solve():
         2.0, 4.0, y0=y, saveat=keep, solver_state=first.solver_state, controller_state=first.controller_state, dt0=0.02
     )
     _assert_close(jax.tree.map(lambda x: x[-1], second.ys), _exact(4.0))
-    assert second.solver_state.tally[0] == 1
+    assert second.solver_state.step_counts[0] == 1
     whole = _solve(0.0, 4.0, saveat=keep)
-    assert second.solver_state.tally.sum() < whole.solver_state.tally.sum() + 10
+    assert second.solver_state.step_counts.sum() < whole.solver_state.step_counts.sum() + 10
     jumped = _solve(2.0, 4.0, y0=y, saveat=keep, solver_state=first.solver_state, made_jump=True)
     _assert_close(jax.tree.map(lambda x: x[-1], jumped.ys), _exact(4.0))
-    assert jumped.solver_state.tally[0] == 2
+    assert jumped.solver_state.step_counts[0] == 2
 
 
 def test_single_precision_and_mixed_leaves():
@@ -146,7 +146,7 @@ def test_restart_after_a_jump_repeats_an_opening():
     jumping = diffrax.ClipStepSizeController(controller, jump_ts=jnp.array([1.0]))
     whole = _solve(0.0, 3.0, y0=jnp.array([2.0]), controller=jumping, **common)
     at_jump = int(np.argmin(np.abs(np.asarray(whole.ts) - 1.0)))
-    assert whole.solver_state.tally[0] == 2
+    assert whole.solver_state.step_counts[0] == 2
     # The same, started after the jump with the first step that the restart settled for.
     t0 = np.nextafter(1.0, 2.0)
     fresh = _solve(t0, 3.0, y0=whole.ys[at_jump], dt0=whole.ts[at_jump + 1] - t0, controller=controller, **common)
@@ -229,9 +229,9 @@ def test_evaluations_are_counted():
     )
     jax.effects_barrier()
     assert solution.stats["num_rejected_steps"] > 0
-    tally = solution.solver_state.tally
-    assert tally[1:].sum() == solution.stats["num_accepted_steps"]
-    assert len(calls) == tally[0] + 2 * solution.stats["num_steps"]
+    step_counts = solution.solver_state.step_counts
+    assert step_counts[1:].sum() == solution.stats["num_accepted_steps"]
+    assert len(calls) == step_counts[0] + 2 * solution.stats["num_steps"]
 
 
 def test_plain_terms_trace_no_manifold():

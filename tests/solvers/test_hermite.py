@@ -110,7 +110,7 @@ def test_robertson_does_not_break_down(rtol):
 def test_every_family(family, points):
     error, solution = relative_error(PROBLEMS["HIRES"], 1e-6, solver=Hermite(family, points))
     assert error < 1e-3
-    used = np.flatnonzero(solution.solver_state.tally[1:]) + 1
+    used = np.flatnonzero(solution.solver_state.step_counts[1:]) + 1
     if points is not None:
         assert set(used) <= {*range(1, points[0]), *points} and points[-1] in used
 
@@ -134,7 +134,7 @@ def test_what_grows_is_not_stepped_over(points):
     """A pendulum that is let go above its pivot, nearer to it than the tolerance, falls nevertheless."""
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], jnp.sin(y[0])])),
-        Hermite(points=points),
+        Hermite(past_points=points),
         0.0,
         100.0,
         None,
@@ -273,7 +273,7 @@ def test_dense_output(family, points):
 def test_jumps_restart():
     controller = diffrax.ClipStepSizeController(MultistepController(1e-8, 1e-8), jump_ts=jnp.array([1.0, 2.5]))
     solution = _run(controller=controller, saveat=diffrax.SaveAt(t1=True, solver_state=True))
-    assert solution.solver_state.tally[0] == 3
+    assert solution.solver_state.step_counts[0] == 3
     np.testing.assert_allclose(solution.ys[-1], _exact(np.array(5.0)), rtol=0, atol=1e-6)
 
 
@@ -324,10 +324,10 @@ def test_single_precision():
     "arguments, message",
     [
         ({"family": "A"}, "families E, B, H, Y"),
-        ({"points": (0, 1)}, "1 to 7 points"),
-        ({"points": (4, 2)}, "increasing"),
-        ({"points": ()}, "increasing"),
-        ({"family": "H", "points": (4,)}, "1 to 3 points"),
+        ({"past_points": (0, 1)}, "1 to 7 points"),
+        ({"past_points": (4, 2)}, "increasing"),
+        ({"past_points": ()}, "increasing"),
+        ({"family": "H", "past_points": (4,)}, "1 to 3 points"),
         ({"rtol": 1e-3}, "both of"),
     ],
 )

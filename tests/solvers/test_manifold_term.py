@@ -94,10 +94,10 @@ def test_change_of_chart_keeps_the_order():
     term = Circle(jnp.array(1.0))
     charted = _solve(term)
     plain = _solve(diffrax.ODETerm(term.vf))
-    tally = charted.solver_state.tally
+    step_counts = charted.solver_state.step_counts
     assert charted.solver_state.chart["changes"] > 5
-    assert tally[0] == 1
-    assert tally[1:6].sum() < 14
+    assert step_counts[0] == 1
+    assert step_counts[1:6].sum() < 14
     assert charted.stats["num_steps"] < 1.3 * plain.stats["num_steps"]
 
 
@@ -170,7 +170,7 @@ def test_jump_on_the_manifold():
         stepsize_controller=controller,
         saveat=saveat,
     )
-    assert solution.solver_state.tally[0] == 2
+    assert solution.solver_state.step_counts[0] == 2
     assert solution.solver_state.chart["changes"] > 1
     np.testing.assert_allclose(solution.ys[-1], _exact(4.0), rtol=0, atol=1e-7)
 

@@ -1,0 +1,274 @@
+"""The equations of a Lagrangian system in any velocities, and the ways to write them, before its structure is known."""
+
+import abc
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar, State
+from ..system import AbstractGeneralizedSystem, DenseInertia, DiagonalInertia
+from ..system.describe import count_independent, count_rows, shorten, specialised_constraints
+from ..system.description import Description
+from ..system.equation import ParameterPath
+from .constraints import AbstractCoordinateConstraint
+from .kinematics import AbstractKinematics
+from .nonideal import AbstractNonIdealForce
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+
+class AbstractEquations(eqx.Module):
+    """A way to write `M u̇ = F + Aᵀ λ`; all ways give the same F."""
+
+    @abc.abstractmethod
+    def check(self, system: "AbstractLagrangian") -> None:
+        """Raise a `ValueError` for a system that the equations cannot be written for."""
+
+    @abc.abstractmethod
+    def force(
+        self, system: "AbstractLagrangian", t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
+    ) -> Float[Array, "nu"]:
+        """`F(t, q, u)`."""
+
+
+class AbstractLagrangian(AbstractGeneralizedSystem):
+    """The functions of a Lagrangian system, and every kernel that follows from them by automatic differentiation.
+
+    **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
+    potential, or None; `constraints`, ordered by level; `sizes`, the number of rows of each.
+
+    `diagonal` says whether the mass matrix is diagonal and constant.
+    """
+
+    lagrangian: Callable[..., Array] = eqx.field(static=True)
+    applied: Callable[..., Array] | None = eqx.field(static=True)
+    constraints: tuple[AbstractCoordinateConstraint, ...]
+    nonideal: tuple[AbstractNonIdealForce, ...]
+    kinematics: AbstractKinematics
+    equations: AbstractEquations
+    parameters: dict[str, Array]
+    guess: State
+    length: Float[Array, ""]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    sizes: tuple[int, ...] = eqx.field(static=True)
+
+    diagonal: AbstractVar[bool]
+
+    # Sizes
+
+    @property
+    def nq(self) -> int:
+        return self.guess.q.shape[-1]
+
+    @property
+    def nu(self) -> int:
+        return self.guess.u.shape[-1]
+
+    @property
+    def position_rows(self) -> int:
+        return self._rows(0)
+
+    @property
+    def coordinate_rows(self) -> int:
+        return self.position_rows
+
+    @property
+    def velocity_rows(self) -> int:
+        return self._rows(1)
+
+    @property
+    def acceleration_rows(self) -> int:
+        return self._rows(2)
+
+    def _rows(self, level):
+        return sum(n for c, n in zip(self.constraints, self.sizes, strict=True) if c.level <= level)
+
+    @property
+    def ideal(self) -> bool:
+        return not self.nonideal
+
+    @property
+    def rates_are_velocities(self) -> bool:
+        return self.kinematics.identity
+
+    @property
+    def rows(self) -> tuple[tuple[str, int], ...]:
+        """Name of the constraint, and number within it, of every row of A."""
+        return tuple((c.name, k) for c, n in zip(self.constraints, self.sizes, strict=True) for k in range(n))
+
+    def coordinate_names(self):
+        return {name: [k] for k, name in enumerate(self.coordinates)}
+
+    def rate_names(self):
+        if self.kinematics.identity:
+            return self.coordinate_names()
+        return {f"u{k}": [k] for k in range(self.nu)}
+
+    def parameter_paths(self) -> dict[str, list[ParameterPath]]:
+        return {name: [(_parameter(name), None)] for name in self.parameters}
+
+    def positive_parameters(self):
+        # The meaning of a parameter is the user's.
+        return frozenset()
+
+    # Kinematics
+
+    def rates(self, t, q, u):
+        return self.kinematics.rates(t, q, u, self.parameters)
+
+    def normalize(self, q):
+        return q
+
+    # Constraints
+
+    @eqx.filter_jit
+    def position_residual(self, t, q):
+        return self._join(c.value(t, q, q, q, self.parameters) for c in self.constraints if c.level == 0)
+
+    def coordinate_residual(self, t, q):
+        return self.position_residual(t, q)
+
+    @eqx.filter_jit
+    def coordinate_jacobian(self, t, q):
+        return jax.jacfwd(self.position_residual, 1)(t, q)
+
+    @eqx.filter_jit
+    def velocity_residual(self, t, q, u):
+        t = jnp.asarray(t, q.dtype)
+        v = self.rates(t, q, u)
+        _, rate = jax.jvp(self.position_residual, (t, q), (jnp.ones_like(t), v))
+        return self._join([rate, *(c.value(t, q, v, v, self.parameters) for c in self.constraints if c.level == 1)])
+
+    @eqx.filter_jit
+    def acceleration_residual(self, t, q, u, udot):
+        t = jnp.asarray(t, q.dtype)
+        v, one = self.rates(t, q, u), jnp.ones_like(t)
+        _, rate = jax.jvp(self.velocity_residual, (t, q, u), (one, v, udot))
+        _, a = jax.jvp(self.rates, (t, q, u), (one, v, udot))
+        others = [c.value(t, q, v, a, self.parameters) for c in self.constraints if c.level == 2]
+        return self._join([rate, *others])
+
+    @eqx.filter_jit
+    def jacobian(self, t, q, u):
+        # Linear in accelerations, so that its derivative is the same anywhere.
+        return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
+
+    @eqx.filter_jit
+    def constraint_force(self, t, q, u, multipliers):
+        _, pull = jax.vjp(lambda udot: self.acceleration_residual(t, q, u, udot), jnp.zeros_like(u))
+        return pull(multipliers)[0]
+
+    @eqx.filter_jit
+    def nonideal_force(self, t, q, u, multipliers):
+        t = jnp.asarray(t, q.dtype)
+        v, pull = jax.vjp(lambda u: self.rates(t, q, u), u)
+        total = jnp.zeros_like(q)
+        for law in self.nonideal:
+            mine = jnp.array([name == law.constraint for name, _ in self.rows])
+            ideal = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
+            first = [name for name, _ in self.rows].index(law.constraint)
+            own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
+            total = total + law.force(t, q, v, ideal, own, self.parameters)
+        return pull(total)[0]
+
+    def _on_coordinates(self, t, q, v, multipliers):
+        """The generalized force on the coordinates of these multipliers."""
+
+        def residual(a):
+            return self._join(
+                jax.jacfwd(c.value, 1 + c.level)(t, q, v, v, self.parameters) @ a
+                if c.level < 2
+                else c.value(t, q, v, a, self.parameters)
+                for c in self.constraints
+            )
+
+        return jax.vjp(residual, jnp.zeros_like(v))[1](multipliers)[0]
+
+    def _join(self, blocks):
+        return jnp.concatenate([jnp.zeros(0, self.guess.q.dtype), *blocks])
+
+    # Dynamics
+
+    def momentum(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
+        """`∂L/∂q̇`."""
+        return jax.grad(self.lagrangian, 2)(t, q, v, self.parameters)
+
+    @eqx.filter_jit
+    def inertia(self, t, q, u):
+        t = jnp.asarray(t, q.dtype)
+        v = self.rates(t, q, u)
+        along = lambda w: jax.jvp(lambda v: self.momentum(t, q, v), (v,), (w,))[1]
+        if self.diagonal:
+            return DiagonalInertia(along(jnp.ones_like(v)))
+        if self.kinematics.identity:
+            return DenseInertia(jax.vmap(along)(jnp.eye(self.nq, dtype=q.dtype)))
+        columns = jax.jacfwd(lambda u: self.rates(t, q, u))(u)
+        return DenseInertia(jax.vmap(along, in_axes=1)(columns) @ columns)
+
+    @eqx.filter_jit
+    def force(self, t, q, u):
+        return self.equations.force(self, jnp.asarray(t, q.dtype), q, u)
+
+    def applied_force(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
+        """Q, the generalized forces on the coordinates that have no potential."""
+        return jnp.zeros_like(v) if self.applied is None else jnp.asarray(self.applied(t, q, v, self.parameters))
+
+    # Energy
+
+    @eqx.filter_jit
+    def kinetic_energy(self, t, q, u):
+        """`q̇ · ∂L/∂q̇ − L` without the potential energy: the kinetic energy, if L is quadratic in q̇."""
+        t = jnp.asarray(t, q.dtype)
+        v = self.rates(t, q, u)
+        energy = v @ self.momentum(t, q, v) - self.lagrangian(t, q, v, self.parameters)
+        return energy - self.potential_energy(t, q)
+
+    @eqx.filter_jit
+    def potential_energy(self, t, q):
+        """`−L(t, q, 0)`."""
+        return -self.lagrangian(t, q, jnp.zeros_like(q), self.parameters)
+
+    # Scales
+
+    def coordinate_scale(self):
+        return jnp.ones(self.nq)
+
+    def velocity_scale(self):
+        return jnp.ones(self.nu)
+
+    # Description
+
+    def describe(self) -> Description:
+        kind = "rates of the coordinates" if self.kinematics.identity else f"of a {type(self.kinematics).__name__}"
+        facts = [
+            ("system", f"of a Lagrangian, {self.nq} coordinates: {shorten(self.coordinates)}"),
+            ("velocities", f"{self.nu}, {kind}"),
+            ("constraint rows", count_rows(self)),
+            ("degrees of freedom", str(self.nu - self.velocity_rank)),
+            ("independent", count_independent(self)),
+            ("equations", type(self.equations).__name__),
+        ]
+        if self.parameters:
+            facts.append(("parameters", shorten(self.parameters)))
+        sizes = zip(self.constraints, self.sizes, strict=True)
+        tables = {
+            "constraints": tuple((type(c).__name__, c.name, f"{n} row{'s' * (n > 1)}") for c, n in sizes),
+            "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
+        }
+        specialised = specialised_constraints(self)
+        if self.diagonal:
+            specialised.append("diagonal mass matrix: no factorisation")
+        if self.applied is None:
+            specialised.append("no forces besides those of the Lagrangian")
+        return Description(tuple(facts), tables, {"specialised away": tuple(specialised)})
+
+
+def _parameter(name: str) -> Callable[[Any], Array]:
+    return lambda system: system.parameters[name]

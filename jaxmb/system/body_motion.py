@@ -1,0 +1,65 @@
+"""Views of a motion by the names of bodies: their motion, the quantities measured of it, and their outlines."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import State
+from .layout import Layout
+from .quantities import BodyMotion, Quantity
+
+
+def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
+    """The motion of one body."""
+    d = layout.space.dimension
+    # Entries of a body follow one another.
+    i, j = int(layout.pose_index[body][0]), int(layout.velocity_index[body][0])
+    position, velocity = ys.q[:, i : i + d], ys.u[:, j : j + d]
+    if not layout.rotates[body]:
+        return BodyMotion(position, velocity, None, None, None)
+    if d == 2:
+        return BodyMotion(position, velocity, ys.q[:, i + 2], None, ys.u[:, j + 2])
+    return BodyMotion(position, velocity, None, ys.q[:, i + 3 : i + 7], ys.u[:, j + 3 : j + 6])
+
+
+def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]:
+    """The fields of `BodyMotion` of every body, `"crank.angle"`."""
+    d = layout.space.dimension
+    translation = {"position": (d,), "velocity": (d,)}
+    rotation = {"angle": (), "angular_velocity": ()} if d == 2 else {"orientation": (4,), "angular_velocity": (3,)}
+    out = {}
+    for body, name in enumerate(names):
+        for field, shape in (translation | rotation if layout.rotates[body] else translation).items():
+            value = lambda ts, ys, _, body=body, field=field: getattr(body_motion(layout, body, ys), field)
+            out[f"{name}.{field}"] = Quantity(shape, value)
+    return out
+
+
+def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
+    """For every body the body-fixed points [m] of the parts in some groups that act on it, each once, shape
+    (points, d).
+    """
+    points: list[dict[tuple, np.ndarray]] = [{} for _ in range(bodies)]
+    for group in groups:
+        stacked = group.group
+        for k, of_parts in enumerate(stacked.body_index.T):
+            anchors = stacked.part.anchor(k)
+            for body, point in zip(
+                of_parts, () if anchors is None else np.asarray(anchors), strict=anchors is not None
+            ):
+                if body < bodies:
+                    points[body][tuple(np.round(point, 12))] = point
+    return [np.stack(list(own.values())) if own else np.zeros((0, 0)) for own in points]
+
+
+def outline(layout: Layout, poses: Float[Array, "times p"], points: np.ndarray) -> Float[Array, "times points d"]:
+    """The mass centre of a body and body-fixed points of it along a motion, world axes."""
+    centre = poses[:, None, : layout.space.dimension]
+    if not points.size:
+        return centre
+    world = jax.vmap(lambda pose: jax.vmap(lambda point: layout.space.point(pose, point))(jnp.asarray(points)))(poses)
+    return jnp.concatenate([centre, world], axis=1)

@@ -1,0 +1,59 @@
+"""Systems in generalized coordinates, without bodies: views of a motion by the names of the coordinates."""
+
+from .equation import AbstractSystem
+from .quantities import Quantity
+
+
+class AbstractGeneralizedSystem(AbstractSystem):
+    """A system whose motion is that of its coordinates. Measured are coordinates, their rates q̇, and the generalized
+    forces of constraints: `"theta"`, `"theta.rate"`, `"A.force"`.
+    """
+
+    @property
+    def has_bodies(self) -> bool:
+        return False
+
+    def motion_names(self):
+        return tuple(self.coordinate_names())
+
+    def motion(self, name, ys):
+        return ys.q[:, self.coordinate_names()[name][0]]
+
+    def quantities(self):
+        out = {name: Quantity((), lambda ts, ys, _, name=name: self.motion(name, ys)) for name in self.motion_names()}
+        for name, (index,) in self.coordinate_names().items():
+            rate = lambda ts, ys, _, index=index: self.rates_along(ts, ys)[:, index]
+            out[f"{name}.rate"] = Quantity((), rate)
+        for name in self.constraint_names():
+            force = lambda ts, ys, multipliers, name=name: self.generalized_constraint_force(name, ts, ys, multipliers)
+            out[f"{name}.force"] = Quantity((self.nu,), force, of_forces=True)
+        return out
+
+    def position_quantities(self):
+        return self.motion_names()
+
+    def normalize_fixed(self, q, fixed):
+        return q, 0
+
+    def outline(self, ys):
+        return {}
+
+    # There are no bodies to act on.
+
+    def joint_names(self):
+        raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
+
+    def reaction(self, name, ts, ys, multipliers):
+        raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
+
+    def force_names(self):
+        raise ValueError("forces are of parts that act on bodies; this system has none.")
+
+    def applied_wrenches(self, name, ts, ys):
+        raise ValueError("forces are of parts that act on bodies; this system has none.")
+
+    def linear_momentum(self, q, u):
+        raise ValueError("Momentum is that of bodies; this system has none. Work it out from its coordinates.")
+
+    def angular_momentum(self, q, u):
+        raise ValueError("Momentum is that of bodies; this system has none. Work it out from its coordinates.")
