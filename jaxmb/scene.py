@@ -1,6 +1,5 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +25,7 @@ from .parts.servo import Servo
 from .parts.spatial.kinematics import SPACE
 from .planar import Body as PlanarBody, PointMass as PlanarPointMass
 from .spatial import Body as SpatialBody, PointMass as SpatialPointMass
-from .states.structure import find_structure
+from .states.structure import with_structure
 from .system import RigidBodySystem
 from .system.describe import Description
 from .system.equation import Ranks
@@ -127,9 +126,9 @@ class Scene(eqx.Module):
             gravity_name="" if gravity is None else gravity.name,
             ranks=Ranks(0, 0, 0, 0),
             implied=(),
+            elimination=None,
         )
-        ranks, implied = find_structure(system)
-        return dataclasses.replace(system, ranks=ranks, implied=implied)
+        return with_structure(system)
 
 
 def _call(part, name, *arguments):

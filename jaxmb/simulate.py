@@ -14,15 +14,14 @@ from jaxtyping import Array, ArrayLike
 
 from ._results import RESULTS
 from ._types import Scalar, State
-from .formulations import AbstractFormulation, BlockMultipliers, Multipliers, NullSpace, Partitioned
-from .formulations.formulation import stages
+from .formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned
+from .formulations.formulation import row_levels
 from .linalg.arrays import as_array, is_traced
 from .linalg.elimination import full_pivot
-from .manifold import AbstractManifold, Baumgarte, BlockProjection, Free, Partition, Projection, project
+from .manifold import AbstractManifold, Baumgarte, Partition, Projection, Unconstrained, project
 from .manifold.partition import Chart
 from .solvers import AbstractMultistep, Adams, AdamsState, ControllerState, Hermite, HermiteState, MultistepController
 from .system import AbstractSystem
-from .system.chain import is_long
 from .trajectory import Trajectory
 
 # Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
@@ -73,12 +72,11 @@ def simulate(
         many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion found stiff is
         simulated again, with `Hermite` from `t0` on; not under `jit`, `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` where a partition is there, else
-        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular;
-        `BlockMultipliers()` for long chains of joints.
+        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`,
         `Projection()` for others, and nothing of either for a system without constraints; for `Adams` on a planar scene
-        with 30 or more constraint rows whose joints form a chain, `BlockProjection()`, whose cost grows with the number
-        of joints and not with its cube.
+        with 30 or more constraint rows whose joints form a chain, `Projection()` as well, whose cost grows with the
+        number of joints and not with its cube.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
@@ -162,17 +160,15 @@ def simulate(
 
 def _manifold(system, solver, formulation) -> AbstractManifold:
     if system.acceleration_rows == 0:
-        return Free()
-    if isinstance(solver, Adams) and (is_long(system) if formulation is None else not formulation.assembles):
-        return BlockProjection()
+        return Unconstrained()
+    if isinstance(solver, Adams) and system.elimination is not None and isinstance(formulation, Multipliers | None):
+        return Projection()
     return Partition() if isinstance(solver, AbstractMultistep) else Projection()
 
 
 def _formulation(system, manifold) -> AbstractFormulation:
     if isinstance(manifold, Partition):
         return Partitioned()
-    if isinstance(manifold, BlockProjection) or (isinstance(manifold, Projection) and is_long(system)):
-        return BlockMultipliers()
     return Multipliers() if system.regular else NullSpace()
 
 
@@ -270,7 +266,7 @@ def _way_back(manifold: AbstractManifold, interpolated: bool) -> Any:
     if isinstance(manifold, Baumgarte):
         # How far its states are off is what one looks for.
         return _normalized
-    return _on_manifold if interpolated or isinstance(manifold, Free) else None
+    return _on_manifold if interpolated or isinstance(manifold, Unconstrained) else None
 
 
 def _restore(system, ts, saved, back):
@@ -307,7 +303,7 @@ def _diagnose(system, start, end, solution):
     system = lax.stop_gradient(system)
 
     def smallest_pivot():
-        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
+        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), level=row_levels(system))
         return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
     pivot = lax.cond(stuck, smallest_pivot, lambda: jnp.ones((), y.q.dtype))

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from ..linalg.elimination import solve_positive
-from ..linalg.orthogonal import frame
+from ..linalg.orthogonal import orthogonal_basis
 from .formulation import AbstractFormulation
 
 
@@ -27,10 +27,11 @@ class NullSpace(AbstractFormulation):
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = False
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        split = frame(jacobian[factor.rows].T)
-        Z, solution = split.across, split.pseudoinverse
-        particular = solution.T @ gamma[factor.rows]
+    def solve(self, inertia, force, jacobian, gamma):
+        jacobian = jacobian.dense()
+        basis = orthogonal_basis(jacobian.independent.T)
+        Z, solution = basis.complement, basis.pseudoinverse
+        particular = solution.T @ jacobian.gather_rows(gamma)
         reduced = Z.T @ inertia.product(Z)
         udot = particular + Z @ solve_positive(reduced, Z.T @ (force - inertia.product(particular)))
-        return udot, factor.spread(solution @ (inertia.product(udot) - force))
+        return udot, jacobian.scatter_rows(solution @ (inertia.product(udot) - force))

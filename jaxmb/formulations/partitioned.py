@@ -27,9 +27,10 @@ class Partitioned(AbstractFormulation):
     partitions: ClassVar[bool] = True
     inverts_mass: ClassVar[bool] = False
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        particular = factor.correction @ gamma
-        reduced = factor.basis.T @ inertia.product(factor.basis)
-        independent = solve_positive(reduced, factor.basis.T @ (force - inertia.product(particular)))
-        udot = particular + factor.basis @ independent
-        return udot, factor.correction.T @ (inertia.product(udot) - force)
+    def solve(self, inertia, force, jacobian, gamma):
+        factor = jacobian.dense().pivoted
+        particular = factor.right_inverse @ gamma
+        reduced = factor.null_space.T @ inertia.product(factor.null_space)
+        independent = solve_positive(reduced, factor.null_space.T @ (force - inertia.product(particular)))
+        udot = particular + factor.null_space @ independent
+        return udot, factor.right_inverse.T @ (inertia.product(udot) - force)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State, VectorLike
+from ..linalg.jacobian import DenseJacobian
 from ..parts.base import array
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.equation import Ranks
@@ -77,6 +78,7 @@ class LagrangianSystem(AbstractSystem):
     linear: bool = eqx.field(static=True)
     homogeneous: bool = eqx.field(static=True)
     ranks: Ranks
+    elimination: ClassVar[None] = None
 
     def __init__(
         self,
@@ -238,6 +240,9 @@ class LagrangianSystem(AbstractSystem):
     def jacobian(self, t, q, u):
         # Linear in accelerations, so that its derivative is the same anywhere.
         return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
+
+    def structured_jacobian(self, t, q, u):
+        return DenseJacobian(self.jacobian(t, q, u))
 
     @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):

@@ -1,8 +1,8 @@
 """Policies that keep the state on its constraints."""
 
 from .baumgarte import Baumgarte as Baumgarte
-from .block_projection import BlockProjection as BlockProjection
-from .free import Free as Free
 from .manifold import AbstractManifold as AbstractManifold
+from .orthogonal_projection import project as project
 from .partition import Partition as Partition
-from .projection import Projection as Projection, project as project
+from .projection import Projection as Projection
+from .unconstrained import Unconstrained as Unconstrained

@@ -50,8 +50,8 @@ class StabilisedField(eqx.Module):
         position = system.position_residual(t, q)
         velocity = system.velocity_residual(t, q, u)
         holonomic = np.arange(system.velocity_rows) < system.position_rows
-        demand = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
-        demand = demand + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
-        demand = jnp.pad(demand, (0, system.acceleration_rows - demand.size))
-        udot, _ = accelerations(system, self.formulation, t, q, u, demand)
+        shift = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
+        shift = shift + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
+        shift = jnp.pad(shift, (0, system.acceleration_rows - shift.size))
+        udot, _ = accelerations(system, self.formulation, t, q, u, shift)
         return State(system.rates(t, q, u), udot)

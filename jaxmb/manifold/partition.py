@@ -14,26 +14,26 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import State
 from ..formulations import AbstractFormulation
-from ..formulations.formulation import check_mass, stages
-from ..linalg.elimination import factor, full_pivot
+from ..formulations.formulation import check_mass, row_levels
+from ..linalg.elimination import eliminate, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
 from .constrained import (
-    Evaluation,
-    Split,
+    ChartIndices,
+    ConstrainedAcceleration,
     coordinate_factor,
     correct_positions,
-    evaluate,
-    evaluate_general,
-    restore,
+    general_acceleration,
+    ideal_acceleration,
     restore_positions,
-    shared,
+    restore_state,
+    shares_split,
 )
-from .free import VectorField
 from .manifold import AbstractManifold, newton_tolerance
+from .unconstrained import VectorField
 
-# A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
+# A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
@@ -77,10 +77,6 @@ class Partition(AbstractManifold):
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
-        if not formulation.assembles:
-            raise ValueError(
-                f"{type(formulation).__name__} finds no independent coordinates; use BlockProjection() with it."
-            )
         return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
 
 
@@ -91,7 +87,7 @@ class Chart(eqx.Module):
     redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties.
     """
 
-    split: Split
+    split: ChartIndices
     quality: Float[Array, "k"]
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
@@ -148,39 +144,39 @@ class PartitionTerm(AbstractManifoldTerm):
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
             if system.plain:
-                out = evaluate(system, self.formulation, t, q, u, split.velocity)
+                out = ideal_acceleration(system, self.formulation, t, q, u, split.velocity)
             else:
-                out = evaluate_general(system, self.formulation, t, q, u, split)
+                out = general_acceleration(system, self.formulation, t, q, u, split)
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
-                split = Split(split.velocity, split.acceleration, None, factors.correction)
+                split = ChartIndices(split.velocity, split.acceleration, None, factors.right_inverse)
         chart = Chart(split, quality, chart.fresh, chart.counters)
         return ManifoldEvaluation(State(q, u), State(system.rates(t, q, u), udot), chart, chart.singular, factors)
 
-    def restore(self, t, y, near, args):
-        system, chart = self.system, near.chart
+    def project_near(self, t, y, linearized_at, args):
+        system, chart = self.system, linearized_at.chart
         if system.acceleration_rows == 0 or not system.plain:
-            return self._settle(t, y, chart, chart.split)
-        before = lax.stop_gradient((near.y.u, near.f.u))
-        before = Evaluation(*before, near.factors)
-        out: Any = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+            return self._project(t, y, chart, chart.split)
+        before = lax.stop_gradient((linearized_at.y.u, linearized_at.f.u))
+        before = ConstrainedAcceleration(*before, linearized_at.factors)
+        out: Any = restore_state(system, t, y.q, y.u, before, chart.split, self.newton_tol)
         f = State(system.rates(t, out.q, out.u), out.udot)
         chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
 
-    def settle(self, t, y, chart, args):
+    def project_cold(self, t, y, chart, args):
         if not (self.system.plain and self.system.linear):
-            return super().settle(t, y, chart, args)
+            return super().project_cold(t, y, chart, args)
         split = chart.split
         if split.coordinate is None:
             # The chart's matrix is of the state before the step.
             system, at, q = lax.stop_gradient((self.system, t, y.q))
-            split = eqx.tree_at(lambda s: s.correction, split, coordinate_factor(system, at, q, split).correction)
-        return self._settle(t, y, chart, split)
+            split = eqx.tree_at(lambda s: s.right_inverse, split, coordinate_factor(system, at, q, split).right_inverse)
+        return self._project(t, y, chart, split)
 
-    def _settle(self, t, y, chart, split):
-        """Positions restored with the matrix of a split, then evaluated there."""
+    def _project(self, t, y, chart, split):
+        """Restore positions with the matrix of a split, then evaluate there."""
         q, iterations, failed = restore_positions(self.system, t, y.q, split, self.newton_tol)
         out = self._evaluate(t, q, y.u, _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
@@ -241,33 +237,35 @@ def _updated(system, t, y, chart, max_influence):
 
 def _of_coordinates(system, t, y):
     """The coordinates' Jacobian, where that of the velocities does not serve both."""
-    return None if shared(system) else system.coordinate_jacobian(t, y.q)
+    return None if shares_split(system) else system.coordinate_jacobian(t, y.q)
 
 
 def _choose(system, t, y, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled."""
-    jacobian, scale, stage = system.jacobian(t, y.q, y.u), system.velocity_scale(), stages(system)
+    jacobian, scale, levels = system.jacobian(t, y.q, y.u), system.velocity_scale(), row_levels(system)
     rows = system.velocity_rows
-    velocity = full_pivot(jacobian[:rows], scale=scale, stage=stage[:rows])
+    velocity = full_pivot(jacobian[:rows], scale=scale, level=levels[:rows])
     singular = velocity.rank != system.velocity_rank
-    solved = factor(jacobian[:rows], velocity.order, system.velocity_rank)
+    solved = eliminate(jacobian[:rows], velocity.order, system.velocity_rank)
     quality = _velocity_quality(system, solved, velocity.order)
     acceleration = None
     if system.acceleration_rows > rows:
-        every = full_pivot(jacobian, scale=scale, stage=stage)
+        every = full_pivot(jacobian, scale=scale, level=levels)
         acceleration, singular = every.order, singular | (every.rank != system.acceleration_rank)
-    if shared(system):
-        return Split(velocity.order, acceleration, None, solved.correction), quality, singular
+    if shares_split(system):
+        return ChartIndices(velocity.order, acceleration, None, solved.right_inverse), quality, singular
     pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-    split, own = _refreshed(system, of_coordinates, Split(velocity.order, acceleration, pivots.order, jnp.zeros(())))
+    split, own = _refreshed(
+        system, of_coordinates, ChartIndices(velocity.order, acceleration, pivots.order, jnp.zeros(()))
+    )
     return split, jnp.maximum(quality, own), singular | (pivots.rank != system.coordinate_rank)
 
 
 def _refreshed(system, jacobian, split):
     """The split with the position factor of this state, from its Jacobian, and the coordinates' quality."""
-    solved = factor(jacobian, split.coordinate, system.coordinate_rank)
+    solved = eliminate(jacobian, split.coordinate, system.coordinate_rank)
     own = _quality(system, solved, system.coordinate_scale(), split.coordinate, system.coordinate_rank)
-    return Split(split.velocity, split.acceleration, split.coordinate, solved.correction), own
+    return ChartIndices(split.velocity, split.acceleration, split.coordinate, solved.right_inverse), own
 
 
 def _velocity_quality(system, solved, order):
@@ -277,8 +275,8 @@ def _velocity_quality(system, solved, order):
 
 def _quality(system, solved, scale, order, rank):
     """What a chart is judged by, in units of the coordinates' scales."""
-    influence = jnp.abs(solved.basis) * scale[order.columns[rank:]][None, :] / scale[:, None]
+    influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
     largest = [jnp.max(influence, initial=1.0)]
     if system.velocity_rank < system.velocity_rows:
-        largest.append(jnp.max(jnp.abs(solved.correction) / scale[:, None], initial=0.0))
+        largest.append(jnp.max(jnp.abs(solved.right_inverse) / scale[:, None], initial=0.0))
     return jnp.stack(largest)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.jacobian import DenseJacobian
 from ..planar import DraftGear
 from ..system import AbstractInertia, AbstractSystem, DenseInertia
 from ..system.equation import Ranks
@@ -85,6 +86,7 @@ class RelativeTrain(AbstractSystem):
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
     ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
+    elimination: ClassVar[None] = None
     rows: ClassVar[tuple[tuple[str, int], ...]] = ()
 
     def __str__(self) -> str:
@@ -165,6 +167,9 @@ class RelativeTrain(AbstractSystem):
 
     def jacobian(self, t, q, u):
         return jnp.zeros((0, self.nu), q.dtype)
+
+    def structured_jacobian(self, t, q, u):
+        return DenseJacobian(self.jacobian(t, q, u))
 
     def constraint_force(self, t, q, u, multipliers):
         return jnp.zeros_like(u)

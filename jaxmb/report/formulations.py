@@ -1,4 +1,4 @@
-"""What the roads to accelerations cost, side by side on one mechanism."""
+"""What the formulations cost, side by side on one mechanism."""
 
 import dataclasses
 import functools
@@ -13,8 +13,9 @@ from jax import lax
 
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import every_row, solve_constrained, stages
-from ..linalg.elimination import Order, factor, full_pivot
+from ..formulations.formulation import row_levels, solve_constrained
+from ..linalg.elimination import PivotOrder, eliminate, full_pivot
+from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
 from .timing import interleaved
@@ -104,16 +105,18 @@ def formulation_costs(
     if system.acceleration_rows == 0:
         raise ValueError(f"{mechanism.name!r} has no constraints: its accelerations are M⁻¹F by any formulation.")
     every = every_formulation() if formulations is None else dict(formulations)
-    chosen = {name: road for name, road in every.items() if system.regular or not road.inverts_mass}
+    chosen = {
+        name: formulation for name, formulation in every.items() if system.regular or not formulation.inverts_mass
+    }
     if not chosen:
         raise ValueError(f"The mass matrix of {mechanism.name!r} is singular; no formulation was given that allows it.")
-    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), stage=stages(system))
+    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), level=row_levels(system))
 
     modes = (_evaluated, _forward, _reverse)
     lines: dict[str, tuple[int, int, int]] = {}
     runs, accelerations = [], {}
-    for name, road in chosen.items():
-        solve = lambda y, road=road: _accelerations(system, road, y, pivots.order)
+    for name, formulation in chosen.items():
+        solve = lambda y, formulation=formulation: _accelerations(system, formulation, y, pivots.order)
         accelerations[name] = np.asarray(eqx.filter_jit(solve)(state))
         programs = [mode(solve) for mode in modes]
         value, forward, reverse = (len(jax.jit(p).lower(state).as_text().splitlines()) for p in programs)
@@ -130,14 +133,13 @@ def formulation_costs(
     return FormulationCosts(mechanism.name, tuple(costs))
 
 
-def _accelerations(system: AbstractSystem, road: AbstractFormulation, y: State, order: Order):
+def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
     t = jnp.zeros((), y.q.dtype)
-    jacobian = system.jacobian(t, y.q, y.u)
-    if road.partitions or system.acceleration_rank < system.acceleration_rows:
-        split = factor(jacobian, order, system.acceleration_rank)
-    else:
-        split = every_row(system.acceleration_rows, system.nu, y.q.dtype)
-    return solve_constrained(system, road, t, y.q, y.u, jacobian, split)[0]
+    jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
+    if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
+        matrix = jacobian.dense().matrix
+        jacobian = DenseJacobian(matrix, eliminate(matrix, order, system.acceleration_rank))
+    return solve_constrained(system, formulation, t, y.q, y.u, jacobian)[0]
 
 
 def _evaluated(solve: Callable[[State], Any]):

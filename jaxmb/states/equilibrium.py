@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import as_array, is_traced
+from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..system import AbstractSystem
-from .assembly import configuration, tangent_solve, tolerance
+from .assembly import configuration
+from .closest import tolerance
 
 _ITERATIONS = 200
 
@@ -189,17 +191,17 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     )
 
 
-def _step(near: _Linearised) -> Float[Array, "n"]:
+def _step(local: _Linearised) -> Float[Array, "n"]:
     """Newton's step with curvatures made positive; none along loose directions without force."""
-    along = near.directions.T @ near.force
+    along = local.directions.T @ local.force
     largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
-    noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(near.curvatures) + largest(near.sizes * near.multipliers))
-    quiet = near.loose & (jnp.abs(along) <= noise)
-    size = jnp.abs(near.curvatures)
+    noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
+    quiet = local.loose & (jnp.abs(along) <= noise)
+    size = jnp.abs(local.curvatures)
     # Quiet directions count as stiff, so that rounding errors of the others do not move along them.
     size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
-    stiffness = near.stiffness + (near.directions * (size - near.curvatures)[None, :]) @ near.directions.T
-    return jnp.linalg.solve(stiffness, near.directions @ jnp.where(quiet, 0.0, along))
+    stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
+    return jnp.linalg.solve(stiffness, local.directions @ jnp.where(quiet, 0.0, along))
 
 
 @eqx.filter_jit
@@ -208,26 +210,26 @@ def _balanced(
 ) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Bool[Array, ""]]:
     """The equilibrium, what is left of the generalized forces there, and whether that is nothing."""
     balance = _Balance(system, t, start[np.array(held, int)], held)
-    q, near, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
+    q, local, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
 
     # The equations that it solves, for their derivatives. What is loose or implied is made definite: nothing moves
     # along loose directions, and multipliers are as small as they can be.
-    n, stiff = system.nu, jnp.max(jnp.abs(near.curvatures))
-    loose = jnp.where(near.loose[None, :], near.directions, 0.0) @ near.directions.T
+    n, stiff = system.nu, jnp.max(jnp.abs(local.curvatures))
+    loose = jnp.where(local.loose[None, :], local.directions, 0.0) @ local.directions.T
     jacobian = lax.stop_gradient(balance).jacobian(q)
 
     def equations(x):
         z, multipliers = x[:n], x[n:]
         there = balance.moved(q, z)
         force = balance.force(there, multipliers) - stiff * (loose @ z)
-        rows = balance.residual(there, jacobian, z) / near.sizes
-        rows += near.implied @ (near.sizes * multipliers) / stiff
+        rows = balance.residual(there, jacobian, z) / local.sizes
+        rows += local.implied @ (local.sizes * multipliers) / stiff
         # Where there is no equilibrium, equations with a solution, so that their derivatives stay finite.
         return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
 
-    known = jnp.concatenate([jnp.zeros(n, q.dtype), near.multipliers])
-    solved = lax.custom_root(equations, known, lambda _, x: x, tangent_solve)
-    return balance.moved(q, solved[:n]), near.force / system.velocity_scale(), ok
+    known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
+    solved = root(equations, known, lambda _, x: x)
+    return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), ok
 
 
 def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
@@ -239,29 +241,29 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         return ~found & (radius > close) & (k < _ITERATIONS)
 
     def advance(carry):
-        q, near, step, radius, _, k = carry
-        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(near.correction))
-        trial = balance.moved(q, step + near.correction)
+        q, local, step, radius, _, k = carry
+        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(local.correction))
+        trial = balance.moved(q, step + local.correction)
         there = _linearise(balance, trial)
         # Too long a step ends where the forces push back half as hard as they pushed at its beginning, or harder.
         # What the correction of the rows does to the forces is not counted.
-        other = jnp.max(jnp.abs(near.curvatures)) * norm(near.correction) * norm(step)
-        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(near.force, step)) - other
-        better = ~back | (norm(there.force) < norm(near.force))
+        other = jnp.max(jnp.abs(local.curvatures)) * norm(local.correction) * norm(step)
+        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(local.force, step)) - other
+        better = ~back | (norm(there.force) < norm(local.force))
         good = (k == 0) | (better & jnp.all(jnp.isfinite(there.force)))
-        q, near = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, near))
+        q, local = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, local))
         radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
-        step = _step(near)
+        step = _step(local)
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
         # What is left after so small a step of Newton's method is its square.
-        return q, near, step, radius, good & (size <= close) & (k > 0), k + 1
+        return q, local, step, radius, good & (size <= close) & (k > 0), k + 1
 
     # At first nothing is known, and nothing moves.
     unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))
     at = (start, unknown, balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
-    q, near, _, _, found, _ = lax.while_loop(proceed, advance, at)
-    return q, near, found
+    q, local, _, _, found, _ = lax.while_loop(proceed, advance, at)
+    return q, local, found
 
 
 def _not_found(system, unbalanced):

@@ -1,11 +1,11 @@
 """The equation of constrained motion, and the compiled rigid-body system."""
 
-from .equation import AbstractSystem as AbstractSystem
-from .inertia import (
+from ..linalg.inertia import (
     AbstractInertia as AbstractInertia,
     BlockInertia as BlockInertia,
     DenseInertia as DenseInertia,
     DiagonalInertia as DiagonalInertia,
 )
+from .equation import AbstractSystem as AbstractSystem
 from .parameters import parameters as parameters, with_parameters as with_parameters
 from .rigid_bodies import RigidBodySystem as RigidBodySystem

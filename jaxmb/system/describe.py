@@ -5,7 +5,6 @@ import html
 from collections import Counter
 from collections.abc import Iterable
 
-from .chain import is_long
 from .equation import AbstractSystem
 from .rigid_bodies import RigidBodySystem
 
@@ -126,8 +125,8 @@ def describe(system: RigidBodySystem) -> Description:
 
 def _left_out(system: RigidBodySystem) -> list[str]:
     out = constraints_left_out(system)
-    if is_long(system):
-        out.append("joints in chains: no matrix of all constraints, no charts; joint by joint with Adams")
+    if system.elimination is not None:
+        out.append("joint chain: no dense Jacobian and no charts with Adams; block-tridiagonal elimination")
     if not system.spatial:
         out.append("planar: no Euler parameters, no gyroscopic moment")
     if not system.forces and not system.nonideal:

@@ -18,7 +18,8 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State
-from .inertia import AbstractInertia
+from ..linalg.inertia import AbstractInertia
+from ..linalg.jacobian import AbstractJacobian, EliminationOrder
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -50,6 +51,7 @@ class AbstractSystem(eqx.Module):
     - `linear`: whether ψ is linear in u up to a constant term; `homogeneous`: whether that term is zero.
     - `guess`: a state to begin an assembly with; `length` [m]: the size that residuals of positions are relative to.
     - `rows`: name of the part, and number within it, of every row of A.
+    - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
     """
 
     nq: AbstractVar[int]
@@ -67,6 +69,7 @@ class AbstractSystem(eqx.Module):
     length: AbstractVar[Float[Array, ""]]
     ranks: AbstractVar[Ranks]
     rows: AbstractVar[tuple[tuple[str, int], ...]]
+    elimination: AbstractVar[EliminationOrder | None]
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:
@@ -113,6 +116,10 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "acceleration_rows nu"]:
         """`A`."""
+
+    @abc.abstractmethod
+    def structured_jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> AbstractJacobian:
+        """`A` in blocks where the system has an order of `elimination`, else as a dense matrix without a factor."""
 
     @abc.abstractmethod
     def constraint_force(

@@ -10,6 +10,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
+from ..linalg.jacobian import DenseJacobian, EliminationOrder, block_jacobian
 from ..linalg.rotations import cross, rotate
 from .coordinates import coordinate_names, rate_names
 from .equation import AbstractSystem, Ranks
@@ -21,7 +23,6 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
-from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
 from .places import parameter_places
 
@@ -42,7 +43,7 @@ class RigidBodySystem(AbstractSystem):
 
     **Fields:** `mass` [kg], shape (bodies,); `rotary` [kg m²], shape (bodies,) in the plane and (bodies, 3, 3) in
     space; `gravity` [m/s²] or None; the groups of parts; `guess`, the state given with the bodies; `length` [m], the
-    scene's size; `body_names`.
+    scene's size; `body_names`; `elimination`, the order in which the joints are eliminated, or None.
     """
 
     mass: Float[Array, "b"]
@@ -60,6 +61,7 @@ class RigidBodySystem(AbstractSystem):
     gravity_name: str = eqx.field(static=True)
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
+    elimination: EliminationOrder | None = eqx.field(static=True)
 
     def __str__(self) -> str:
         return str(self.describe())
@@ -226,9 +228,18 @@ class RigidBodySystem(AbstractSystem):
     def jacobian(self, t, q, u):
         return self._jacobian(t, q, u, self.joints)
 
-    def _jacobian(self, t, q, u, groups):
+    def structured_jacobian(self, t, q, u):
+        if self.elimination is None:
+            return DenseJacobian(self.jacobian(t, q, u))
+        blocks = [*self._blocks(t, q, u, self.joints), jnp.zeros(1, q.dtype)]
+        return block_jacobian(_join(blocks, q.dtype), self.elimination)
+
+    def _blocks(self, t, q, u, groups):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        blocks = [g.jacobian(t, poses, velocities) for g in groups]
+        return [g.jacobian(t, poses, velocities) for g in groups]
+
+    def _jacobian(self, t, q, u, groups):
+        blocks = self._blocks(t, q, u, groups)
         return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
     @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""No constraints at all: the plain equations of motion."""
+"""The equations of motion as they are, without a projection on constraints."""
 
 import diffrax
 import equinox as eqx
@@ -9,7 +9,7 @@ from ..system import AbstractSystem
 from .manifold import AbstractManifold
 
 
-class Free(AbstractManifold):
+class Unconstrained(AbstractManifold):
     """Integrate all coordinates and leave the constraints to themselves.
 
     The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
