@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import is_traced
 from ..linalg.rotations import normalize
 from ..system import AbstractSystem, RigidBodySystem
 from ..system.coordinates import prescribe
+from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
 
 
@@ -44,12 +45,14 @@ def assemble(
 
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
 
-    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, or the
-    coordinates that cannot be fixed together. Under `jit` the same as a run-time error without the names.
+    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
+    coordinates that cannot be fixed together, or rates that contradict each other; rates that agree may be more than
+    the degrees of freedom. Under `jit` the same as a run-time error without the names.
     """
-    guess = system.guess if guess is None else guess
-    t = as_array(t, guess.q.dtype)
-    u, fixed_rates = prescribe("rate", system.rate_names(), rates or {}, guess.u)
+    check_system("assemble", system)
+    guess = checked_guess("assemble", system, guess)
+    t = checked_time("assemble", t, guess.q.dtype)
+    u, fixed_rates = prescribe("rate", system.rate_names(), {} if rates is None else rates, guess.u)
     if not is_traced(u):
         _check_finite(u, "rates")
     q, _, ok = configuration(system, guess.q, fix, t, throw)
@@ -65,7 +68,7 @@ def assemble(
     ok = ok & ok_rates
     if throw:
         q = eqx.error_if(
-            q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are open."
+            q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are violated."
         )
     state = State(q, u)
     return state if throw else jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), state)
@@ -78,7 +81,7 @@ def configuration(
     hold; an error if not, with `throw` and outside `jit`.
     """
     names = system.coordinate_names()
-    q, fixed = prescribe("coordinate", names, fix or {}, guess)
+    q, fixed = prescribe("coordinate", names, {} if fix is None else fix, guess)
     if not is_traced(q):
         _check_finite(q, "coordinates")
     whole = 0

@@ -7,7 +7,7 @@ where it would be balanced. Derivatives are those of the balance, by the implici
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,10 +17,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import is_traced
 from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..system import AbstractSystem
+from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
 from .closest import tolerance
 
@@ -62,10 +63,11 @@ def equilibrium(
     equilibrium; the message names the coordinates whose forces nothing balances. Under `jit` a run-time error without
     the names.
     """
+    check_system("equilibrium", system)
     if not system.plain:
         raise ValueError("Equilibria are of systems whose constraints are ideal and bind positions or velocities.")
-    guess = system.guess if guess is None else guess
-    time: Any = as_array(t, guess.q.dtype)
+    guess = checked_guess("equilibrium", system, guess)
+    time = checked_time("equilibrium", t, guess.q.dtype)
     start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
