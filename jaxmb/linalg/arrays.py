@@ -1,4 +1,4 @@
-"""NumPy for what is known, which compiles nothing; JAX for what is traced, or an array of JAX's."""
+"""Choose NumPy for concrete values, where nothing is compiled, and JAX for tracers and JAX arrays."""
 
 from types import ModuleType
 from typing import Any
@@ -11,19 +11,19 @@ from jaxtyping import Array, Float, Int
 
 
 def namespace(*arrays: Any) -> ModuleType:
-    """The module whose functions serve these arrays."""
+    """`numpy` if all arrays are NumPy's, else `jax.numpy`."""
     return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether there is anything traced in a pytree."""
+    """Whether any leaf of a pytree is traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def as_array(value: Any, dtype: Any) -> Any:
-    """A new array of NumPy's, or one of JAX's if anything in it is traced.
+    """A new NumPy array, or a JAX array if any entry is traced.
 
-    New, since `jax.device_put` shares the memory of what it is given: what its owner changes later must not follow.
+    The values are copied, since `jax.device_put` may alias NumPy memory that the caller changes later.
     """
     return jnp.asarray(value, dtype) if is_traced(value) else np.array(value, dtype)
 
