@@ -119,7 +119,7 @@ REFUSED = {
                 planar.Driver("two", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t),
             ],
         ).compile(),
-        "velocities asked for by one, two contradict",
+        "velocities prescribed by one, two contradict",
     ),
 }
 

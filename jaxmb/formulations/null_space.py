@@ -11,8 +11,8 @@ class NullSpace(AbstractFormulation):
     """Maggi's equations in an orthonormal basis Z of the null space of A: `(ZᵀMZ) ẏ = Zᵀ(F − M c)`, `u̇ = Z ẏ + c`.
 
     c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
-    preferred over others, so there is no chart to become bad, and no pivots to search where no row is redundant. The
-    mass matrix may be singular, as long as no velocity without mass is free.
+    preferred over others, so no chart can become singular, and no pivots are searched for where no row is redundant.
+    The mass matrix may be singular, as long as no velocity without mass is free.
 
     ??? cite "Reference"
         ```bibtex

@@ -19,9 +19,9 @@ from .manifold import AbstractManifold
 class Baumgarte(AbstractManifold):
     """Integrate all coordinates and velocities, with constraints on accelerations that decay, for any solver.
 
-    Of constraints between positions `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, of those between velocities `ψ̇ + rate ψ = 0`: the
-    state is near the constraints, not on them, and a rate much above that of the motion makes it stiff. For comparison
-    with `Partition`, which needs no such number.
+    Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, those between velocities `ψ̇ + rate ψ = 0`: the
+    state is near the constraints, not on them, and a rate much above that of the motion makes the equations stiff. For
+    comparison with `Partition`, which needs no such number.
 
     **Arguments:** `rate` [1/s] > 0.
     """

@@ -48,14 +48,14 @@ _ROW_GROWTH = 4.0
 class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
-    Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic
+    There are `nq − rank Φ_q` independent coordinates and `nu − rank [Φ; ψ]` independent velocities; with nonholonomic
     constraints these are two nested charts. Only independent components are integrated; the others satisfy the
     constraints to Newton's tolerance at the end of every step. The error of a step is measured on all of them. A chart
     is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would serve
-    better than those it keeps; history is kept for all components, so that costs no restart.
+    better than those it keeps; the solver's history is that of all components, so a new chart costs no restart.
 
-    The formulation finds the accelerations of predicted states; at corrected ones they are improved by Newton's method,
-    with the same factor.
+    The formulation finds the accelerations of predicted states; those of corrected states follow by one step of
+    Newton's method with the same factor.
 
     **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
     made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its
@@ -81,7 +81,7 @@ class Partition(AbstractManifold):
 
 
 class Chart(eqx.Module):
-    """A split with its quality and counters.
+    """The index sets with their quality and counters.
 
     **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H| and, with
     redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties.
@@ -99,12 +99,12 @@ class Chart(eqx.Module):
 
     @property
     def iterations(self) -> Int[Array, ""]:
-        """Iterations of the last position Newton."""
+        """Newton iterations for positions in the last step."""
         return self.counters[1]
 
     @property
     def newton(self) -> Int[Array, ""]:
-        """Iterations of all position Newtons."""
+        """Newton iterations for positions in all steps."""
         return self.counters[2]
 
     @property
@@ -119,7 +119,7 @@ class Chart(eqx.Module):
 
 
 class PartitionTerm(AbstractManifoldTerm):
-    """A constrained system as a term that knows its charts."""
+    """A constrained system as a term with charts."""
 
     system: AbstractSystem
     formulation: AbstractFormulation
@@ -170,7 +170,7 @@ class PartitionTerm(AbstractManifoldTerm):
             return super().project_cold(t, y, chart, args)
         split = chart.split
         if split.coordinate is None:
-            # The chart's matrix is of the state before the step.
+            # The chart's matrix is that of the state before the step.
             system, at, q = lax.stop_gradient((self.system, t, y.q))
             split = eqx.tree_at(lambda s: s.right_inverse, split, coordinate_factor(system, at, q, split).right_inverse)
         return self._project(t, y, chart, split)
@@ -182,9 +182,9 @@ class PartitionTerm(AbstractManifoldTerm):
         return out._replace(failed=failed | out.failed)
 
     def controlled(self, chart):
-        # All components, the dependent ones as well: where these turn fast, the error of the independent ones alone
-        # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
-        # spatial slider-crank 3107 against 3867.)
+        # All components: where dependent ones change fast, the error of the independent ones alone shows it too late.
+        # (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a spatial
+        # slider-crank 3107 against 3867.)
         del chart
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
@@ -274,7 +274,7 @@ def _velocity_quality(system, solved, order):
 
 
 def _quality(system, solved, scale, order, rank):
-    """What a chart is judged by, in units of the coordinates' scales."""
+    """The quality of a chart, in units of the coordinates' scales."""
     influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
     largest = [jnp.max(influence, initial=1.0)]
     if system.velocity_rank < system.velocity_rows:

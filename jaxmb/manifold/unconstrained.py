@@ -10,10 +10,11 @@ from .manifold import AbstractManifold
 
 
 class Unconstrained(AbstractManifold):
-    """Integrate all coordinates and leave the constraints to themselves.
+    """Integrate all coordinates without a projection on the constraints.
 
-    The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
-    that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
+    The policy of systems without constraints. Where there are constraints, the state drifts off them by the error of
+    integration, which is for comparison only. Euler parameters are normalised where they are used, so their length does
+    not matter.
     """
 
     def prepare(self, system, formulation, solver, rtol):

@@ -1,4 +1,4 @@
-"""Consistent initial states: the nearest configuration and velocities that satisfy every constraint.
+"""Consistent initial states: the closest configuration and velocities that satisfy every constraint.
 
 First the configuration closest to the guess that satisfies `Φ(t, q) = 0` and the coordinates fixed by name, then the
 velocities closest to the guess that satisfy `ψ(t, q, u) = 0` and the rates fixed by name; see `states/closest.py`.
@@ -56,7 +56,7 @@ def assemble(
     if not is_traced(u):
         _check_finite(u, "rates")
     q, _, ok = configuration(system, guess.q, fix, t, throw)
-    # At rest, where nothing asks for motion, there is nothing to compile.
+    # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.homogeneous and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else closest_velocities(system, t, q, u, tuple(fixed_rates.tolist()))
@@ -94,8 +94,8 @@ def configuration(
 
 
 def _normalize_fixed(system, q, fixed):
-    """Attitudes given whole are made unit; their normalisation rows have no free column left. Also the number of
-    those.
+    """Normalise attitudes of which all four parameters are prescribed, and count them: their normalisation rows have no
+    free column left.
     """
     whole = [
         row[3:]

@@ -27,7 +27,7 @@ from .closest import (
 # 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# More rows than this do not fit in dense matrices of reasonable size.
+# Dense matrices of more rows than this are too large.
 _DENSE = 3000
 
 
@@ -86,7 +86,7 @@ def _independent_by_blocks(system):
 
 @eqx.filter_jit
 def _analyse(system):
-    """Everything that needs the system's kernels, in one compiled function."""
+    """All evaluations of the system, in one compiled function."""
     q, u = system.normalize(system.guess.q), system.guess.u
     t = jnp.zeros((), q.dtype)
     scale = system.velocity_scale()
@@ -137,7 +137,7 @@ def _check_left_over(system, what, left, asked):
     if np.any(bad):
         names = sorted({name for (name, _), b in zip(system.rows, bad, strict=True) if b})
         raise ValueError(
-            f"The {what} asked for by {', '.join(names)} contradict each other (largest residual "
+            f"The {what} prescribed by {', '.join(names)} contradict each other (largest residual "
             f"{np.abs(left).max():.3g}). Remove one of them, or make their motions agree."
         )
 
@@ -168,7 +168,7 @@ def _check_locked(system, jacobian):
 
 
 def _connected(system):
-    """Bodies that joints connect other than through the ground, with their rows; none that are driven in time."""
+    """Sets of bodies that joints connect without the ground, with their rows; sets with a driver are left out."""
     ground, row = system.layout.bodies, 0
     # A union-find forest: the root of a body's tree stands for all that are connected with it.
     parent = list(range(ground))
@@ -198,7 +198,7 @@ def _connected(system):
 
 
 def _check_determined(system, implied):
-    """Refuse laws of joints whose force is not determined."""
+    """Refuse friction laws of joints whose force is not determined."""
     for g in system.nonideal:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
