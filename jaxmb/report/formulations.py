@@ -13,8 +13,9 @@ from jax import lax
 
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import every_row, solve_constrained, stages
-from ..linalg.elimination import Order, factor, full_pivot
+from ..formulations.formulation import row_levels, solve_constrained
+from ..linalg.elimination import PivotOrder, eliminate, full_pivot
+from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
 from .timing import interleaved
@@ -109,7 +110,7 @@ def formulation_costs(
         raise ValueError(
             f"The mass matrix of {mechanism.name!r} is singular; give a formulation for it, such as NullSpace()."
         )
-    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), stage=stages(system))
+    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), level=row_levels(system))
 
     modes = (_evaluated, _forward, _reverse)
     lines: dict[str, tuple[int, int, int]] = {}
@@ -132,14 +133,13 @@ def formulation_costs(
     return FormulationCosts(mechanism.name, tuple(costs))
 
 
-def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: Order):
+def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
     t = jnp.zeros((), y.q.dtype)
-    jacobian = system.jacobian(t, y.q, y.u)
+    jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
-        split = factor(jacobian, order, system.acceleration_rank)
-    else:
-        split = every_row(system.acceleration_rows, system.nu, y.q.dtype)
-    return solve_constrained(system, formulation, t, y.q, y.u, jacobian, split)[0]
+        matrix = jacobian.dense().matrix
+        jacobian = DenseJacobian(matrix, eliminate(matrix, order, system.acceleration_rank))
+    return solve_constrained(system, formulation, t, y.q, y.u, jacobian)[0]
 
 
 def _evaluated(solve: Callable[[State], Any]):
