@@ -39,7 +39,7 @@ class Linear(AbstractNormalLaw):
     **Arguments:** `stiffness` [N/m].
     """
 
-    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth
@@ -55,7 +55,7 @@ class Hertz(AbstractNormalLaw):
     `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
     """
 
-    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth**1.5
@@ -75,11 +75,11 @@ class Bekker(AbstractNormalLaw):
     `width` b [m], the smaller side of the patch that presses; `area` [m²] of it.
     """
 
-    cohesive_modulus: Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
-    frictional_modulus: Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
-    exponent: Number = fields.parameter(sign="positive")
-    width: Number = fields.parameter(unit="m", sign="positive")
-    area: Number = fields.parameter(unit="m²", sign="positive")
+    cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
+    frictional_modulus: fields.Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
+    exponent: fields.Number = fields.parameter(sign="positive")
+    width: fields.Number = fields.parameter(unit="m", sign="positive")
+    area: fields.Number = fields.parameter(unit="m²", sign="positive")
 
     def force(self, depth):
         return self.area * (self.cohesive_modulus / self.width + self.frictional_modulus) * depth**self.exponent
@@ -108,8 +108,8 @@ class Coulomb(AbstractFrictionLaw):
     **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
 
-    coefficient: Number = fields.parameter(sign="non-negative", kw_only=False)
-    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
+    coefficient: fields.Number = fields.parameter(sign="non-negative", kw_only=False)
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         del engaged, travel
@@ -135,12 +135,12 @@ class Janosi(AbstractFrictionLaw):
     `length` [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
     """
 
-    cohesion: Number = fields.parameter(unit="Pa", sign="non-negative")
-    friction_angle: Number = fields.parameter(unit="rad", sign="non-negative")
-    shear_modulus: Number = fields.parameter(unit="m", sign="positive")
-    length: Number = fields.parameter(unit="m", sign="positive")
-    area: Number = fields.parameter(unit="m²", sign="positive")
-    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
+    cohesion: fields.Number = fields.parameter(unit="Pa", sign="non-negative")
+    friction_angle: fields.Number = fields.parameter(unit="rad", sign="non-negative")
+    shear_modulus: fields.Number = fields.parameter(unit="m", sign="positive")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    area: fields.Number = fields.parameter(unit="m²", sign="positive")
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         strength = self.cohesion * self.area * engaged + load * jnp.tan(self.friction_angle)
@@ -161,17 +161,17 @@ class AbstractContact(AbstractPotentialForce):
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
+    bodies: fields.Names = fields.body_names()
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     friction: AbstractFrictionLaw | None = fields.law(
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
-    radius: Float[Array, "*n"] = fields.length(shape=None, sign="non-negative", default=0.0)
-    points: Float[Array, "*n d"] = fields.parameter(shape=None, unit="m", optional=True)
-    damping: Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    damping_depth: Number = fields.parameter(unit="m", sign="positive", default=0.01)
-    smoothing: Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    radius: fields.Number = fields.length(shape=None, sign="non-negative", default=0.0)
+    points: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:

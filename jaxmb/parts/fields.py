@@ -17,7 +17,7 @@ positive, and pictures and reactions take from it where a part acts.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -26,6 +26,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ..linalg.arrays import as_array, is_traced
+
+# The types of fields. A number may be given as anything that NumPy makes an array of, and is held as an array; type
+# checkers do not know the converters of these helpers.
+if TYPE_CHECKING:
+    Number = Numbers = Names = Any
+else:
+    Number, Numbers, Names = Array, dict[str, Array], tuple[str, ...]
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d"]

@@ -40,7 +40,7 @@ class Flat(AbstractTerrain):
     **Arguments:** `level` [m].
     """
 
-    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0, kw_only=False)
+    level: fields.Number = fields.parameter(unit="m", default=0.0, kw_only=False)
 
     def height(self, place):
         return self.level
@@ -52,9 +52,9 @@ class Bump(AbstractTerrain):
     **Arguments:** `start` [m], where it begins; `length` [m] > 0; `peak` [m], its height, negative for a ditch.
     """
 
-    start: Float[Array, ""] = fields.parameter(unit="m")
-    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    peak: Float[Array, ""] = fields.parameter(unit="m")
+    start: fields.Number = fields.parameter(unit="m")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    peak: fields.Number = fields.parameter(unit="m")
 
     def height(self, place):
         s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
@@ -67,9 +67,9 @@ class Sinusoid(AbstractTerrain):
     **Arguments:** `amplitude` [m]; `wavelength` [m] > 0; `phase` [rad].
     """
 
-    amplitude: Float[Array, ""] = fields.parameter(unit="m")
-    wavelength: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    phase: Float[Array, ""] = fields.parameter(unit="rad", default=0.0)
+    amplitude: fields.Number = fields.parameter(unit="m")
+    wavelength: fields.Number = fields.parameter(unit="m", sign="positive")
+    phase: fields.Number = fields.parameter(unit="rad", default=0.0)
 
     def height(self, place):
         return self.amplitude * jnp.sin(2 * jnp.pi * place[0] / self.wavelength + self.phase)
@@ -81,8 +81,8 @@ class Slope(AbstractTerrain):
     **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.
     """
 
-    gradient: Float[Array, ""] = fields.parameter(unit="m/m", kw_only=False)
-    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0)
+    gradient: fields.Number = fields.parameter(unit="m/m", kw_only=False)
+    level: fields.Number = fields.parameter(unit="m", default=0.0)
 
     def height(self, place):
         return self.level + self.gradient * place[0]
@@ -95,9 +95,9 @@ class Ramp(AbstractTerrain):
     gradient is `1.875 rise / length`, in the middle.
     """
 
-    start: Float[Array, ""] = fields.parameter(unit="m")
-    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    rise: Float[Array, ""] = fields.parameter(unit="m")
+    start: fields.Number = fields.parameter(unit="m")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    rise: fields.Number = fields.parameter(unit="m")
 
     def height(self, place):
         return self.rise * step((place[0] - self.start) / self.length)
@@ -112,8 +112,8 @@ class Spline(AbstractTerrain):
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """
 
-    x: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
-    heights: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
+    x: fields.Number = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
+    heights: fields.Number = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
 
     def __check_init__(self):
         if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:
@@ -168,7 +168,7 @@ class Surface(AbstractTerrain):
     """
 
     function: Callable[[Place, dict[str, Array]], Float[Array, ""]] = fields.function()
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
 
     def height(self, place):
         return jnp.reshape(self.function(place, self.parameters), ())

@@ -39,18 +39,18 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         centres.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
-    unloading: Float[Array, ""] = fields.parameter(sign="non-negative", default=0.4)
-    preload: Float[Array, ""] = fields.parameter(unit="N", sign="non-negative", default=5e4)
-    slack: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", default=0.02)
-    travel: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.11)
-    stop_stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
-    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    transition: Float[Array, ""] = fields.parameter(unit="m/s", sign="positive", default=0.01)
-    smoothing: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.005)
-    free_length: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
-    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
+    unloading: fields.Number = fields.parameter(sign="non-negative", default=0.4)
+    preload: fields.Number = fields.parameter(unit="N", sign="non-negative", default=5e4)
+    slack: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.02)
+    travel: fields.Number = fields.parameter(unit="m", sign="positive", default=0.11)
+    stop_stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    transition: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=0.005)
+    free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
+    point_a: fields.Number = fields.point(body=0, default="mass centre")
+    point_b: fields.Number = fields.point(body=1, default="mass centre")
 
     def validate(self):
         if self.unloading > 1:
