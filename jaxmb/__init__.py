@@ -5,6 +5,7 @@ from . import (
     lagrangian as lagrangian,
     manifold as manifold,
     mechanisms as mechanisms,
+    parts as parts,
     planar as planar,
     report as report,
     solvers as solvers,
@@ -13,6 +14,7 @@ from . import (
 )
 from ._results import RESULTS as RESULTS
 from ._types import State as State
+from .linalg import rotations as rotations
 from .parts import contact as contact, terrain as terrain
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (

@@ -1,1 +1,51 @@
-"""What a scene is made of."""
+"""What a scene is made of, and the base classes and declarations for parts of one's own.
+
+A part is a class derived from one of the base classes. Its fields are declared by helpers that say what they mean
+(`point()`, `axis()`, `length()`, `parameter()`, …), and its kernel is a pure function of the poses of its own bodies.
+`notebooks/05_extending.ipynb` writes a joint, a force and a contact law.
+"""
+
+from .base import (
+    AbstractBody as AbstractBody,
+    AbstractCompound as AbstractCompound,
+    AbstractConstraint as AbstractConstraint,
+    AbstractForce as AbstractForce,
+    AbstractJoint as AbstractJoint,
+    AbstractLaw as AbstractLaw,
+    AbstractNonIdeal as AbstractNonIdeal,
+    AbstractPair as AbstractPair,
+    AbstractPlanarPart as AbstractPlanarPart,
+    AbstractPotentialForce as AbstractPotentialForce,
+    AbstractSpatialPart as AbstractSpatialPart,
+    AbstractVelocityConstraint as AbstractVelocityConstraint,
+)
+from .contact import (
+    AbstractContact as AbstractContact,
+    AbstractFrictionLaw as AbstractFrictionLaw,
+    AbstractNormalLaw as AbstractNormalLaw,
+)
+from .fields import (
+    Names as Names,
+    Number as Number,
+    Numbers as Numbers,
+    attitude as attitude,
+    axis as axis,
+    body_name as body_name,
+    body_names as body_names,
+    choice as choice,
+    function as function,
+    guess as guess,
+    law as law,
+    length as length,
+    name as name,
+    numbers as numbers,
+    parameter as parameter,
+    point as point,
+)
+from .space import (
+    AbstractSpace as AbstractSpace,
+    force_pair as force_pair,
+    separation as separation,
+    separation_rate as separation_rate,
+)
+from .terrain import AbstractTerrain as AbstractTerrain

@@ -3,7 +3,14 @@
 from ..parts.contact import Contact as Contact
 from ..parts.forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
 from ..parts.friction import Friction as Friction
-from ..parts.planar.bodies import Body as Body, PointMass as PointMass, box as box, disc as disc, rod as rod
+from ..parts.planar.bodies import (
+    AbstractRigidBody as AbstractRigidBody,
+    Body as Body,
+    PointMass as PointMass,
+    box as box,
+    disc as disc,
+    rod as rod,
+)
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.planar.drivers import Driver as Driver
 from ..parts.planar.forces import (

@@ -4,6 +4,7 @@ from ..parts.contact import Contact as Contact
 from ..parts.forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper
 from ..parts.friction import Friction as Friction
 from ..parts.spatial.bodies import (
+    AbstractRigidBody as AbstractRigidBody,
     Body as Body,
     PointMass as PointMass,
     box as box,
