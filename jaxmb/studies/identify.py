@@ -119,9 +119,9 @@ def identify(
     - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
         it every quantity is weighted by its own range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
-        to be positive, such as masses and moments of inertia, stay so without bounds, and inertia matrices stay positive
-        definite; the parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by
-        their start.
+        to be positive, such as masses and moments of inertia, stay so without bounds, and inertia matrices stay
+        positive definite; the parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are
+        scaled by their start.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
         optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
