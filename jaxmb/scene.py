@@ -1,6 +1,5 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +26,7 @@ from .parts.names import unknown
 from .parts.planar.kinematics import PLANE
 from .parts.servo import Servo
 from .parts.spatial.kinematics import SPACE
-from .states.structure import find_structure
+from .states.structure import with_structure
 from .system import RigidBodySystem
 from .system.description import Description
 from .system.equation import Ranks
@@ -126,9 +125,9 @@ class Scene(eqx.Module):
             gravity_name="" if gravity is None else gravity.name,
             ranks=Ranks(0, 0, 0, 0),
             implied=(),
+            elimination=None,
         )
-        ranks, implied = find_structure(system)
-        return dataclasses.replace(system, ranks=ranks, implied=implied)
+        return with_structure(system)
 
 
 def _check_program(servo, space, bodies):

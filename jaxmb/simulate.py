@@ -77,12 +77,11 @@ def simulate(
         many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion that is detected
         to be stiff is simulated again from `t0` with `Hermite`; not under `jit`, `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
-        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular;
-        `BlockMultipliers()` for long chains of joints.
+        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
         `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a planar scene
-        with 30 or more constraint rows whose joints form a chain the default is `BlockProjection()`, whose cost grows
-        with the number of joints and not with its cube.
+        with 30 or more constraint rows whose joints form a chain the default is `Projection()` as well, whose cost
+        grows with the number of joints and not with its cube.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of

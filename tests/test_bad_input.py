@@ -119,7 +119,7 @@ REFUSED = {
                 planar.Driver("two", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t),
             ],
         ).compile(),
-        "velocities asked for by one, two contradict",
+        "velocities prescribed by one, two contradict",
     ),
 }
 
@@ -165,6 +165,51 @@ def test_assembly_names_what_cannot_be_fixed(pendulum):
     assert np.all(np.isnan(quiet.q))
 
 
+def test_more_rates_than_freedoms_may_be_given_if_they_agree(pendulum):
+    for name in ("bar.x", "bar.y"):
+        # The bar turns about its end, half a metre from its centre.
+        given = {"bar.angle": 2.0, "bar.x": 0.0, "bar.y": 1.0}
+        np.testing.assert_allclose(mb.assemble(pendulum, rates=given).u, (0.0, 1.0, 2.0), rtol=0, atol=1e-14)
+        with pytest.raises(ValueError, match=r"No velocities satisfy pin with .* contradict each other"):
+            mb.assemble(pendulum, rates=given | {name: 0.5})
+    turn = lambda w: mb.assemble(pendulum, rates={"bar.angle": w, "bar.y": 0.5 * w}).u
+    np.testing.assert_allclose(jax.jacfwd(turn)(2.0), (0.0, 0.5, 1.0), rtol=0, atol=1e-14)
+
+
+NUMBERS = {"text": "0.3", "None": None, "complex": 0.3j, "ragged": [[1.0], [2.0, 3.0]]}
+
+
+@pytest.mark.parametrize("value", NUMBERS.values(), ids=NUMBERS.keys())
+def test_prescribed_values_are_real_numbers(pendulum, value):
+    with pytest.raises(ValueError, match=r"Coordinate 'bar.angle' must be a real number"):
+        mb.assemble(pendulum, fix={"bar.angle": value})
+    with pytest.raises(ValueError, match=r"Rate 'bar.velocity' must be a real number"):
+        mb.assemble(pendulum, rates={"bar.velocity": value})
+    with pytest.raises(ValueError, match=r"Coordinate 'bar.angle' must be a real number"):
+        mb.equilibrium(pendulum, fix={"bar.angle": value})
+    with pytest.raises(ValueError, match=r"t must be a real number"):
+        mb.assemble(pendulum, t=value)
+
+
+@pytest.mark.parametrize("function", [mb.assemble, mb.equilibrium])
+def test_arguments_of_wrong_types(pendulum, function):
+    scene = mb.Scene([bar()], joints=[pin()])
+    for system, message in ((scene, r"got a Scene; compile the scene first, scene.compile\(\)"), (None, "got None")):
+        with pytest.raises(ValueError, match=f"{function.__name__}: system must be a compiled scene.*{message}"):
+            function(system)
+    for guess, message in (
+        ("here", r"guess must be a State\(q, u\), got 'here'"),
+        (mb.State(jnp.zeros(2), jnp.zeros(3)), r"guess.q must have shape \(3,\), got \(2,\)"),
+        (mb.State(jnp.zeros(3), None), "guess.u must be a real number or an array of them, got None"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            function(pendulum, guess)
+    with pytest.raises(ValueError, match=r"prescribed by name.*got \['bar.angle'\]"):
+        function(pendulum, fix=["bar.angle"])
+    with pytest.raises(ValueError, match="t must be one number"):
+        function(pendulum, t=(0.0, 1.0))
+
+
 @pytest.mark.parametrize("rtol", [0.0, -1e-3, 2.0, np.nan, 1e-17])
 def test_tolerances(pendulum, rtol):
     with pytest.raises(ValueError, match="rtol"):
@@ -175,8 +220,8 @@ def test_combinations(pendulum):
     state = mb.assemble(pendulum)
     with pytest.raises(ValueError, match="Partition needs a solver that knows charts"):
         mb.simulate(pendulum, state, t1=0.1, solver=diffrax.Tsit5(), manifold=mb.manifold.Partition())
-    with pytest.raises(ValueError, match="Projection is for one-step solvers"):
-        mb.simulate(pendulum, state, t1=0.1, manifold=mb.manifold.Projection())
+    with pytest.raises(ValueError, match="Projection needs Adams or a Runge–Kutta solver"):
+        mb.simulate(pendulum, state, t1=0.1, manifold=mb.manifold.Projection(), solver=mb.solvers.Hermite())
     with pytest.raises(ValueError, match="coordinates and"):
         mb.simulate(pendulum, mb.State(jnp.zeros(2), jnp.zeros(3)), t1=0.1)
     with pytest.raises(ValueError, match="MultistepController"):

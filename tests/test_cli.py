@@ -1,6 +1,5 @@
 """The command line, run in this process."""
 
-import dataclasses
 import importlib
 import json
 import subprocess
@@ -53,10 +52,8 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
 
 
 def test_report(capsys, tmp_path, monkeypatch):
-    """Of a mechanism, and of the one beside it."""
-    get = mb.mechanisms.get
-    heavier = lambda *args, **kwargs: dataclasses.replace(get(*args, **kwargs), beside=({"mass": 2.0},))
-    monkeypatch.setattr(mb.mechanisms, "get", heavier)
+    """Of a mechanism, and of a variant of it."""
+    monkeypatch.setattr("jaxmb.cli._REPORT_VARIANTS", {"pendulum": ({"mass": 2.0},)})
     words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out

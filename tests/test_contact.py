@@ -11,6 +11,7 @@ from scipy.integrate import quad
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.mechanisms._wheel_contact import WheelContact
 from jaxmb.parts import contact, terrain
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
@@ -35,18 +36,16 @@ JANOSI = contact.Janosi(
 )
 
 
-def vehicle_contact(**changes):
-    """The wheels of the tracked vehicle."""
+def three_wheels(kind=planar.Contact, **changes):
+    """Contact of three bodies with a bump."""
     options = {
         "terrain": BUMP,
         "normal": contact.Linear(8e5),
         "friction": contact.Coulomb(0.7, transition_speed=0.3),
         "radius": 0.305,
         "damping": 2e4,
-        "onset": "linear",
-        "depth": "vertical",
     }
-    return planar.Contact("road", ("a", "b", "c"), **(options | changes))
+    return kind("road", ("a", "b", "c"), **(options | changes))
 
 
 # Terrains
@@ -143,7 +142,7 @@ def test_wheels_of_the_tracked_vehicle():
     """Spring with the slope's share, damping that sets in linearly, traction at the rim: as in the model's equations,
     deep in the ground, at its surface and far above.
     """
-    part = vehicle_contact().resolve(PLANE, jnp.zeros((3, 3)))
+    part = three_wheels(WheelContact).resolve(PLANE, jnp.zeros((3, 3)))
     q = np.array([[4.3, 0.2, 0.4], [5.0, 0.4071, 0.1], [4.5, 30.0, 0.0]])
     v = np.array([[1.0, 0.3, -1.0], [0.3, 0.2, 0.5], [1.0, -1.0, 0.0]])
     ground, slope = oracle.bump(q[:, 0])
@@ -164,19 +163,18 @@ def test_wheels_of_the_tracked_vehicle():
 
 
 @pytest.mark.parametrize(
-    "space, depth, law",
-    [(PLANE, "normal", "soft soil"), (PLANE, "vertical", "linear"), (SPACE, "normal", "hertz")],
-    ids=["plane", "vertical", "space"],
+    "space, kind, law",
+    [(PLANE, planar.Contact, "soft soil"), (PLANE, WheelContact, "linear"), (SPACE, spatial.Contact, "hertz")],
+    ids=["plane", "wheels", "space"],
 )
-def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, depth, law):
+def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, kind, law):
     rng = np.random.default_rng(1)
     poses, velocities = states(rng, space, 3)
     rates = jax.vmap(space.rates)(poses, velocities)
-    points = jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))
-    build = lambda **options: vehicle_contact(
-        normal=LAWS[law], onset="smooth", points=points, depth=depth, **options
-    ).resolve(space, poses)
-    elastic, rough = build(friction=None, damping=0.0), build(friction=JANOSI, damping=3e3)
+    places = {} if kind is WheelContact else {"points": jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))}
+    build = lambda **options: three_wheels(kind, normal=LAWS[law], **places, **options).resolve(space, poses)
+    smooth = contact.Coulomb(0.0, transition_speed=1.0)
+    elastic, rough = build(friction=smooth, damping=0.0), build(friction=JANOSI, damping=3e3)
     energy, rate = jax.jvp(lambda q: elastic.energy(space, q, 0.0), (poses,), (rates,))
     power = lambda part: jnp.sum(part.wrenches(space, poses, velocities, 0.0) * velocities)
     assert energy > 1.0
@@ -189,7 +187,7 @@ def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, de
 )
 def test_derivatives_are_finite_where_laws_have_kinks(friction, law):
     """At the surface, far off it, and without slip or speed."""
-    part = vehicle_contact(normal=LAWS[law], friction=friction).resolve(PLANE, jnp.zeros((3, 3)))
+    part = three_wheels(normal=LAWS[law], friction=friction).resolve(PLANE, jnp.zeros((3, 3)))
     poses, still = jnp.array([[0.0, 0.305, 0.0], [1.0, 1e4, 0.0], [2.0, 0.2, 0.0]]), jnp.zeros((3, 3))
     wrenches = lambda *args: (part.wrenches(PLANE, *args, 0.0),) * 2
     jacobians, value = jax.jit(jax.jacfwd(wrenches, (0, 1), has_aux=True))(poses, still)
@@ -200,7 +198,7 @@ def test_derivatives_are_finite_where_laws_have_kinks(friction, law):
 def test_one_terrain_for_all_bodies_is_one_parameter():
     wheel = lambda name, x: planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.3))
     bodies = [wheel(name, x) for name, x in (("a", 4.3), ("b", 4.6), ("c", 4.9))]
-    system = mb.Scene(bodies, forces=[vehicle_contact()]).compile()
+    system = mb.Scene(bodies, forces=[three_wheels()]).compile()
     known = mb.parameters(system)
     assert {name: float(known[name]) for name in known if "terrain" in name} == {
         "road.terrain.start": 4.0,
@@ -269,15 +267,13 @@ def primitives(part):
 
 
 def test_nothing_of_friction_without_friction():
-    assert "tanh" in primitives(vehicle_contact())
-    assert "tanh" not in primitives(vehicle_contact(friction=None))
+    assert "tanh" in primitives(three_wheels())
+    assert "tanh" not in primitives(three_wheels(friction=None))
 
 
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"depth": "deep"}, "depth must be one of"),
-        ({"onset": "late"}, "onset must be one of"),
         ({"terrain": 0.0}, "terrain must be a law from jaxmb.terrain"),
         ({"normal": 8e5}, "normal must be a law from jaxmb.contact"),
         ({"friction": 0.7}, "friction must be a law from jaxmb.contact"),
@@ -291,4 +287,4 @@ def test_nothing_of_friction_without_friction():
 )
 def test_bad_input(changes, message):
     with pytest.raises(ValueError, match=f"'road': {message}"):
-        vehicle_contact(**changes).resolve(PLANE, jnp.zeros((3, 3)))
+        three_wheels(**changes).resolve(PLANE, jnp.zeros((3, 3)))

@@ -11,7 +11,7 @@ from jaxmb.linalg import elimination
 full_pivot, solve_positive, cholesky = map(
     jax.jit, (elimination.full_pivot, elimination.solve_positive, elimination.cholesky)
 )
-factor = jax.jit(elimination.factor, static_argnums=2)
+eliminate = jax.jit(elimination.eliminate, static_argnums=2)
 gauss_jordan = jax.jit(elimination.gauss_jordan, static_argnums=1)
 
 RNG = np.random.default_rng(0)
@@ -33,14 +33,14 @@ def test_rank_orders_and_influence(m, n, rank):
     assert sorted(np.asarray(order.columns)) == list(range(n))
     np.testing.assert_array_equal(np.asarray(order.rows)[np.asarray(order.row_place)], np.arange(m))
     np.testing.assert_array_equal(np.asarray(order.columns)[np.asarray(order.column_place)], np.arange(n))
-    solved = factor(A, order, rank)
+    solved = eliminate(A, order, rank)
     A = np.asarray(A)
-    np.testing.assert_allclose(A @ solved.basis, 0, atol=1e-11 * max(1, np.max(np.abs(A))))
+    np.testing.assert_allclose(A @ solved.null_space, 0, atol=1e-11 * max(1, np.max(np.abs(A))))
     independent = np.asarray(order.columns)[rank:]
-    np.testing.assert_allclose(np.asarray(solved.basis)[independent], np.eye(n - rank), rtol=0, atol=0)
+    np.testing.assert_allclose(np.asarray(solved.null_space)[independent], np.eye(n - rank), rtol=0, atol=0)
     # The correction solves consistent equations and leaves independent columns alone.
     x = RNG.normal(size=n)
-    moved = np.asarray(solved.correction) @ (A @ x)
+    moved = np.asarray(solved.right_inverse) @ (A @ x)
     np.testing.assert_allclose(A @ moved, A @ x, rtol=0, atol=1e-10 * max(1, np.max(np.abs(A @ x))))
     np.testing.assert_allclose(moved[independent], 0, atol=0)
 
@@ -49,7 +49,7 @@ def test_influence_is_of_order_one():
     for _ in range(20):
         A = random_matrix(8, 12, 8)
         pivots = full_pivot(A)
-        influence = factor(A, pivots.order, 8).basis
+        influence = eliminate(A, pivots.order, 8).null_space
         assert np.max(np.abs(influence)) < 10
 
 
@@ -62,7 +62,7 @@ def test_scale_decides_between_units():
 
 def test_stages_nest():
     A = jnp.concatenate([0.1 * random_matrix(2, 6, 2), random_matrix(2, 6, 2)])
-    order = full_pivot(A, stage=jnp.array([0, 0, 1, 1])).order
+    order = full_pivot(A, level=jnp.array([0, 0, 1, 1])).order
     assert set(np.asarray(order.rows[:2]).tolist()) == {0, 1}
     np.testing.assert_array_equal(order.columns[:2], full_pivot(A[:2]).order.columns[:2])
 
@@ -91,8 +91,8 @@ def test_batches_are_eliminated_as_their_members_are(m, n):
 
     @jax.value_and_grad
     def single(A):
-        solved = factor(A, full_pivot(A).order, m)
-        return jnp.sum(weights * jnp.concatenate([solved.correction, solved.basis], axis=1) ** 2)
+        solved = eliminate(A, full_pivot(A).order, m)
+        return jnp.sum(weights * jnp.concatenate([solved.right_inverse, solved.null_space], axis=1) ** 2)
 
     assert len({tuple(np.asarray(full_pivot(A).order.columns)) for A in batch[0]}) > 1
     found = jax.jit(jax.vmap(jax.vmap(single)))(batch)
@@ -123,7 +123,7 @@ def test_factor_second_derivative():
     A = random_matrix(4, 6, 4)
     order = full_pivot(A).order
     direction = random_matrix(4, 6, 4)
-    curve = lambda s: jnp.sum(factor(A + s * direction, order, 4).basis ** 2)
+    curve = lambda s: jnp.sum(eliminate(A + s * direction, order, 4).null_space ** 2)
     second = jax.jit(jax.grad(jax.grad(curve)))(0.0)
     curve, h = jax.jit(curve), 1e-4
     np.testing.assert_allclose(second, (curve(h) - 2 * curve(0.0) + curve(-h)) / h**2, rtol=1e-4)

@@ -1,4 +1,6 @@
-"""Every road to the same accelerations: on matrices against NumPy, on the library's mechanisms against each other."""
+"""All formulations give the same accelerations: on matrices against NumPy, on the library's mechanisms against each
+other.
+"""
 
 from typing import ClassVar
 
@@ -18,13 +20,14 @@ from jaxmb.formulations import (
     Poincare,
     UdwadiaKalaba,
     gauss_function,
-    linearize,
+    pivoted_jacobian,
 )
 from jaxmb.formulations.formulation import solve_constrained
-from jaxmb.linalg.elimination import factor, full_pivot
+from jaxmb.linalg.elimination import eliminate, full_pivot
+from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
 
-ROADS = {
+FORMULATIONS = {
     "partitioned": Partitioned(),
     "multipliers": Multipliers(),
     "null_space": NullSpace(),
@@ -33,14 +36,14 @@ ROADS = {
     "inverses": UdwadiaKalaba("inverses"),
     "singular_mass": UdwadiaKalaba("singular_mass"),
 }
-WITHOUT_INVERSE_OF_MASS = {name: ROADS[name] for name in ("partitioned", "null_space", "singular_mass")}
+WITHOUT_INVERSE_OF_MASS = {name: FORMULATIONS[name] for name in ("partitioned", "null_space", "singular_mass")}
 N, RANK = 7, 4
 
 
-def solve_by_all(inertia, force, jacobian, gamma, order, roads=ROADS):
-    """Accelerations and multipliers, an array each with an axis of roads."""
-    solved = factor(jacobian, order, RANK)
-    pairs = [road.solve(inertia, force, jacobian, gamma, solved) for road in roads.values()]
+def solve_by_all(inertia, force, jacobian, gamma, order, formulations=FORMULATIONS):
+    """Accelerations and multipliers, an array each with an axis of formulations."""
+    jacobian = DenseJacobian(jacobian, eliminate(jacobian, order, RANK))
+    pairs = [formulation.solve(inertia, force, jacobian, gamma) for formulation in formulations.values()]
     return tuple(jnp.stack(values) for values in zip(*pairs, strict=True))
 
 
@@ -79,7 +82,7 @@ def test_equal_to_numpy_whichever_rows_and_columns_are_chosen(dense):
             expected, some = by_numpy(M, F, A, gamma, kept)
             all_rows = np.zeros(RANK + 1)
             all_rows[kept] = some
-            for k, name in enumerate(ROADS):
+            for k, name in enumerate(FORMULATIONS):
                 np.testing.assert_allclose(udot[k], expected, rtol=0, atol=1e-11, err_msg=name)
                 np.testing.assert_allclose(
                     multipliers[k], all_rows, rtol=0, atol=1e-11 * (1 + np.max(np.abs(some))), err_msg=name
@@ -103,10 +106,10 @@ def test_singular_mass():
     M, F = M.at[-1].set(0.0).at[:, -1].set(0.0), F.at[-1].set(0.0)
     A = A.at[0].set(0.3 * jnp.eye(N)[0] + jnp.eye(N)[-1])
     order = full_pivot(A).order
-    roads = WITHOUT_INVERSE_OF_MASS
-    udot, multipliers = jax.jit(lambda *args: solve_by_all(DenseInertia(M), *args, roads))(F, A, gamma, order)
+    formulations = WITHOUT_INVERSE_OF_MASS
+    udot, multipliers = jax.jit(lambda *args: solve_by_all(DenseInertia(M), *args, formulations))(F, A, gamma, order)
     expected, _ = by_numpy(M, F, A, gamma, np.arange(RANK))
-    for k, name in enumerate(roads):
+    for k, name in enumerate(formulations):
         np.testing.assert_allclose(udot[k], expected, rtol=0, atol=1e-11, err_msg=name)
         np.testing.assert_allclose(A @ udot[k], gamma, rtol=0, atol=1e-14 * (1 + np.max(np.abs(gamma))), err_msg=name)
         force = M @ udot[k] - F
@@ -121,12 +124,12 @@ def test_forces_that_do_virtual_work():
     force = jnp.asarray(np.array([0.1, 0.2, -0.3]) - np.cross(spin, moments * spin))
     A, gamma = jnp.array([[1.0, 2.0, -1.0]]), jnp.array([0.4])
     admissible = np.linalg.svd(A)[2][1:].T
-    solved = factor(A, full_pivot(A).order, 1)
+    jacobian = DenseJacobian(A, eliminate(A, full_pivot(A).order, 1))
     inertia = DiagonalInertia(jnp.asarray(moments))
-    solve = jax.jit(lambda F: [road.solve(inertia, F, A, gamma, solved) for road in ROADS.values()])
+    solve = jax.jit(lambda F: [formulation.solve(inertia, F, jacobian, gamma) for formulation in FORMULATIONS.values()])
     rough = jnp.array([0.05, -0.02, 0.03])
     # Only the part along motions that the constraint allows acts.
-    outcomes = zip(ROADS, solve(force), solve(force + rough), solve(force + 3.0 * A[0]), strict=True)
+    outcomes = zip(FORMULATIONS, solve(force), solve(force + rough), solve(force + 3.0 * A[0]), strict=True)
     for name, (ideal, multipliers), (udot, _), (same, _) in outcomes:
         np.testing.assert_allclose(A @ ideal, gamma, rtol=0, atol=1e-14, err_msg=name)
         np.testing.assert_allclose(moments * ideal - force, A.T @ multipliers, rtol=0, atol=1e-14, err_msg=name)
@@ -221,24 +224,24 @@ LIBRARY = {name: FEW.get(name, {}) for name in mb.mechanisms.names()}
 STEPS = 40
 
 
-def motion_by(system, roads, q, u):
-    """A short motion from one state by every road, by a Runge–Kutta method of order four.
+def motion_by(system, formulations, q, u):
+    """A short motion from one state by every formulation, by a Runge–Kutta method of order four.
 
-    **Returns:** what each road gives at the beginning of every step: state, accelerations and constraint forces,
-    (steps, roads, …); and at the start the multipliers, the Jacobian, and the basis of what it allows.
+    **Returns:** what each formulation gives at the beginning of every step: state, accelerations and constraint forces,
+    (steps, formulations, …); and at the start the multipliers, the Jacobian, and the basis of what it allows.
     """
 
     def evaluate(t, q, u):
-        jacobian, split = jax.vmap(lambda q, u: linearize(system, t, q, u))(q, u)
+        jacobian = jax.vmap(lambda q, u: pivoted_jacobian(system, t, q, u))(q, u)
         lane = lambda tree, k: jax.tree.map(lambda x: x[k], tree)
         pairs = [
-            solve_constrained(system, road, t, q[k], u[k], jacobian[k], lane(split, k))
-            for k, road in enumerate(roads.values())
+            solve_constrained(system, formulation, t, q[k], u[k], lane(jacobian, k))
+            for k, formulation in enumerate(formulations.values())
         ]
         udot, multipliers = (jnp.stack(values) for values in zip(*pairs, strict=True))
-        force = jnp.einsum("krn,kr->kn", jacobian, multipliers)
+        force = jnp.einsum("krn,kr->kn", jacobian.matrix, multipliers)
         rates = jax.vmap(lambda q, u: system.rates(t, q, u))(q, u)
-        return rates, udot, force, multipliers, jacobian[0], split.basis[0]
+        return rates, udot, force, multipliers, jacobian.matrix[0], jacobian.pivoted.null_space[0]
 
     def step(carry, _):
         t, q, u, h = carry
@@ -258,7 +261,7 @@ def motion_by(system, roads, q, u):
         first = jax.tree.map(lambda x: x[0], (udot, others))
         return (t + h, q + h * mean(qdot), u + h * mean(udot), h), (q, u, first)
 
-    zero, lanes = jnp.zeros(()), (len(roads), 1)
+    zero, lanes = jnp.zeros(()), (len(formulations), 1)
     start = zero, jnp.tile(q, lanes), jnp.tile(u, lanes), zero
     _, (q, u, (udot, (force, *others))) = jax.lax.scan(step, start, None, length=STEPS)
     return (q, u, udot, force), [x[0] for x in others]
@@ -266,18 +269,18 @@ def motion_by(system, roads, q, u):
 
 @pytest.mark.parametrize("name", LIBRARY)
 def test_formulations_agree(name):
-    """Accelerations and multipliers from every road, at random states on the constraints, are those of least effort,
-    and the motions from there are the same.
+    """Accelerations and multipliers by every formulation, at random states on the constraints, are those of least
+    effort, and the motions from there are the same.
     """
     mechanism = mb.mechanisms.get(name, **LIBRARY[name])
     system, state = mechanism.system, mechanism.state
-    roads = ROADS if system.positive_definite_mass else WITHOUT_INVERSE_OF_MASS
+    formulations = FORMULATIONS if system.positive_definite_mass else WITHOUT_INVERSE_OF_MASS
 
     # Eliminations of many rows take longer than to compile them.
     @(jit_to_run_long if system.acceleration_rows > 16 else jax.jit)
     def solve(q, u, change):
         y = mb.manifold.project(system, 0.0, mb.State(q, u))
-        motion, (multipliers, jacobian, basis) = motion_by(system, roads, y.q, y.u)
+        motion, (multipliers, jacobian, basis) = motion_by(system, formulations, y.q, y.u)
         udot = motion[2][0]
         left = jax.vmap(lambda udot: system.acceleration_residual(0.0, y.q, y.u, udot))(udot)
         other = basis @ change
@@ -295,8 +298,10 @@ def test_formulations_agree(name):
         change = jnp.asarray(rng.normal(size=system.nu - system.acceleration_rank))
         motion, multipliers, left, (sums, sizes), (power, powers), (least, more), excess = solve(q, u, change)
         for values in (motion[2][0], multipliers):
-            for k, road in enumerate(roads):
-                np.testing.assert_allclose(values[k], values[0], rtol=0, atol=1e-10 * largest(values[0]), err_msg=road)
+            for k, formulation in enumerate(formulations):
+                np.testing.assert_allclose(
+                    values[k], values[0], rtol=0, atol=1e-10 * largest(values[0]), err_msg=formulation
+                )
         np.testing.assert_allclose(left[0], 0.0, atol=1e-9 * largest(sums))
         np.testing.assert_allclose(left, 0.0, atol=1e-10 * largest(sizes))
         # The ideal force of constraints does no work in displacements that they allow.
@@ -304,9 +309,9 @@ def test_formulations_agree(name):
         if system.ideal and system.positive_definite_mass:
             np.testing.assert_allclose(more - least, excess, rtol=0, atol=1e-12 * more)
         for values in motion:
-            for k, road in enumerate(roads):
+            for k, formulation in enumerate(formulations):
                 bound = 1e-8 * largest(values[:, 0])
-                np.testing.assert_allclose(values[:, k], values[:, 0], rtol=0, atol=bound, err_msg=road)
+                np.testing.assert_allclose(values[:, k], values[:, 0], rtol=0, atol=bound, err_msg=formulation)
 
 
 MOTIONS = {
@@ -321,18 +326,18 @@ def motions():
 
     def by(name, **options):
         mechanism = mb.mechanisms.get(name)
-        return lambda road: (
-            mb.simulate(mechanism.system, mechanism.state, t1=0.2, rtol=1e-9, formulation=road, **options).ys
+        return lambda formulation: (
+            mb.simulate(mechanism.system, mechanism.state, t1=0.2, rtol=1e-9, formulation=formulation, **options).ys
         )
 
     ways = [by(name, **options) for name, options in MOTIONS.items()]
     return [(way, way(Partitioned())) for way in ways]
 
 
-@pytest.mark.parametrize("road", [name for name in ROADS if name not in ("partitioned", "multipliers")])
-def test_motions_by_every_formulation(road, motions):
+@pytest.mark.parametrize("formulation", [name for name in FORMULATIONS if name not in ("partitioned", "multipliers")])
+def test_motions_by_every_formulation(formulation, motions):
     for way, expected in motions:
-        end = way(ROADS[road])
+        end = way(FORMULATIONS[formulation])
         np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-9)
         np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-8)
 
@@ -351,13 +356,14 @@ class SaddlePoint(AbstractFormulation):
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = False
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        A = jacobian[factor.rows]
+    def solve(self, inertia, force, jacobian, gamma):
+        jacobian = jacobian.dense()
+        A = jacobian.independent
         m, n = A.shape
         mass = inertia.product(jnp.eye(n))
         both = jnp.concatenate([jnp.concatenate([mass, -A.T], axis=1), jnp.concatenate([A, jnp.zeros((m, m))], axis=1)])
-        solution = jnp.linalg.solve(both, jnp.concatenate([force, gamma[factor.rows]]))
-        return solution[:n], factor.spread(solution[n:])
+        solution = jnp.linalg.solve(both, jnp.concatenate([force, jacobian.gather_rows(gamma)]))
+        return solution[:n], jacobian.scatter_rows(solution[n:])
 
 
 def test_a_formulation_of_ones_own(motions):
@@ -367,8 +373,8 @@ def test_a_formulation_of_ones_own(motions):
 
 def test_formulations_that_need_the_inverse_of_a_singular_mass_matrix_are_refused():
     mechanism = mb.mechanisms.get("spherical_four_bar")
-    for road in (Multipliers(), Poincare(), UdwadiaKalaba()):
+    for formulation in (Multipliers(), Poincare(), UdwadiaKalaba()):
         with pytest.raises(ValueError, match="NullSpace"):
-            mb.formulations.accelerations(mechanism.system, road, 0.0, mechanism.state.q, mechanism.state.u)
+            mb.formulations.accelerations(mechanism.system, formulation, 0.0, mechanism.state.q, mechanism.state.u)
         with pytest.raises(ValueError, match="NullSpace"):
-            mb.simulate(mechanism.system, mechanism.state, t1=1.0, formulation=road)
+            mb.simulate(mechanism.system, mechanism.state, t1=1.0, formulation=formulation)

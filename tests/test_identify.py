@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from scipy.optimize import least_squares
 
 import jaxmb as mb
 from jaxmb import planar
@@ -261,6 +262,26 @@ def test_failed_trials_are_rejected():
     assert min(trials) < 0
     assert solution.success
     np.testing.assert_allclose(solution.z, [1e-2, 1e-4], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "residuals, start",
+    [
+        (lambda z: jnp.stack([10 * (z[1] - z[0] ** 2), 1 - z[0]]), [-1.2, 1.0]),
+        (lambda z: jnp.stack([z[0] - 1e6, z[1] - 2e-6, z[0] * z[1] - 2]), [1.0, 1.0]),
+        (lambda z: 3 * jnp.exp(-2 * TS) + 0.01 * jnp.sin(40 * TS) - z[0] * jnp.exp(-z[1] * TS), [1.0, 0.0]),
+        (lambda z: jnp.stack([z[0] * z[1] - 2, (z[0] * z[1]) ** 2 - 3.9]), [1.0, 1.0]),
+    ],
+    ids=["curved valley", "badly scaled", "with noise", "undetermined"],
+)
+def test_least_squares_agree_with_scipy(residuals, start):
+    """On the value of the objective; the minimum need not be unique."""
+    residuals = jax.jit(residuals)
+    linearised = lambda z: (residuals(z), jax.jacfwd(residuals)(z))
+    found = levenberg_marquardt(linearised, jnp.array(start), tol=1e-10, limit=100)
+    known = least_squares(residuals, start, jax.jacfwd(residuals), xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
+    assert found.success and found.iterations < 50
+    np.testing.assert_allclose(0.5 * np.sum(residuals(found.z) ** 2), known.cost, rtol=1e-8, atol=1e-10)
 
 
 def test_iterations_are_limited(system, motion):

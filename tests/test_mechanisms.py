@@ -1,6 +1,7 @@
 """The library of mechanisms against published and independent values, their structure, and the behaviour of charts."""
 
 import functools
+from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -69,6 +70,13 @@ CASES = [
     ("rough_ring", {}, 1e-9),
     ("tracking_chain", {}, 1e-7),
 ]
+
+
+def test_every_file_of_reference_values_belongs_to_a_mechanism():
+    for path in (Path(mechanisms.__file__).parent / "data").iterdir():
+        assert path.suffix == ".json" and path.stem.startswith(mechanisms.names())
+        known = mechanisms.References.load(path.stem)
+        assert known.source and 0 < known.tolerance < 1e-6 and np.all(np.diff(known.times) > 0)
 
 
 @pytest.mark.parametrize("name, parameters, bound", CASES)

@@ -270,6 +270,6 @@ def test_bad_input():
     with pytest.raises(ValueError, match="Unknown joint 'turn'"):
         program = mb.Servo(angle("turn", motion=lambda t, p: t))
         scene(joints=[program], forces=[planar.Friction("rub", "turn", coefficient=0.1, radius=0.1)])
-    with pytest.raises(ValueError, match=r"accelerations asked for by.*turn.*contradict"):
+    with pytest.raises(ValueError, match=r"accelerations prescribed by.*turn.*contradict"):
         both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
         scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])

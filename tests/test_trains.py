@@ -1,5 +1,6 @@
 """Trains: draft gears, chains of vehicles of any length, and the cost of them."""
 
+import dataclasses
 import functools
 import os
 import time
@@ -13,11 +14,13 @@ from oracles import trains as oracle
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.formulations import BlockMultipliers, Multipliers, accelerations
-from jaxmb.manifold import BlockProjection
+from jaxmb.formulations import Multipliers, Poincare, accelerations
+from jaxmb.manifold import Partition, Projection
 from jaxmb.mechanisms._relative import velocities
 from jaxmb.mechanisms.train import coupler_forces
-from jaxmb.states import assembly, chain_assembly as _chain_assembly, structure as _structure
+from jaxmb.states import closest, structure
+from jaxmb.system import joint_graph
+from jaxmb.system.joint_graph import chain_order
 
 # A draft gear that is a linear spring.
 LINEAR = functools.partial(planar.DraftGear, stiffness=2e7, unloading=1.0, preload=0.0, slack=0.0, travel=10.0)
@@ -203,6 +206,13 @@ def hinged(n, **numbers):
     return mb.mechanisms.train(n=n, coupler=planar.Revolute, mass=mass, inertia=16 * mass, **numbers)
 
 
+def by_blocks(system):
+    """The system with its joints in an order of elimination, also where a dense matrix is faster."""
+    order = chain_order(system)
+    assert order is not None
+    return dataclasses.replace(system, elimination=order)
+
+
 def random_state(system, rng, pitch=0.2):
     q = np.asarray(system.guess.q) + np.tile([0.0, 0.0, 1.0], system.nq // 3) * pitch * rng.normal(size=system.nq)
     return jnp.asarray(q), jnp.asarray(rng.normal(size=system.nu))
@@ -210,14 +220,14 @@ def random_state(system, rng, pitch=0.2):
 
 @pytest.mark.parametrize("n", [2, 3, 10, 50])
 def test_hinge_forces_are_those_of_one_matrix_of_all(n):
-    system = hinged(n).system
-    solve = jax.jit(lambda q, u: (accelerations(system, BlockMultipliers(), 0.1, q, u), system.force(0.1, q, u)))
+    system = by_blocks(hinged(n).system)
+    solve = jax.jit(lambda q, u: (accelerations(system, Multipliers(), 0.1, q, u), system.force(0.1, q, u)))
     rng = np.random.default_rng(n)
     for _ in range(3):
         q, u = random_state(system, rng)
         (udot, multipliers), force = solve(q, u)
         arrays = (np.asarray(x).reshape(n, 3) for x in (q, u, force))
-        expected, forces = oracle.hinged_accelerations(*arrays, np.asarray(system.mass), np.asarray(system.rotary))
+        expected, forces = oracle.hinged_accelerations(*arrays, np.asarray(system.mass), np.asarray(system.moments_of_inertia))
         np.testing.assert_allclose(udot.reshape(n, 3), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
         np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, rtol=0, atol=1e-12 * np.max(np.abs(forces)))
 
@@ -252,32 +262,44 @@ def hanging_spheres():
 def test_any_joints_in_chains(build):
     system = build()
     rng = np.random.default_rng(0)
-    solve = jax.jit(
-        lambda q, u: [accelerations(system, road, 0.0, q, u) for road in (BlockMultipliers(), Multipliers())]
-    )
+    structured = by_blocks(system)
+
+    @jax.jit
+    def solve(q, u, v):
+        cases = (structured, Multipliers()), (structured, Poincare()), (system, Multipliers())
+        blocks = structured.structured_jacobian(0.0, q, u)
+        products = [
+            [A.product(v), A.transpose_product(A.product(v)), A.matrix]
+            for A in (blocks.dense(), system.structured_jacobian(0.0, q, u))
+        ]
+        products.append([blocks.product(v), blocks.transpose_product(blocks.product(v)), products[0][2]])
+        return [accelerations(*case, 0.0, q, u) for case in cases], products
+
     for _ in range(3):
         q = system.normalize(system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
-        found, expected = solve(q, jnp.asarray(rng.normal(size=system.nu)))
-        for a, b in zip(found, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
+        for found in solve(q, *jnp.asarray(rng.normal(size=(2, system.nu)))):
+            for case in found[:-1]:
+                for a, b in zip(case, found[-1], strict=True):
+                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
 
 
 def test_a_chain_in_space_moves_as_by_partitioning():
     system = hanging_spheres()
-    ends = [
-        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys
-        for manifold in (BlockProjection(), None)
+    cases = (system, Partition()), (system, Projection()), (by_blocks(system), Projection())
+    expected, *ends = [
+        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys for system, manifold in cases
     ]
-    np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-7)
-    assert np.max(np.abs(system.coordinate_residual(0.3, ends[0].q[-1]))) <= 1e-13
+    for end in ends:
+        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-7)
+        assert np.max(np.abs(system.coordinate_residual(0.3, end.q[-1]))) <= 1e-13
 
 
 def undamped(coupler):
     return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
 
 
-@pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, BlockProjection())])
+@pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, Projection())])
 def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
     system = undamped(coupler).system
     rng = np.random.default_rng(1)
@@ -297,27 +319,27 @@ def long_chain():
 
 
 def test_long_chains_are_assembled_as_short_ones_are(long_chain):
-    """The way without dense matrices against the other one, with derivatives."""
+    """Assembly by blocks against that with dense matrices, with derivatives."""
     system, rng = long_chain.system, np.random.default_rng(0)
     bend, turn = (jnp.asarray(rng.normal(size=48)) for _ in range(2))
     held = np.isin(np.arange(48), [5, 20])
     direction = jax.tree.map(lambda x: 1e-2 * x * jnp.asarray(rng.normal(size=x.shape)), system)
     of_state = jnp.asarray(rng.normal(size=(2, 48)))
 
-    def by_blocks(system, guess):
-        q, ok, _ = _chain_assembly.positions(system, 0.0, guess.q, held, 1e-10)
-        return jnp.stack([q, _chain_assembly.velocities(system, 0.0, q, guess.u, held)[0]]), ok
+    def blockwise(system, guess):
+        q, ok, _ = closest.configuration_by_blocks(system, 0.0, guess.q, held, 1e-10)
+        return jnp.stack([q, closest.velocities_by_blocks(system, 0.0, q, guess.u, held)[0]]), ok
 
     def dense(system, guess):
-        q, ok = assembly.positions(system, 0.0, guess.q, tuple(held.tolist()), 32)
-        return jnp.stack([q, assembly.velocities(system, 0.0, q, guess.u, tuple(held.tolist()))[0]]), ok
+        q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), 32)
+        return jnp.stack([q, closest.closest_velocities(system, 0.0, q, guess.u, tuple(held.tolist()))[0]]), ok
 
     @jax.jit
     def evaluate(system, guess, direction):
         pushed = lambda f: jax.jvp(lambda s, g: f(s, g)[0], (system, guess), (direction, guess))
         back = lambda f: jax.grad(lambda s, g: jnp.vdot(of_state, f(s, g)[0]), (0, 1))(system, guess)
-        pulled = jax.tree.map(jnp.vdot, back(by_blocks), (direction, guess))
-        return pushed(by_blocks), pushed(dense), sum(jax.tree.leaves(pulled)), by_blocks(system, guess)[1]
+        pulled = jax.tree.map(jnp.vdot, back(blockwise), (direction, guess))
+        return pushed(blockwise), pushed(dense), sum(jax.tree.leaves(pulled)), blockwise(system, guess)[1]
 
     guess = mb.State(long_chain.state.q + 5e-4 * bend, turn)
     (found, dfound), (expected, dexpected), pulled, ok = evaluate(system, guess, direction)
@@ -328,12 +350,12 @@ def test_long_chains_are_assembled_as_short_ones_are(long_chain):
 
 
 def test_long_chains_need_no_choice(long_chain):
-    """The same motion by both solvers' defaults, joint by joint."""
-    assert "joint by joint" in str(long_chain.system)
+    """The same motion by both solvers' defaults, by blocks."""
+    assert "block-tridiagonal" in str(long_chain.system)
     ends = []
     for solver in (None, diffrax.Tsit5()):
         sol = mb.simulate(long_chain.system, long_chain.state, t1=0.1, rtol=1e-9, solver=solver)
-        assert isinstance(sol.formulation, BlockMultipliers)
+        assert isinstance(sol.formulation, Multipliers)
         assert np.all(sol.constraint_violation.position <= 1e-13)
         ends.append(sol.ys)
     np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
@@ -379,14 +401,15 @@ def test_very_long_chains_are_compiled_without_dense_matrices(monkeypatch):
     def refused(system):
         raise AssertionError("a dense Jacobian is made")
 
-    monkeypatch.setattr(_structure, "VERY_LONG", 10)
-    monkeypatch.setattr(_structure, "_DENSE", 10)
-    monkeypatch.setattr(_structure, "_analyse", refused)
+    monkeypatch.setattr(joint_graph, "_LEAST_ROWS", 10)
+    monkeypatch.setattr(closest, "MANY_ROWS", 10)
+    monkeypatch.setattr(structure, "_DENSE", 10)
+    monkeypatch.setattr(structure, "_analyse", refused)
     foot = planar.Revolute("foot", "ground", "b0", point=(-0.5, 0.0))
     system = ring(foot, bodies=8)
     assert (system.velocity_rows, system.velocity_rank, system.coordinate_rank) == (16, 16, 16)
     far = planar.Revolute("far", "ground", "b7", point_a=(99.0, 0.0), point_b=(0.5, 0.0))
-    with pytest.raises(ValueError, match=r"cannot be assembled.*leave open far"):
+    with pytest.raises(ValueError, match=r"cannot be assembled.*violate far"):
         ring(foot, far, bodies=8)
 
 
@@ -396,23 +419,84 @@ def pendulum_on_paper():
     return mb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[rod], q=(1.0, 0.0))
 
 
+def turning_pendulum():
+    """In velocities along axes that turn and move, with a mass matrix that depends on the position."""
+    kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2) + 0.5 * q[0] ** 2 * v[1] ** 2
+    rod = mb.lagrangian.Holonomic("rod", lambda t, q, p: q @ q - 1.0)
+    axes = lambda t, q, p: jnp.array([[jnp.cos(q[1]), -jnp.sin(q[1])], [jnp.sin(q[1]), jnp.cos(q[1])]])
+    kinematics = mb.lagrangian.Frame(axes, 2, lambda t, q, p: jnp.array([0.1, 0.2]) * jnp.cos(t))
+    return mb.lagrangian.LagrangianSystem(
+        kinetic=kinetic, constraints=[rod], kinematics=kinematics, q=(1.0, 0.0), u=(0.0, 0.3)
+    )
+
+
+def skater():
+    return mb.mechanisms.get("appell_hamel").system
+
+
+def dry_friction():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pin = planar.Revolute("pin", "ground", "body", point=(1.0, 0.0))
+    return mb.Scene([body], joints=[pin], forces=[planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)]).compile()
+
+
 @pytest.mark.parametrize(
     ("build", "options", "message"),
     [
-        (lambda: ring(planar.Distance("back", "b3", "b0")), {}, "back closes a loop"),
-        (lambda: ring(planar.Distance("twin", "b0", "b1", point_a=(0, 1)), bodies=2), {}, "twin closes a loop"),
-        (lambda: ring(planar.Revolute("foot", "ground", "b1", point=(1, 0))), {}, "branch at b1.*pin0, pin1, foot"),
-        (redundant, {}, "only 3 are independent"),
-        (ring, {"solver": mb.solvers.Hermite()}, "BlockProjection needs Adams"),
-        (ring, {"formulation": Multipliers()}, "goes with BlockMultipliers"),
-        (ring, {"formulation": BlockMultipliers(), "manifold": mb.manifold.Partition()}, "no independent coordinates"),
-        (pendulum_on_paper, {}, "Only scenes have a joint graph"),
+        (redundant, {}, r"only 3 are independent.*Partition\(\)"),
+        (ring, {"solver": mb.solvers.Hermite()}, "Projection needs Adams"),
+        (ring, {"formulation": Poincare()}, r"Projection with Adams finds accelerations by Multipliers\(\)"),
+        (skater, {}, "linear in velocities"),
+        (dry_friction, {}, "ideal"),
     ],
 )
-def test_what_is_no_chain_is_refused(build, options, message):
+def test_projection_with_adams_refuses(build, options, message):
     system = build()
     with pytest.raises(ValueError, match=message):
-        mb.simulate(system, system.guess, t1=1.0, **({"manifold": BlockProjection()} | options))
+        mb.simulate(system, system.guess, t1=1.0, **({"manifold": Projection()} | options))
+
+
+LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
+TWIN = planar.Distance("twin", "b0", "b1", point_a=(0.0, 1.0))
+FOOT = planar.Revolute("foot", "ground", "b1", point=(1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "build", [lambda: ring(LOOP), lambda: ring(TWIN, bodies=2), lambda: ring(FOOT), pendulum_on_paper, turning_pendulum]
+)
+def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
+    """Loops, branches and systems without joints: the same motion as by partitioning, with its derivatives."""
+    system = build()
+    assert system.elimination is None
+    rng = np.random.default_rng(0)
+    push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=system.nu)))
+    state = mb.assemble(system, push)
+
+    def end(u, manifold, adjoint):
+        start = mb.manifold.project(system, 0.0, mb.State(state.q, state.u * u))
+        y = mb.simulate(system, start, t1=0.3, rtol=1e-10, manifold=manifold, adjoint=adjoint).ys
+        return jnp.concatenate([y.q[0], y.u[0]])
+
+    forward = lambda manifold: jax.jit(
+        lambda u: jax.jvp(lambda u: end(u, manifold, diffrax.ForwardMode()), (u,), (1.0,))
+    )
+    expected, dexpected = forward(Partition())(1.0)
+    found, dfound = forward(Projection())(1.0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-6)
+    weights = jnp.asarray(rng.normal(size=found.size))
+    reverse = jax.jit(jax.grad(lambda u: weights @ end(u, Projection(), None)))(1.0)
+    np.testing.assert_allclose(reverse, weights @ dfound, rtol=1e-9)
+
+
+def test_partitioning_of_a_long_chain_still_works(long_chain):
+    """With either formulation when it is asked for."""
+    run = lambda **options: mb.simulate(long_chain.system, long_chain.state, t1=0.02, rtol=1e-9, **options).ys
+    expected = run()
+    for formulation in (None, Multipliers()):
+        end = run(manifold=Partition(), formulation=formulation)
+        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-6)
 
 
 # Cost
@@ -435,13 +519,12 @@ def test_program_and_memory_of_long_trains(coupler):
 
     def measure(n):
         mechanism = mb.mechanisms.train(n=n, coupler=coupler)
-        road = BlockMultipliers() if mechanism.system.constraints else Multipliers()
-        right_hand_side = lambda system, q, u: accelerations(system, road, 0.1, q, u)[0]
+        right_hand_side = lambda system, q, u: accelerations(system, Multipliers(), 0.1, q, u)[0]
         arguments = mechanism.system, mechanism.state.q, mechanism.state.u
         lines = jax.jit(right_hand_side).lower(*arguments).as_text().count("\n")
         return lines, largest(jax.make_jaxpr(right_hand_side)(*arguments).jaxpr)
 
-    (few, small), (many, large) = measure(20), measure(80)
+    (few, small), (many, large) = measure(40), measure(160)
     assert few == many
     assert large <= 4.2 * small
 
@@ -458,11 +541,10 @@ def test_time_of_long_trains(coupler):
     runs = {}
     for n in (1000, 10000):
         mechanism = mb.mechanisms.train(n=n, coupler=coupler)
-        road = BlockMultipliers() if mechanism.system.constraints else Multipliers()
 
         @jax.jit
-        def several(system, q, u, road=road, repeats=100000 // n):
-            again = lambda _, u: u + 1e-9 * accelerations(system, road, 0.1, q, u)[0]
+        def several(system, q, u, repeats=100000 // n):
+            again = lambda _, u: u + 1e-9 * accelerations(system, Multipliers(), 0.1, q, u)[0]
             return jax.lax.fori_loop(0, repeats, again, u)
 
         runs[n] = functools.partial(several, mechanism.system, mechanism.state.q, mechanism.state.u)

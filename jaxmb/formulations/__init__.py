@@ -1,10 +1,9 @@
 """Formulations of the equations of constrained motion."""
 
-from .block_multipliers import BlockMultipliers as BlockMultipliers
 from .formulation import (
     AbstractFormulation as AbstractFormulation,
     accelerations as accelerations,
-    linearize as linearize,
+    pivoted_jacobian as pivoted_jacobian,
 )
 from .gauss import gauss_function as gauss_function
 from .multipliers import Multipliers as Multipliers

@@ -6,16 +6,17 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..linalg.elimination import Factor, factor, full_pivot
-from ..system import AbstractInertia, AbstractSystem
-from ..system.chain import block_jacobian
+from ..linalg.elimination import eliminate, full_pivot
+from ..linalg.inertia import AbstractInertia
+from ..linalg.jacobian import AbstractJacobian, DenseJacobian
+from ..system import AbstractSystem
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -24,46 +25,38 @@ else:
 
 
 class AbstractFormulation(eqx.Module):
-    """A road from the matrices of the equation to accelerations and multipliers.
+    """A method of solving for accelerations and multipliers.
 
-    `inverts_mass` says whether it needs the inverse of the mass matrix, which is not there for every system;
-    `partitions` says whether it needs the split in dependent and independent columns; without it only the independent
-    rows are needed, and no search for pivots where there is no redundancy. `assembles` says whether it takes A as one
-    matrix; otherwise it takes the blocks of joints in a chain, and no factor.
+    `inverts_mass` says whether it needs the inverse of the mass matrix, which some systems do not have; `partitions`
+    says whether it needs the velocities split into dependent and independent ones. A formulation that does not
+    partition needs only the independent rows, so no pivots are searched for where no row is redundant.
     """
 
     partitions: AbstractVar[bool]
     inverts_mass: AbstractVar[bool]
-    assembles: ClassVar[bool] = True
 
     @abc.abstractmethod
     def solve(
         self,
         inertia: AbstractInertia,
         force: Float[Array, "n"],
-        jacobian: Float[Array, "m n"],
+        jacobian: AbstractJacobian,
         gamma: Float[Array, "m"],
-        factor: Factor,
     ) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
         """Accelerations u̇ and multipliers λ; multipliers of implied rows are zero.
 
-        **Arguments:** M, F, A and γ of the equation, and A's `factor` in the current chart.
+        **Arguments:** M, F, A and γ of the equation. A formulation that needs A as one matrix takes `jacobian.dense()`.
         """
 
 
-def linearize(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> tuple[Array, Factor]:
-    """The Jacobian A at a state and its factor, with a search for pivots."""
+def pivoted_jacobian(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> DenseJacobian:
+    """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
     jacobian = system.jacobian(t, q, u)
-    pivots = full_pivot(jacobian, scale=system.velocity_scale(), stage=stages(system))
-    return jacobian, factor(jacobian, pivots.order, system.acceleration_rank)
+    pivots = full_pivot(jacobian, scale=system.velocity_scale(), level=row_levels(system))
+    return DenseJacobian(jacobian, eliminate(jacobian, pivots.order, system.acceleration_rank))
 
 
-def every_row(m: int, n: int, dtype) -> Factor:
-    """A factor that keeps all rows and splits no columns, for formulations that do not partition."""
-    return Factor(jnp.zeros((n, m), dtype), jnp.zeros((n, 0), dtype), jnp.arange(m))
-
-
-def stages(system: AbstractSystem) -> Array:
+def row_levels(system: AbstractSystem) -> Array:
     """Holonomic rows before nonholonomic ones before those of accelerations, so that the dependent velocities nest."""
     row = jnp.arange(system.acceleration_rows)
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
@@ -78,41 +71,25 @@ def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None
         )
 
 
-def check_independent(system: AbstractSystem) -> None:
-    """Raise a `ValueError` for a system with redundant rows, which block elimination cannot drop."""
-    if system.acceleration_rank < system.acceleration_rows:
-        raise ValueError(
-            f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and block "
-            "elimination drops none; use Partition() or Projection()."
-        )
-
-
 def accelerations(
     system: AbstractSystem,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
-    demand: Float[Array, "m"] | None = None,
+    gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `demand`, those of
-    `A u̇ = γ − demand`.
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
+    `A u̇ = γ − gamma_shift`.
 
-    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular, and for one
-    that needs a chain of independent joints where there is none.
+    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
     """
     check_mass(system, formulation)
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
-    jacobian: Any
-    if not formulation.assembles:
-        check_independent(system)
-        jacobian, split = block_jacobian(system, t, q, u), None
-    elif formulation.partitions or system.acceleration_rank < system.acceleration_rows:
-        jacobian, split = linearize(system, t, q, u)
-    else:
-        jacobian, split = system.jacobian(t, q, u), every_row(system.acceleration_rows, system.nu, u.dtype)
-    return solve_constrained(system, formulation, t, q, u, jacobian, split, demand)
+    searches = formulation.partitions or system.acceleration_rank < system.acceleration_rows
+    jacobian = pivoted_jacobian(system, t, q, u) if searches else system.structured_jacobian(t, q, u)
+    return solve_constrained(system, formulation, t, q, u, jacobian, gamma_shift)
 
 
 def solve_constrained(
@@ -121,20 +98,19 @@ def solve_constrained(
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
-    jacobian: Any,
-    split: Any,
-    demand: Float[Array, "m"] | None = None,
+    jacobian: AbstractJacobian,
+    gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """The same from the Jacobian A and its factor, or from its blocks and none.
+    """The same as `accelerations`, from a Jacobian A that is known already.
 
     Where constraints are not ideal, their force C follows from the multipliers of ideal ones, and then accelerations
     from C as from any other force (F. E. Udwadia and P. Phohomsiri, Proc. R. Soc. A 463, 2007): `M u̇ = F + C + Aᵀ λ`.
     """
     inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    gamma = gamma if demand is None else gamma - demand
-    udot, multipliers = formulation.solve(inertia, force, jacobian, gamma, split)
+    gamma = gamma if gamma_shift is None else gamma - gamma_shift
+    udot, multipliers = formulation.solve(inertia, force, jacobian, gamma)
     if system.ideal:
         return udot, multipliers
     force = force + system.nonideal_force(t, q, u, multipliers)
-    return formulation.solve(inertia, force, jacobian, gamma, split)
+    return formulation.solve(inertia, force, jacobian, gamma)

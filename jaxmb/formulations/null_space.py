@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from ..linalg.elimination import solve_positive
-from ..linalg.orthogonal import frame
+from ..linalg.orthogonal import orthogonal_basis
 from .formulation import AbstractFormulation
 
 
@@ -11,8 +11,8 @@ class NullSpace(AbstractFormulation):
     """Maggi's equations in an orthonormal basis Z of the null space of A: `(ZᵀMZ) ẏ = Zᵀ(F − M c)`, `u̇ = Z ẏ + c`.
 
     c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
-    preferred over others, so there is no chart to become bad, and no pivots to search where no row is redundant. The
-    mass matrix may be singular, as long as no velocity without mass is free.
+    preferred over others, so no chart can become singular, and no pivots are searched for where no row is redundant.
+    The mass matrix may be singular, as long as no velocity without mass is free.
 
     ??? cite "Reference"
         ```bibtex
@@ -27,10 +27,11 @@ class NullSpace(AbstractFormulation):
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = False
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        split = frame(jacobian[factor.rows].T)
-        Z, solution = split.across, split.pseudoinverse
-        particular = solution.T @ gamma[factor.rows]
+    def solve(self, inertia, force, jacobian, gamma):
+        jacobian = jacobian.dense()
+        basis = orthogonal_basis(jacobian.independent.T)
+        Z, solution = basis.complement, basis.pseudoinverse
+        particular = solution.T @ jacobian.gather_rows(gamma)
         reduced = Z.T @ inertia.product(Z)
         udot = particular + Z @ solve_positive(reduced, Z.T @ (force - inertia.product(particular)))
-        return udot, factor.spread(solution @ (inertia.product(udot) - force))
+        return udot, jacobian.scatter_rows(solution @ (inertia.product(udot) - force))

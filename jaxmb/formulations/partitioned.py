@@ -10,7 +10,7 @@ class Partitioned(AbstractFormulation):
     """Reduced equations in the independent accelerations, `(EᵀME) u̇_i = Eᵀ(F − M c)`, `u̇ = E u̇_i + c`.
 
     E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
-    Cheapest where the chart is there anyway and the degrees of freedom are few, and so the default with `Partition`. (A
+    Cheapest where a chart is made anyway and the degrees of freedom are few; the default with `Partition`. (A
     Bricard linkage, 30 velocities and 29 independent rows, one evaluation with its factor: 15 µs, and 24 with a
     derivative; the others take from 15 to 83, and 25 to 124.)
 
@@ -27,9 +27,10 @@ class Partitioned(AbstractFormulation):
     partitions: ClassVar[bool] = True
     inverts_mass: ClassVar[bool] = False
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        particular = factor.correction @ gamma
-        reduced = factor.basis.T @ inertia.product(factor.basis)
-        independent = solve_positive(reduced, factor.basis.T @ (force - inertia.product(particular)))
-        udot = particular + factor.basis @ independent
-        return udot, factor.correction.T @ (inertia.product(udot) - force)
+    def solve(self, inertia, force, jacobian, gamma):
+        factor = jacobian.dense().pivoted
+        particular = factor.right_inverse @ gamma
+        reduced = factor.null_space.T @ inertia.product(factor.null_space)
+        independent = solve_positive(reduced, factor.null_space.T @ (force - inertia.product(particular)))
+        udot = particular + factor.null_space @ independent
+        return udot, factor.right_inverse.T @ (inertia.product(udot) - force)

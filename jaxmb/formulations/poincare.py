@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from ..linalg.orthogonal import frame
+from ..linalg.orthogonal import orthogonal_basis
 from .formulation import AbstractFormulation
 
 
@@ -30,10 +30,11 @@ class Poincare(AbstractFormulation):
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = True
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        root = inertia.root()
+    def solve(self, inertia, force, jacobian, gamma):
+        jacobian, root = jacobian.dense(), inertia.root()
         free = root.solve(force)
-        adapted = frame(root.solve(jacobian[factor.rows].T))
-        bound = adapted.inverse.T @ gamma[factor.rows]
-        sdot = adapted.along @ bound + adapted.across @ (adapted.across.T @ free)
-        return root.transpose().solve(sdot), factor.spread(adapted.inverse @ (bound - adapted.along.T @ free))
+        basis = orthogonal_basis(root.solve(jacobian.independent.T))
+        bound = basis.inverse.T @ jacobian.gather_rows(gamma)
+        sdot = basis.range @ bound + basis.complement @ (basis.complement.T @ free)
+        multipliers = basis.inverse @ (bound - basis.range.T @ free)
+        return root.transpose().solve(sdot), jacobian.scatter_rows(multipliers)

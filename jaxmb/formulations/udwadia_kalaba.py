@@ -5,7 +5,7 @@ from typing import Literal, get_args
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..linalg.orthogonal import frame
+from ..linalg.orthogonal import orthogonal_basis
 from .formulation import AbstractFormulation
 
 Method = Literal["moore_penrose", "inverses", "singular_mass"]
@@ -63,38 +63,37 @@ class UdwadiaKalaba(AbstractFormulation):
     def inverts_mass(self) -> bool:
         return self.method != "singular_mass"
 
-    def solve(self, inertia, force, jacobian, gamma, factor):
-        return _FORMS[self.method](inertia, force, jacobian, gamma, factor)
+    def solve(self, inertia, force, jacobian, gamma):
+        return _FORMS[self.method](inertia, force, jacobian.dense(), gamma)
 
 
-def _moore_penrose(inertia, force, jacobian, gamma, factor):
-    A, root = jacobian[factor.rows], inertia.root()
+def _moore_penrose(inertia, force, jacobian, gamma):
+    A, root = jacobian.independent, inertia.root()
     back = root.transpose()
     free = back.solve(root.solve(force))
-    pseudoinverse = frame(root.solve(A.T)).pseudoinverse.T
-    sdot = pseudoinverse @ (gamma[factor.rows] - A @ free)
-    return free + back.solve(sdot), factor.spread(pseudoinverse.T @ sdot)
+    pseudoinverse = orthogonal_basis(root.solve(A.T)).pseudoinverse.T
+    sdot = pseudoinverse @ (jacobian.gather_rows(gamma) - A @ free)
+    return free + back.solve(sdot), jacobian.scatter_rows(pseudoinverse.T @ sdot)
 
 
-def _inverses(inertia, force, jacobian, gamma, factor):
-    del jacobian
-    root = inertia.root()
-    particular = factor.correction @ gamma
+def _inverses(inertia, force, jacobian, gamma):
+    factor, root = jacobian.pivoted, inertia.root()
+    particular = factor.right_inverse @ gamma
     ahead = root.solve(force) - root.transpose().product(particular)
-    independent = frame(root.transpose().product(factor.basis)).pseudoinverse @ ahead
-    udot = particular + factor.basis @ independent
-    return udot, factor.correction.T @ (inertia.product(udot) - force)
+    independent = orthogonal_basis(root.transpose().product(factor.null_space)).pseudoinverse @ ahead
+    udot = particular + factor.null_space @ independent
+    return udot, factor.right_inverse.T @ (inertia.product(udot) - force)
 
 
-def _singular_mass(inertia, force, jacobian, gamma, factor):
-    A = jacobian[factor.rows]
-    rows = frame(A.T)
-    project = lambda x: x - rows.along @ (rows.along.T @ x)
+def _singular_mass(inertia, force, jacobian, gamma):
+    A = jacobian.independent
+    rows = orthogonal_basis(A.T)
+    project = lambda x: x - rows.range @ (rows.range.T @ x)
     mass = project(inertia.product(jnp.eye(A.shape[1], dtype=A.dtype)))
-    stacked = frame(jnp.concatenate([mass, A])).pseudoinverse
+    stacked = orthogonal_basis(jnp.concatenate([mass, A])).pseudoinverse
     # The projection of F leaves nothing for least squares to balance, and so loses no digits to it.
-    udot = stacked @ jnp.concatenate([project(force), gamma[factor.rows]])
-    return udot, factor.spread(rows.pseudoinverse @ (inertia.product(udot) - force))
+    udot = stacked @ jnp.concatenate([project(force), jacobian.gather_rows(gamma)])
+    return udot, jacobian.scatter_rows(rows.pseudoinverse @ (inertia.product(udot) - force))
 
 
 _FORMS = {"moore_penrose": _moore_penrose, "inverses": _inverses, "singular_mass": _singular_mass}

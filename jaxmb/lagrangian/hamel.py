@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..linalg.elimination import Order, factor, full_pivot
+from ..linalg.elimination import PivotOrder, eliminate, full_pivot
 from .kinematics import QuasiVelocityFrame
 from .model import AbstractEquations
 from .transposition import Transposition, check_shape, share_of_suslov
@@ -106,17 +106,17 @@ def complete(columns: Float[Array, "n k"]) -> Float[Array, "n n"]:
 def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse, with full pivoting."""
     n = matrix.shape[0]
-    return factor(matrix, full_pivot(matrix).order, n).correction
+    return eliminate(matrix, full_pivot(matrix).order, n).right_inverse
 
 
-def pivoted_frame(matrix: Callable[..., Array], order: Order, rank: int) -> QuasiVelocityFrame:
+def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) -> QuasiVelocityFrame:
     """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
 
     **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
     `jaxmb.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the coordinates
     that the pivots leave.
     """
-    basis = lambda t, q, p: factor(jnp.asarray(matrix(t, q, p)), order, rank).basis
+    basis = lambda t, q, p: eliminate(jnp.asarray(matrix(t, q, p)), order, rank).null_space
     return QuasiVelocityFrame(basis, columns=order.n - rank)
 
 

@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import Scalar, VectorLike
-from ..linalg.elimination import factor, full_pivot
+from ..linalg.elimination import eliminate, full_pivot
+from ..linalg.newton import newton
 from .kinematics import AbstractKinematics, Parameters
 from .system import LagrangianSystem
 
@@ -88,17 +89,12 @@ def _inverse(omega, t, q, target, parameters, near):
     residual = lambda v: omega(t, q, v, parameters) - target
     slope = jax.jacfwd(residual)
 
-    def correct(carry):
-        v, _, k = carry
+    def correct(v):
         step = _solve(slope(v), residual(v))
-        return v - step, jnp.max(jnp.abs(step)), k + 1
+        return v - step, jnp.max(jnp.abs(step))
 
-    def proceed(carry):
-        v, size, k = carry
-        small = 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
-        return (size > small) & (k < _ITERATIONS)
-
-    v, size, _ = lax.while_loop(proceed, correct, (near, jnp.array(jnp.inf, q.dtype), 0))
+    far = lambda v, size: size > 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
+    v, size = newton(correct, far, near, most=_ITERATIONS, dtype=q.dtype)
     # Where rounding keeps corrections a little larger the inverse is found as well.
     found = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
     return jnp.where(found, v, jnp.nan)
@@ -116,7 +112,7 @@ def _inverse_jvp(primals, tangents):
 
 
 def _solve(matrix, right):
-    return factor(matrix, lax.stop_gradient(full_pivot(matrix).order), matrix.shape[0]).correction @ right
+    return eliminate(matrix, lax.stop_gradient(full_pivot(matrix).order), matrix.shape[0]).right_inverse @ right
 
 
 def kinetostatic_forces(

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
-from ..states.assembly import nearest, residual_size, tolerance
+from ..states.closest import meet_constraints, residual_size, tolerance
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
@@ -165,8 +165,8 @@ def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
     residual, coordinate_rank = jnp.zeros((), q.dtype), jnp.array(0)
     mass, inertia = hessian(t, q, v, p), system.inertia(t, q, u).product(jnp.eye(u.size, dtype=q.dtype))
     if system.position_rows:
-        q, near = nearest(system, t, q, system.coordinate_scale())
-        residual = residual_size(system, t, q, near)
+        q, linearized = meet_constraints(system, t, q, system.coordinate_scale())
+        residual = residual_size(system, t, q, linearized)
         coordinate_rank = full_pivot(system.coordinate_jacobian(t, q)).rank
     jacobian = system.jacobian(t, q, u)
     rank = lambda own: full_pivot(jnp.where(own[:, None], jacobian, 0.0)).rank

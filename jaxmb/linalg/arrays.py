@@ -1,4 +1,4 @@
-"""NumPy for what is known, which compiles nothing; JAX for what is traced, or an array of JAX's."""
+"""Choose NumPy for concrete values, where nothing is compiled, and JAX for tracers and JAX arrays."""
 
 from types import ModuleType
 from typing import Any
@@ -7,23 +7,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 
 def namespace(*arrays: Any) -> ModuleType:
-    """The module whose functions serve these arrays."""
+    """`numpy` if all arrays are NumPy's, else `jax.numpy`."""
     return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether there is anything traced in a pytree."""
+    """Whether any leaf of a pytree is traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def as_array(value: Any, dtype: Any) -> Any:
-    """A new array of NumPy's, or one of JAX's if anything in it is traced.
+    """A new NumPy array, or a JAX array if any entry is traced.
 
-    New, since `jax.device_put` shares the memory of what it is given: what its owner changes later must not follow.
+    The values are copied, since `jax.device_put` may alias NumPy memory that the caller changes later.
     """
     return jnp.asarray(value, dtype) if is_traced(value) else np.array(value, dtype)
 
@@ -35,3 +35,8 @@ def replaced(array: Array, index: Any, value: Any) -> Array:
     new = np.array(array)
     new[index] = value
     return jax.device_put(new)
+
+
+def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
+    """`values[index]` as a gather without checks: the indices are in bounds by construction."""
+    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -5,7 +5,7 @@ A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ 
 which H stays of order one, and leaves m − r rows that are implied by the others.
 
 Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other
-state the same split is used without search (`factor`). Pivots are integers and carry no derivative; values do.
+state the same split is used without search (`eliminate`). Pivots are integers and carry no derivative; values do.
 
 Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension Reduction in Analysis of
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
@@ -18,13 +18,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-# The largest sizes for each way of sweeping, measured on XLA's CPU backend: up to the first the rotating loop is nearly
-# twice as fast as the one in place, up to the second that one is faster than LAPACK's blocked elimination.
+# The largest number of rows for each way of sweeping; see jaxmb.linalg for the measurement.
 _ROTATING_SIZE = 18
 _LOOP_SIZE = 40
 
 
-class Order(eqx.Module):
+class PivotOrder(eqx.Module):
     """An order of elimination: two permutations and their inverses, packed in one array of integers.
 
     **Fields:** `packed`; `m`, `n`: the matrix's shape, static. `rows` has pivot rows first and implied rows last,
@@ -52,43 +51,43 @@ class Order(eqx.Module):
         return self.packed[2 * self.m + self.n :]
 
 
-class Pivots(eqx.Module):
+class PivotSearch(eqx.Module):
     """Result of `full_pivot`; integers and sizes, without derivatives.
 
     **Fields:** `rank`; `order` of elimination; `smallest` and `largest` pivot of the equilibrated matrix.
     """
 
     rank: Int[Array, ""]
-    order: Order
+    order: PivotOrder
     smallest: Float[Array, ""]
     largest: Float[Array, ""]
 
 
 class Factor(eqx.Module):
-    """The solved form of `A δx = −residual` in a given split; full-size matrices, so no index bookkeeping is left.
+    """The solved form of `A δx = −residual` in a given split, in matrices of full size.
 
-    **Fields:** `correction` (n × m): `δx = −correction @ residual` makes `A δx = −residual` while the independent
-    columns keep their values; columns of implied rows are zero. `basis` (n × (n − r)): `δx = basis @ δx_i` spans the
-    null space of A, with the identity on the independent rows and the influence matrix H on the dependent ones.
-    `rows` (r,): the rows kept, which tangents have not.
+    **Fields:** `right_inverse` (n × m): `δx = −right_inverse @ residual` makes `A δx = −residual` while the independent
+    columns keep their values; its columns of implied rows are zero. `null_space` (n × (n − r)): `δx = null_space @
+    δx_i` spans the null space of A, with the identity on the independent rows and the influence matrix H on the
+    dependent ones. `rows` (r,): the independent rows; None in tangents.
     """
 
-    correction: Float[Array, "n m"]
-    basis: Float[Array, "n f"]
+    right_inverse: Float[Array, "n m"]
+    null_space: Float[Array, "n f"]
     rows: Int[Array, "r"] | None
 
-    def spread(self, kept: Float[Array, "r"]) -> Float[Array, "m"]:
-        """Values of all rows from those of the kept ones: zero for implied rows."""
-        return jnp.zeros(self.correction.shape[1], kept.dtype).at[self.rows].set(kept)
+    def scatter_rows(self, kept: Float[Array, "r"]) -> Float[Array, "m"]:
+        """The values of all rows from those of the independent ones: zero for implied rows."""
+        return jnp.zeros(self.right_inverse.shape[1], kept.dtype).at[self.rows].set(kept)
 
 
 def full_pivot(
     A: Float[Array, "m n"],
     *,
     scale: Float[Array, "n"] | None = None,
-    stage: Int[Array, "m"] | None = None,
+    level: Int[Array, "m"] | None = None,
     tol: float | None = None,
-) -> Pivots:
+) -> PivotSearch:
     """Eliminate with full pivoting.
 
     **Arguments:**
@@ -96,8 +95,8 @@ def full_pivot(
     - `A`: the matrix, m × n, any shape and rank.
     - `scale`: size of a typical change of each column's coordinate (a length for translations, one for angles), shape
         (n,); the matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
-    - `stage`: rows of stage 0 are eliminated before rows of stage 1, shape (m,). This nests the dependent columns of
-        nonholonomic rows in the independent columns of the holonomic ones.
+    - `level`: rows of level 0 are eliminated before rows of higher levels, shape (m,). This nests the dependent columns
+        of nonholonomic rows in the independent columns of the holonomic ones.
     - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, the nearest of true
         ranks 1e-4.
     """
@@ -120,8 +119,8 @@ def full_pivot(
         open_row = row_order == unused
         open_ = open_row[:, None] & (column_order == unused)[None, :] & (size > zero)
         candidates = jnp.where(open_, size, 0.0)
-        if stage is not None:
-            first = jnp.where((stage == 0)[:, None], candidates, 0.0)
+        if level is not None:
+            first = jnp.where((level == 0)[:, None], candidates, 0.0)
             candidates = jnp.where(jnp.any(first > 0), first, candidates)
         best = jnp.argmax(candidates)
         r = lax.div(best, n)
@@ -147,13 +146,13 @@ def full_pivot(
     _, row_order, column_order, smallest, largest, rank = start if m == 0 else lax.fori_loop(0, min(m, n), step, start)
     rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
     packed = jnp.concatenate([rows, columns, jnp.argsort(rows), jnp.argsort(columns)]).astype(np.int32)
-    return Pivots(rank, Order(packed, m, n), smallest, largest)
+    return PivotSearch(rank, PivotOrder(packed, m, n), smallest, largest)
 
 
-def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
+def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
     """Eliminate in the order a chart already has, without search; differentiable in `A`.
 
-    **Arguments:** `A`: the matrix; `order` from `Pivots`; `rank`: its rank, static.
+    **Arguments:** `A`: the matrix; `order` from `PivotSearch`; `rank`: its rank, static.
     """
     m, n = A.shape
     rows = order.rows[:rank]
@@ -162,13 +161,13 @@ def factor(A: Float[Array, "m n"], order: Order, rank: int) -> Factor:
     identity = (column == free).astype(A.dtype)
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
-    # Gathers by pairs of indices: one kernel each, in the layout that comes next. Those of the pivots are places of A;
-    # of the others only what is dependent has a place, and the rest is not used.
+    # Gathers by pairs of indices are one kernel each, in the layout that comes next. The first is in bounds; in the
+    # others the indices of independent columns are clipped, and those values are not used.
     swept = gauss_jordan(_gather(A, rows[:, None], order.columns[None, :], "promise_in_bounds"), rank)
     dependent = column < rank
-    correction = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
-    basis = jnp.where(dependent, -_gather(swept, column, free, "clip"), identity)
-    return Factor(correction, basis, rows)
+    right_inverse = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
+    null_space = jnp.where(dependent, -_gather(swept, column, free, "clip"), identity)
+    return Factor(right_inverse, null_space, rows)
 
 
 def _gather(A, row, column, mode):
@@ -198,7 +197,7 @@ def _rotate(B):
     r = B.shape[0]
 
     def step(_, B):
-        # The pivot stands in the corner, always: its row moves to the bottom and its column to the end of the square.
+        # The pivot is always in the corner; then its row moves to the bottom, and its column to the end of the square.
         row = B[0] / B[:1, 0]
         row = jnp.concatenate([row[1:r], 1 / B[0, :1], row[r:]])
         rest = jnp.concatenate([B[1:, 1:r], jnp.zeros_like(B[1:, :1]), B[1:, r:]], axis=1)
@@ -219,8 +218,8 @@ def _sweep_in_place(B):
     return lax.fori_loop(0, r, step, B)
 
 
-# One member of a batch after the other: XLA's batched LAPACK kernels have been seen to wait forever for each other in
-# loops (jaxlib 0.10.2, two cores, 64 matrices of 35 rows).
+# The members of a batch one after the other: XLA's batched LAPACK kernels have been seen to wait forever for each other
+# in loops (jaxlib 0.10.2, two cores, 64 matrices of 35 rows).
 @jax.custom_batching.sequential_vmap
 def _sweep_blocked(B):
     r = B.shape[0]

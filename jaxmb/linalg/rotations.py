@@ -2,8 +2,7 @@
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
 components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p`
-are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`. What is made of NumPy's
-arrays alone is NumPy's.
+are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`. NumPy in, NumPy out.
 
 Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the Dynamic Analysis of Three-Dimensional
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
@@ -19,8 +18,8 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import Scalar, VectorLike
 from .arrays import as_array, namespace
 
-# Products of rotation algebra are written as small constant tensors and one sum each: XLA fuses those, where it would
-# make a kernel of every slice and every stack of components.
+# Products of rotation algebra are small constant tensors and one sum each: XLA fuses those, and would make a kernel of
+# every slice and every stack of components.
 
 
 def _tables():

@@ -19,9 +19,9 @@ from .manifold import AbstractManifold, all_rows_formulation, normalize_state
 class Baumgarte(AbstractManifold):
     """Integrate all coordinates and velocities, with constraints on accelerations that decay, for any solver.
 
-    Of constraints between positions `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, of those between velocities `ψ̇ + rate ψ = 0`: the
-    state is near the constraints, not on them, and a rate much above that of the motion makes it stiff. For comparison
-    with `Partition`, which needs no such number.
+    Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, those between velocities `ψ̇ + rate ψ = 0`: the
+    state is near the constraints, not on them, and a rate much above that of the motion makes the equations stiff. For
+    comparison with `Partition`, which needs no such number.
 
     **Arguments:** `rate` [1/s] > 0.
     """
@@ -63,8 +63,8 @@ class StabilisedField(eqx.Module):
         position = system.position_residual(t, q)
         velocity = system.velocity_residual(t, q, u)
         holonomic = np.arange(system.velocity_rows) < system.position_rows
-        demand = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
-        demand = demand + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
-        demand = jnp.pad(demand, (0, system.acceleration_rows - demand.size))
-        udot, _ = accelerations(system, self.formulation, t, q, u, demand)
+        shift = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
+        shift = shift + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
+        shift = jnp.pad(shift, (0, system.acceleration_rows - shift.size))
+        udot, _ = accelerations(system, self.formulation, t, q, u, shift)
         return State(system.rates(t, q, u), udot)

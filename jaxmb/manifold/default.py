@@ -2,15 +2,13 @@
 
 import diffrax
 
-from ..formulations import AbstractFormulation
+from ..formulations import AbstractFormulation, Multipliers
 from ..solvers import AbstractMultistep
 from ..system import AbstractSystem
-from ..system.chain import is_long
-from .block_projection import BlockProjection
-from .free import Free
 from .manifold import AbstractManifold
 from .partition import Partition
 from .projection import Projection
+from .unconstrained import Unconstrained
 
 
 def default_manifold(
@@ -18,8 +16,9 @@ def default_manifold(
 ) -> AbstractManifold:
     """The policy that suits a system, a solver, and a formulation if one is given."""
     if system.acceleration_rows == 0:
-        return Free()
+        return Unconstrained()
     if not isinstance(solver, AbstractMultistep):
         return Projection()
-    in_blocks = is_long(system) if formulation is None else not formulation.assembles
-    return BlockProjection() if in_blocks and not solver.solves_implicitly else Partition()
+    # Block elimination serves multipliers only: it singles out no independent columns.
+    in_blocks = system.elimination is not None and isinstance(formulation, Multipliers | None)
+    return Projection() if in_blocks and not solver.solves_implicitly else Partition()

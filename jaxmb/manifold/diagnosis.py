@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool
 
 from .._results import RESULTS
 from .._types import Scalar, State
-from ..formulations.formulation import stages
+from ..formulations.formulation import row_levels
 from ..linalg.elimination import full_pivot
 from ..system import AbstractSystem
 
@@ -29,7 +29,7 @@ def diagnose(
     system, t, y = lax.stop_gradient((system, t, y))
 
     def smallest_pivot():
-        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), stage=stages(system))
+        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), level=row_levels(system))
         return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
     pivot = lax.cond(failed, smallest_pivot, lambda: jnp.ones((), y.q.dtype))

@@ -14,28 +14,28 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import State
 from ..formulations import AbstractFormulation, Partitioned
-from ..formulations.formulation import check_mass, stages
-from ..linalg.elimination import factor, full_pivot
+from ..formulations.formulation import check_mass, row_levels
+from ..linalg.elimination import eliminate, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
 from .constrained import (
-    Evaluation,
-    Split,
+    ChartIndices,
+    ConstrainedAcceleration,
     coordinate_factor,
     correct_positions,
-    evaluate,
-    evaluate_general,
-    restore,
+    general_acceleration,
+    ideal_acceleration,
     restore_positions,
-    shared,
+    restore_state,
+    shares_split,
 )
 from .diagnosis import diagnose
 from .manifold import AbstractManifold, newton_tolerance
-from .projection import project_normalized
+from .orthogonal_projection import project_normalized
 from .vector_field import VectorField
 
-# A carried position factor is refreshed after this many steps, or when Newton takes this many iterations.
+# A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
@@ -50,14 +50,14 @@ _ROW_GROWTH = 4.0
 class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
-    Independent coordinates number `nq − rank Φ_q`, independent velocities `nu − rank [Φ; ψ]`; with nonholonomic
+    There are `nq − rank Φ_q` independent coordinates and `nu − rank [Φ; ψ]` independent velocities; with nonholonomic
     constraints these are two nested charts. Only independent components are integrated; the others satisfy the
     constraints to Newton's tolerance at the end of every step. The error of a step is measured on all of them. A chart
     is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would serve
-    better than those it keeps; history is kept for all components, so that costs no restart.
+    better than those it keeps; the solver's history is that of all components, so a new chart costs no restart.
 
-    The formulation finds the accelerations of predicted states; at corrected ones they are improved by Newton's method,
-    with the same factor.
+    The formulation finds the accelerations of predicted states; those of corrected states follow by one step of
+    Newton's method with the same factor.
 
     **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
     made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its
@@ -79,10 +79,6 @@ class Partition(AbstractManifold):
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
-        if not formulation.assembles:
-            raise ValueError(
-                f"{type(formulation).__name__} finds no independent coordinates; use BlockProjection() with it."
-            )
         return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
 
     def default_formulation(self, system):
@@ -99,13 +95,13 @@ class Partition(AbstractManifold):
 
 
 class Chart(eqx.Module):
-    """A split with its quality and counters.
+    """The index sets with their quality and counters.
 
     **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H| and, with
     redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties.
     """
 
-    split: Split
+    split: ChartIndices
     quality: Float[Array, "k"]
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
@@ -117,12 +113,12 @@ class Chart(eqx.Module):
 
     @property
     def iterations(self) -> Int[Array, ""]:
-        """Iterations of the last position Newton."""
+        """Newton iterations for positions in the last step."""
         return self.counters[1]
 
     @property
     def newton(self) -> Int[Array, ""]:
-        """Iterations of all position Newtons."""
+        """Newton iterations for positions in all steps."""
         return self.counters[2]
 
     @property
@@ -137,7 +133,7 @@ class Chart(eqx.Module):
 
 
 class PartitionTerm(AbstractManifoldTerm):
-    """A constrained system as a term that knows its charts."""
+    """A constrained system as a term with charts."""
 
     system: AbstractSystem
     formulation: AbstractFormulation
@@ -162,47 +158,47 @@ class PartitionTerm(AbstractManifoldTerm):
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
             if system.ideal_on_velocities:
-                out = evaluate(system, self.formulation, t, q, u, split.velocity)
+                out = ideal_acceleration(system, self.formulation, t, q, u, split.velocity)
             else:
-                out = evaluate_general(system, self.formulation, t, q, u, split)
+                out = general_acceleration(system, self.formulation, t, q, u, split)
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
-                split = Split(split.velocity, split.acceleration, None, factors.correction)
+                split = ChartIndices(split.velocity, split.acceleration, None, factors.right_inverse)
         chart = Chart(split, quality, chart.fresh, chart.counters)
         return ManifoldEvaluation(State(q, u), State(system.rates(t, q, u), udot), chart, chart.singular, factors)
 
-    def restore(self, t, y, near, args):
-        system, chart = self.system, near.chart
+    def project_near(self, t, y, linearized_at, args):
+        system, chart = self.system, linearized_at.chart
         if system.acceleration_rows == 0 or not system.ideal_on_velocities:
-            return self._settle(t, y, chart, chart.split)
-        before = lax.stop_gradient((near.y.u, near.f.u))
-        before = Evaluation(*before, near.factors)
-        out: Any = restore(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+            return self._project(t, y, chart, chart.split)
+        before = lax.stop_gradient((linearized_at.y.u, linearized_at.f.u))
+        before = ConstrainedAcceleration(*before, linearized_at.factors)
+        out: Any = restore_state(system, t, y.q, y.u, before, chart.split, self.newton_tol)
         f = State(system.rates(t, out.q, out.u), out.udot)
         chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
 
-    def settle(self, t, y, chart, args):
+    def project_cold(self, t, y, chart, args):
         if not (self.system.ideal_on_velocities and self.system.linear):
-            return super().settle(t, y, chart, args)
+            return super().project_cold(t, y, chart, args)
         split = chart.split
         if split.coordinate is None:
-            # The chart's matrix is of the state before the step.
+            # The chart's matrix is that of the state before the step.
             system, at, q = lax.stop_gradient((self.system, t, y.q))
-            split = eqx.tree_at(lambda s: s.correction, split, coordinate_factor(system, at, q, split).correction)
-        return self._settle(t, y, chart, split)
+            split = eqx.tree_at(lambda s: s.right_inverse, split, coordinate_factor(system, at, q, split).right_inverse)
+        return self._project(t, y, chart, split)
 
-    def _settle(self, t, y, chart, split):
-        """Positions restored with the matrix of a split, then evaluated there."""
+    def _project(self, t, y, chart, split):
+        """Restore positions with the matrix of a split, then evaluate there."""
         q, iterations, failed = restore_positions(self.system, t, y.q, split, self.newton_tol)
         out = self._evaluate(t, q, y.u, _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
 
     def controlled(self, chart):
-        # All components, the dependent ones as well: where these turn fast, the error of the independent ones alone
-        # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
-        # spatial slider-crank 3107 against 3867.)
+        # All components: where dependent ones change fast, the error of the independent ones alone shows it too late.
+        # (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a spatial
+        # slider-crank 3107 against 3867.)
         del chart
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
@@ -255,33 +251,35 @@ def _updated(system, t, y, chart, max_influence):
 
 def _of_coordinates(system, t, y):
     """The coordinates' Jacobian, where that of the velocities does not serve both."""
-    return None if shared(system) else system.coordinate_jacobian(t, y.q)
+    return None if shares_split(system) else system.coordinate_jacobian(t, y.q)
 
 
 def _choose(system, t, y, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled."""
-    jacobian, scale, stage = system.jacobian(t, y.q, y.u), system.velocity_scale(), stages(system)
+    jacobian, scale, levels = system.jacobian(t, y.q, y.u), system.velocity_scale(), row_levels(system)
     rows = system.velocity_rows
-    velocity = full_pivot(jacobian[:rows], scale=scale, stage=stage[:rows])
+    velocity = full_pivot(jacobian[:rows], scale=scale, level=levels[:rows])
     singular = velocity.rank != system.velocity_rank
-    solved = factor(jacobian[:rows], velocity.order, system.velocity_rank)
+    solved = eliminate(jacobian[:rows], velocity.order, system.velocity_rank)
     quality = _velocity_quality(system, solved, velocity.order)
     acceleration = None
     if system.acceleration_rows > rows:
-        every = full_pivot(jacobian, scale=scale, stage=stage)
+        every = full_pivot(jacobian, scale=scale, level=levels)
         acceleration, singular = every.order, singular | (every.rank != system.acceleration_rank)
-    if shared(system):
-        return Split(velocity.order, acceleration, None, solved.correction), quality, singular
+    if shares_split(system):
+        return ChartIndices(velocity.order, acceleration, None, solved.right_inverse), quality, singular
     pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-    split, own = _refreshed(system, of_coordinates, Split(velocity.order, acceleration, pivots.order, jnp.zeros(())))
+    split, own = _refreshed(
+        system, of_coordinates, ChartIndices(velocity.order, acceleration, pivots.order, jnp.zeros(()))
+    )
     return split, jnp.maximum(quality, own), singular | (pivots.rank != system.coordinate_rank)
 
 
 def _refreshed(system, jacobian, split):
     """The split with the position factor of this state, from its Jacobian, and the coordinates' quality."""
-    solved = factor(jacobian, split.coordinate, system.coordinate_rank)
+    solved = eliminate(jacobian, split.coordinate, system.coordinate_rank)
     own = _quality(system, solved, system.coordinate_scale(), split.coordinate, system.coordinate_rank)
-    return Split(split.velocity, split.acceleration, split.coordinate, solved.correction), own
+    return ChartIndices(split.velocity, split.acceleration, split.coordinate, solved.right_inverse), own
 
 
 def _velocity_quality(system, solved, order):
@@ -290,9 +288,9 @@ def _velocity_quality(system, solved, order):
 
 
 def _quality(system, solved, scale, order, rank):
-    """What a chart is judged by, in units of the coordinates' scales."""
-    influence = jnp.abs(solved.basis) * scale[order.columns[rank:]][None, :] / scale[:, None]
+    """The quality of a chart, in units of the coordinates' scales."""
+    influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
     largest = [jnp.max(influence, initial=1.0)]
     if system.velocity_rank < system.velocity_rows:
-        largest.append(jnp.max(jnp.abs(solved.correction) / scale[:, None], initial=0.0))
+        largest.append(jnp.max(jnp.abs(solved.right_inverse) / scale[:, None], initial=0.0))
     return jnp.stack(largest)

@@ -1,47 +1,56 @@
-"""Projection on the constraints after every step, so that any diffrax solver runs on constrained systems.
-
-Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
-"""
+"""Integration of all coordinates, with a projection on the constraints after every step."""
 
 from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from .._types import Scalar, State
-from ..formulations import BlockMultipliers
-from ..linalg.elimination import full_pivot, solve_positive
-from ..solvers import AbstractMultistep
-from ..system import AbstractSystem, DiagonalInertia
-from ..system.chain import is_long
-from ..system.corrector import corrector
-from .manifold import AbstractManifold, all_rows_formulation, normalize_state
-from .nearest import nearest
+from .._types import State
+from ..formulations import AbstractFormulation, Multipliers
+from ..formulations.formulation import check_mass
+from ..linalg.jacobian import MassProjector
+from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..system import AbstractSystem
+from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
+from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
-
-_ITERATIONS = 8
 
 
 class Projection(AbstractManifold):
-    """Integrate all coordinates with any diffrax Runge–Kutta solver, and project every step on the constraints.
+    """Integrate all coordinates and velocities with any diffrax Runge–Kutta solver or with `Adams`, and project every
+    step on the constraints.
 
-    The projection is the smallest change in the coordinates' scales, first of the configuration, then of the
-    velocities. A first-same-as-last derivative is kept across it: the difference is of the size of the local error.
+    With a Runge–Kutta solver the projection is the smallest change in the coordinates' scales, first of the
+    configuration, then of the velocities. A first-same-as-last derivative is kept across it: the difference is of the
+    size of the local error.
+
+    With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` serves
+    positions, velocities and accelerations. The elimination follows the structure of A: for a long chain of joints a
+    step takes time and memory in proportion to its length. No row may be redundant, and constraints must be ideal and
+    linear in velocities. `Hermite` needs independent coordinates, which a projection does not single out.
+
+    **Arguments:** `newton_tol`: with `Adams`, size of the last Newton correction of positions relative to the system's
+    size, default tied to the tolerance of integration; one more correction is made with the factor of the state it led
+    to.
     """
 
+    newton_tol: float | None = eqx.field(static=True, default=None)
+
     def prepare(self, system, formulation, solver, rtol):
-        if isinstance(solver, AbstractMultistep) and not solver.solves_implicitly:
+        check_mass(system, formulation)
+        if not isinstance(solver, AbstractMultistep):
+            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
+        if solver.solves_implicitly:
             raise ValueError(
-                "Projection is for one-step solvers; use manifold=Partition() with Adams, which loses no history."
+                f"Projection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() with it."
             )
-        return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
+        _check_multistep(system, formulation)
+        return ProjectionTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
 
     def default_formulation(self, system):
-        return BlockMultipliers() if is_long(system) else all_rows_formulation(system)
+        return all_rows_formulation(system)
 
     def correction(self, interpolated):
         return project_normalized if interpolated else None
@@ -51,6 +60,69 @@ class Projection(AbstractManifold):
 
     def diagnose(self, system, t, y, solver_state, result, failed):
         return result
+
+
+def _check_multistep(system, formulation):
+    """Refuse what one factor of `A M⁻¹ Aᵀ` does not serve."""
+    if not isinstance(formulation, Multipliers):
+        raise ValueError(
+            f"Projection with Adams finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
+            "the formulation out, or use Partition()."
+        )
+    if system.acceleration_rank < system.acceleration_rows:
+        raise ValueError(
+            f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and "
+            "Projection with Adams drops none; use Partition()."
+        )
+    if not (system.ideal_on_velocities and system.linear):
+        raise ValueError(
+            "Projection with Adams takes constraints that are ideal, bind positions or velocities, and are linear in "
+            "velocities; use Partition()."
+        )
+
+
+class ProjectionTerm(AbstractManifoldTerm):
+    """A constrained system whose states are projected in the metric of the mass matrix. Its chart is the number of
+    Newton iterations so far.
+    """
+
+    system: AbstractSystem
+    formulation: AbstractFormulation
+    newton_tol: Float[Array, ""]
+
+    def vf(self, t, y, args):
+        return VectorField(self.system, self.formulation)(t, y, args)
+
+    def init_chart(self, t, y, args):
+        return jnp.array(0)
+
+    def evaluate(self, t, y, chart, args):
+        system, y = self.system, State(self.system.normalize(y.q), y.u)
+        projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
+        return ManifoldEvaluation(y, self._field(t, y, projector), chart, jnp.array(False), projector)
+
+    def project_near(self, t, y, linearized_at, args):
+        metric_at = lambda y: self.system.inertia(t, y.q, y.u)
+        y, projector, iterations, failed = project_in_metric(
+            self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
+        )
+        return ManifoldEvaluation(y, self._field(t, y, projector), linearized_at.chart + iterations, failed, None)
+
+    def _field(self, t, y, projector: MassProjector):
+        """Rates and accelerations by the formulation's equations, with a factor that is known."""
+        system = self.system
+        free = projector.metric.solve(system.force(t, y.q, y.u))
+        udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
+        return State(system.rates(t, y.q, y.u), udot)
+
+    def controlled(self, chart):
+        return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
+
+    def free(self, chart):
+        return jnp.arange(self.system.nq + self.system.nu)
+
+    def update_chart(self, t, y, chart, args):
+        return chart
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
@@ -86,7 +158,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
 
-    # A program in the program, so that it is traced once.
+    # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         solver = self.solver
@@ -98,67 +170,3 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
-
-
-def project(system: AbstractSystem, t: Scalar, y: State) -> State:
-    """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order."""
-    if is_long(system):
-        return _project_chain(system, jnp.asarray(t, y.q.dtype), y)
-    q = y.q
-    if system.coordinate_rank > 0:
-        t = jnp.asarray(t, q.dtype)
-        square = system.coordinate_scale() ** 2
-        jacobian = system.coordinate_jacobian(t, q)
-        rows = _independent(jacobian, system.coordinate_scale(), system.coordinate_rank)
-        ahead = jacobian[rows] * square[None, :]
-        gram = ahead @ jacobian[rows].T
-        moved = lambda multipliers: q - ahead.T @ multipliers
-        residual = lambda multipliers: system.coordinate_residual(t, moved(multipliers))[rows]
-        q = moved(_root(residual, gram))
-    u = y.u
-    if system.velocity_rank > 0:
-        square = system.velocity_scale() ** 2
-        for _ in range(1 if system.linear else 3):
-            jacobian = system.velocity_jacobian(t, q, u)
-            rows = _independent(jacobian, system.velocity_scale(), system.velocity_rank)
-            ahead = jacobian[rows] * square[None, :]
-            u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
-    return State(q, u)
-
-
-def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
-    """`project` from coordinates that need not satisfy their own invariants, such as interpolated ones."""
-    return project(system, t, normalize_state(system, t, y))
-
-
-def _project_chain(system, t, y):
-    metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
-    tol = 64 * jnp.finfo(y.q.dtype).eps
-    return nearest(system, t, y, metric, corrector(system, t, y, metric), tol)[0]
-
-
-def _independent(jacobian: Array, scale: Array, rank: int) -> Any:
-    return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
-
-
-def _root(residual, gram: Array) -> Array:
-    """Chord Newton from zero multipliers; its derivative is that of the root."""
-
-    def solve(residual, start):
-        def correct(carry):
-            x, _, k = carry
-            step = solve_positive(gram, residual(x))  # the residual falls as the multipliers grow
-            return x + step, jnp.max(jnp.abs(step)), k + 1
-
-        def proceed(carry):
-            x, last, k = carry
-            return (last > 64 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=1e-8)) & (k < _ITERATIONS)
-
-        return lax.while_loop(proceed, correct, (start, jnp.array(jnp.inf, start.dtype), 0))[0]
-
-    def tangent_solve(linear, b):
-        return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)
-
-    start = jnp.zeros(gram.shape[0], gram.dtype)
-    gram = lax.stop_gradient(gram)
-    return lax.custom_root(residual, start, solve, tangent_solve)

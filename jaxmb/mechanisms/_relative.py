@@ -1,8 +1,8 @@
 """A train on a straight track in relative coordinates, after V. A. Lazaryan and others.
 
-Coordinates are the place of the leading vehicle and the extensions of the couplers, `q = (x₁, y₁, …, yₙ₋₁)`, velocities
-their rates: slack of a centimetre is not a difference of places ten kilometres along the track. With the forces F_j on
-the vehicles and the tensions S_j of the couplers
+Coordinates are the position of the leading vehicle and the extensions of the couplers, `q = (x₁, y₁, …, yₙ₋₁)`, and
+velocities are their rates: a slack of a centimetre is not the difference of positions ten kilometres along the track.
+With the forces F_j on the vehicles and the tensions S_j of the couplers
 
     ÿ_j = −S_j (1/m_j + 1/m_{j+1}) + S_{j−1}/m_j + S_{j+1}/m_{j+1} + F_j/m_j − F_{j+1}/m_{j+1}
 
@@ -38,7 +38,7 @@ class RelativeInertia(AbstractInertia):
         return jnp.concatenate([absolute[:1], absolute[:-1] - absolute[1:]])
 
     def root(self):
-        # A full matrix, for formulations in frames only; no solution of the equations of motion needs it.
+        # A full matrix, needed by formulations in frames only.
         return DenseInertia(self.product(jnp.eye(self.mass.size, dtype=self.mass.dtype))).root()
 
     def transpose(self):
@@ -122,7 +122,7 @@ class RelativeTrain(AbstractGeneralizedSystem):
                     paths[f"{part}{k + 1 if value.ndim else ''}.{name}"] = [(_number(part, name), index)]
         for k in range(self.nq - 1):
             for name in self.couplers.__dataclass_fields__:
-                if eqx.is_inexact_array(getattr(self.couplers, name)) and name not in _PLACES:
+                if eqx.is_inexact_array(getattr(self.couplers, name)) and name not in _ATTACHMENT:
                     paths[f"coupler{k + 1}.{name}"] = [(_gear(name), k)]
         return paths
 
@@ -148,7 +148,7 @@ class RelativeTrain(AbstractGeneralizedSystem):
         return 0.5 * jnp.sum(self.mass * velocities(u) ** 2)
 
     def potential_energy(self, t, q):
-        # Places along the track but for a constant: those of couplers without extension.
+        # Positions along the track up to a constant, that of couplers without extension.
         return jnp.sum(self.couplers.stored(q[1:])) + self.slope * jnp.sum(self.mass * velocities(q))
 
     def normalize(self, q):
@@ -187,8 +187,8 @@ class RelativeTrain(AbstractGeneralizedSystem):
         return jnp.zeros(0, q.dtype)
 
 
-# Where a coupler is attached, which does not matter on a straight track.
-_PLACES = ("point_a", "point_b", "free_length")
+# Attachment of a coupler, which has no effect on a straight track.
+_ATTACHMENT = ("point_a", "point_b", "free_length")
 
 
 def _number(part, name):

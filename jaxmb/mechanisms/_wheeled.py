@@ -7,6 +7,7 @@ Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre 
 front axle ahead of the pin.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,30 +18,43 @@ from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffi
 from ..parts.fields import as_jax
 from ..scene import Scene
 from ..system import parameters as parameters_of
-from ..trajectory import Trajectory
-from .mechanism import Observation, point_motion
+from .mechanism import Mechanism, Model, References, build, is_rigid
+from .observe import columns, lagrangian_coordinates, point_motion
 
 COORDINATES = ("x", "y", "theta", "phi")
 FORMS = ("frame", "constraints", "connection")
 
 
-def wheeled(
+def build_wheeled(
+    name: str,
+    description: str,
+    parameters: dict[str, Any],
+    start: tuple[float, float, float],
+    *,
     form: str,
     equations: AbstractEquations | None,
-    parameters: dict[str, Any],
-    *,
-    angle: float,
-    speed: float,
-    rate: float,
-) -> LagrangianSystem:
-    """The system in one of its forms, from speed and turning rate at the start.
+    model: Model,
+    as_bodies: Callable[[dict[str, Any]], dict[str, Any]] = lambda parameters: parameters,
+) -> Mechanism:
+    """Such a mechanism, in one of its models.
 
-    **Raises:** `ValueError` for an unknown form.
+    **Arguments:** `start`: the angle φ [rad], speed [m/s] and turning rate [rad/s]; `form`, `equations` and `model` as
+    in `roller_racer`; `as_bodies`: the parameters of its rigid bodies, from those of its Lagrangian.
+
+    **Raises:** `ValueError` for an unknown form or model.
     """
     if form not in FORMS:
         raise ValueError(f"The forms are {', '.join(FORMS)}; got {form!r}.")
-    parameters, q, u, v = _start(parameters, angle, speed, rate)
-    kinematics, start, constraints = {
+    if is_rigid(model, form=form == "frame", equations=equations is None):
+        system, observe = _bodies(as_bodies(parameters), start), _observe_bodies
+    else:
+        system, observe = _lagrangian(parameters, start, form, equations), lagrangian_coordinates
+    return build(name, system, t1=5.0, observe=observe, description=description, references=References.load(name))
+
+
+def _lagrangian(parameters, start, form, equations) -> LagrangianSystem:
+    parameters, q, u, v = _start(parameters, *start)
+    kinematics, velocities, constraints = {
         "frame": (QuasiVelocityFrame(frame, 2), u, ()),
         "constraints": (Rates(), v, (Pfaffian("wheels", wheels),)),
         "connection": (Connection((2, 3), (0, 1), connection), v[2:], ()),
@@ -51,15 +65,14 @@ def wheeled(
         kinematics=kinematics,
         equations=equations,
         q=q,
-        u=start,
+        u=velocities,
         parameters=parameters,
         coordinates=COORDINATES,
     )
 
 
-def wheeled_bodies(parameters: dict[str, Any], *, angle: float, speed: float, rate: float) -> Scene:
-    """The same platforms as rigid bodies `rear` and `front`, from speed and turning rate at the start."""
-    parameters, q, _, v = _start(parameters, angle, speed, rate)
+def _bodies(parameters, start) -> Scene:
+    parameters, q, _, v = _start(parameters, *start)
     places, rates = jax.jvp(lambda q: _places(q, parameters), (q,), (v,))
     names, masses = ("rear", "front"), (parameters["mass"], parameters["front_mass"])
     inertias, ahead = zip(*((parameters[k + "inertia"], parameters[k + "ahead"]) for k in ("", "front_")), strict=True)
@@ -86,13 +99,10 @@ def wheeled_bodies(parameters: dict[str, Any], *, angle: float, speed: float, ra
     return Scene(bodies, joints=[pin, *wheels])
 
 
-def observe_bodies(trajectory: Trajectory) -> Observation:
-    """The coordinates of the platforms as rigid bodies, and as velocities speed and turning rate."""
+def _observe_bodies(trajectory):
     rear, front = trajectory["rear"], trajectory["front"]
     axle, velocity = point_motion(trajectory, "rear", parameters_of(trajectory.system)["rear_wheels.point"])
-    return {
-        "x": axle[:, 0],
-        "y": axle[:, 1],
+    return columns("xy", axle) | {
         "theta": rear.angle,
         "phi": front.angle - rear.angle,
         "u0": velocity[:, 0] * jnp.cos(rear.angle) + velocity[:, 1] * jnp.sin(rear.angle),

@@ -79,7 +79,7 @@ def andrews(
     **Labels:** the test set's angles [rad] `beta`, `Theta`, `gamma`, `Phi`, `delta`, `Omega`, `epsilon` and their rates
     [rad/s] `d_beta`, …; `F_x`, `F_y` [m], the crank's pin.
     """
-    if problem not in _REFERENCES:
+    if problem not in ("ivp", "iftomm"):
         raise ValueError(f"andrews: problem must be 'ivp' or 'iftomm', got {problem!r}.")
     start = (_ANGLES[0] if problem == "ivp" else -0.0620) if angle is None else angle
     origins, angles = _poses()
@@ -116,7 +116,7 @@ def andrews(
         t1=0.03 if problem == "ivp" else 0.05,
         observe=_observe,
         description="Andrews' squeezing mechanism: seven planar bodies in three loops, a torque against a spring.",
-        references=_REFERENCES[problem] if angle is None else None,
+        references=References.load(f"andrews_{problem}") if angle is None else None,
         fix={"K1.angle": start},
         rates={"K1.angle": 0.0},
     )
@@ -162,99 +162,3 @@ def _observe(trajectory):
         observed[f"d_{label}"] = K[body].angular_velocity - (0.0 if base is None else K[base].angular_velocity)
     observed["F_x"], observed["F_y"] = _F * jnp.cos(K["K1"].angle), _F * jnp.sin(K["K1"].angle)
     return observed
-
-
-_SOURCE = "recomputed in relative angles and in maximal coordinates, extrapolation method in extended precision"
-_REFERENCES = {
-    "ivp": References(
-        times=np.array([0.015, 0.03]),
-        labels=(
-            "beta",
-            "Theta",
-            "gamma",
-            "Phi",
-            "delta",
-            "Omega",
-            "epsilon",
-            "d_beta",
-            "d_Theta",
-            "d_gamma",
-            "d_Phi",
-            "d_delta",
-            "d_Omega",
-            "d_epsilon",
-        ),
-        values=np.array(
-            [
-                [
-                    5.655429749991793,
-                    -5.833796765108831,
-                    0.4258919257523778,
-                    0.16401283757260487,
-                    0.4936765269686444,
-                    -0.16401283757260487,
-                    1.2087125419091949,
-                    441.70199325525226,
-                    -375.35949712887447,
-                    46.634212264885555,
-                    92.03152208827711,
-                    -9.501516255917524,
-                    -92.0315220882771,
-                    33.69062862357237,
-                ],
-                [
-                    15.810771195153695,
-                    -15.756371058411824,
-                    0.04082224011964597,
-                    -0.534730116342079,
-                    0.524409965879954,
-                    0.5347301163420791,
-                    1.0480807410419382,
-                    1139.9203022591062,
-                    -1424.3792951775404,
-                    11.032911910614947,
-                    19.293374105025702,
-                    0.5735699148293117,
-                    -19.2933741050257,
-                    0.3231791492490629,
-                ],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-12,
-    ),
-    "iftomm": References(
-        times=np.array([0.03, 0.05]),
-        labels=("F_x", "F_y", "beta", "Theta", "gamma", "Phi", "delta", "Omega", "epsilon", "d_beta"),
-        values=np.array(
-            [
-                [
-                    -0.006970260781768041,
-                    -0.0006445654614904415,
-                    15.800174670662718,
-                    -15.743129380967044,
-                    0.04073369712538144,
-                    -0.5348849528458116,
-                    0.5244053593807245,
-                    0.5348849528458114,
-                    1.0480781581340424,
-                    1140.103975550473,
-                ],
-                [
-                    -0.005158985250188684,
-                    0.004731265284079472,
-                    33.81534072136018,
-                    -33.57115537821938,
-                    0.11515852759155025,
-                    -0.4047649413081342,
-                    0.5260512563221522,
-                    0.40476494130813334,
-                    1.0572717559075697,
-                    1140.9427334471095,
-                ],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-12,
-    ),
-}

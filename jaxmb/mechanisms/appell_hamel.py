@@ -9,7 +9,8 @@ from ..parts.fields import as_jax
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates, point_coordinates
 
 
 @mechanism(variants=("model",))
@@ -36,7 +37,7 @@ def appell_hamel(
     **Labels:** `x`, `y`, `z` [m]; `u0`, `u1`, `u2` [m/s].
     """
     along = as_jax(speed) * jnp.stack([jnp.cos(as_jax(heading)), jnp.sin(as_jax(heading)), as_jax(slope)])
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     if rigid:
         cone = lambda poses, velocities, t, p: _excess(velocities[0], p["slope"])
         system = Scene(
@@ -58,7 +59,7 @@ def appell_hamel(
         "appell_hamel",
         system,
         t1=0.5,
-        observe=_observe_particle if rigid else observe_coordinates,
+        observe=(lambda trajectory: point_coordinates(trajectory, "xyz")) if rigid else lagrangian_coordinates,
         description="Particle with its climb held in proportion to its speed (Appell, Hamel).",
         references=_references(),
     )
@@ -66,12 +67,6 @@ def appell_hamel(
 
 def _excess(v, slope):
     return v[2] - slope * jnp.sqrt(jnp.dot(v[:2], v[:2]))
-
-
-def _observe_particle(trajectory):
-    particle = trajectory["particle"]
-    place = {name: particle.position[:, k] for k, name in enumerate("xyz")}
-    return place | {f"u{k}": particle.velocity[:, k] for k in range(3)}
 
 
 def _references():

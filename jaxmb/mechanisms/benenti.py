@@ -8,7 +8,10 @@ from ..lagrangian import LagrangianSystem, Nonholonomic
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates, point_coordinates
+
+_COORDINATES = ("x1", "y1", "x2", "y2")
 
 
 @mechanism(variants=("model",))
@@ -27,12 +30,12 @@ def benenti(
     Source: S. Benenti, Geometrical aspects of the dynamics of non-holonomic systems, Rend. Sem. Mat. Univ. Pol. Torino
     54, 1996; data of this package. Reference values from DOP853 on the equations with a multiplier.
 
-    **Arguments:** `masses` [kg]; `stiffness` of the spring [N/m], without length; `gravity` [m/s²];
+    **Arguments:** `masses` [kg]; `stiffness` of the spring [N/m], of zero free length; `gravity` [m/s²];
     `model`: from its Lagrangian, or as two point masses `one` and `two`.
 
     **Labels:** `x1`, `y1`, `x2`, `y2` [m], `u0` … `u3` [m/s].
     """
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     q, u = np.array([0.0, 0.0, 1.0, 0.0]), np.array([1.0, 2.0, 0.5, 1.0])
     if rigid:
         system = _particles(masses, stiffness, gravity, q, u)
@@ -44,15 +47,15 @@ def benenti(
             q=q,
             u=u,
             parameters={"masses": masses, "stiffness": stiffness, "gravity": gravity},
-            coordinates=("x1", "y1", "x2", "y2"),
+            coordinates=_COORDINATES,
         )
     return build(
         "benenti",
         system,
         t1=2.0,
-        observe=_observe_particles if rigid else observe_coordinates,
+        observe=(lambda trajectory: point_coordinates(trajectory, _COORDINATES)) if rigid else lagrangian_coordinates,
         description="Two particles with parallel velocities; a constraint quadratic in them (Benenti).",
-        references=_REFERENCES,
+        references=References.load("benenti"),
     )
 
 
@@ -74,19 +77,3 @@ def _particles(masses, stiffness, gravity, q, u) -> Scene:
 def _parallel(poses, velocities, t, p):
     a, b = velocities
     return a[0] * b[1] - b[0] * a[1]
-
-
-def _observe_particles(trajectory):
-    one, two = trajectory["one"], trajectory["two"]
-    places, rates = jnp.hstack([one.position, two.position]), jnp.hstack([one.velocity, two.velocity])
-    observed = {name: places[:, k] for k, name in enumerate(("x1", "y1", "x2", "y2"))}
-    return observed | {f"u{k}": rates[:, k] for k in range(4)}
-
-
-_REFERENCES = References(
-    times=np.array([2.0]),
-    labels=("x1", "y1", "x2", "y2"),
-    values=np.array([[2.990189703, -13.041993719, 3.041463848, -13.747922217]]),
-    source="DOP853 at 1e-12 on the equations with a multiplier",
-    tolerance=1e-9,
-)

@@ -1,6 +1,5 @@
 """Bennett's linkage."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,6 +8,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 
 @mechanism()
@@ -22,7 +22,7 @@ def bennett(
     speed: float = 8.0,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """Four hinges on skew axes, a loop with one degree of freedom although counting rows leaves minus two; y up.
+    """Four hinges on skew axes, a loop with one degree of freedom although the count of rows leaves −2; y up.
 
     Links of length a and twist α alternate with links of length b and twist β, `b sin α = a sin β`; the ground is one
     of the latter, with the input axis z in the origin and the output axis at (−b, 0, 0). Input θ and output φ, measured
@@ -73,7 +73,7 @@ def bennett(
         t1=2.0,
         observe=lambda trajectory: _observe(trajectory, beta),
         description="Bennett's linkage, four hinges on skew axes, over-constrained; under gravity.",
-        references=_REFERENCES,
+        references=References.load("bennett"),
         rates={"link1.wz": speed},
     )
 
@@ -83,8 +83,7 @@ def _turned(axis, angle):
 
 
 def _observe(trajectory, beta):
-    along = jax.vmap(lambda p: rotations.rotate(p, jnp.array([1.0, 0.0, 0.0])))
-    first, last = (along(trajectory[link].orientation) for link in ("link1", "link3"))
+    first, last = (body_axis(trajectory, link, (1.0, 0.0, 0.0)) for link in ("link1", "link3"))
     return {
         "cos": first[:, 0],
         "sin": first[:, 1],
@@ -92,18 +91,3 @@ def _observe(trajectory, beta):
         "sin_out": last @ jnp.array([0.0, np.cos(beta), -np.sin(beta)]),
         "omega": trajectory["link1"].angular_velocity[:, 2],
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.5, 1.0, 2.0]),
-    labels=("cos", "sin", "cos_out", "sin_out", "omega"),
-    values=np.array(
-        [
-            [-0.7539231749735649, -0.6569625912011882, 0.03503959758411869, -0.9993859247563691, 6.803810034294923],
-            [-0.5806289338730152, 0.814168312543227, -0.2761582624477915, 0.9611121755975295, 5.863189984481541],
-            [-0.9995429027798889, 0.030232193144951843, 0.9969665208359424, 0.07783158955255262, 4.61089964420653],
-        ]
-    ),
-    source="one coordinate and its energy, derivatives by complex steps, DOP853 at 3e-14",
-    tolerance=1e-12,
-)

@@ -5,7 +5,8 @@ import numpy as np
 from .. import spatial
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 _AXES = ("y", "z", "x", "y", "z", "x")
 
@@ -13,7 +14,7 @@ _AXES = ("y", "z", "x", "y", "z", "x")
 @mechanism()
 def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gravity: float = 9.81) -> Mechanism:
     """Six hinges P0 … P5 and five equal bars along the edges of a cube, a closed loop with one degree of freedom
-    although counting rows leaves none; y up, released from rest.
+    although the count of rows leaves none; y up, released from rest.
 
     Source: problem A04 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics. The reference
     values were computed in two joint angles with the loop closed in closed form, in extended precision, and with all
@@ -42,55 +43,10 @@ def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gra
         t1=10.0,
         observe=lambda trajectory: _observe(trajectory, length),
         description="Rectangular Bricard linkage, an over-constrained spatial loop (IFToMM benchmark A04).",
-        references=_REFERENCES,
+        references=References.load("bricard"),
     )
 
 
 def _observe(trajectory, length):
     point, speed = point_motion(trajectory, "bar2", (0.0, -0.5 * length, 0.0))
-    observed = {axis: point[:, k] for k, axis in enumerate("xyz")}
-    return observed | {f"v{axis}": speed[:, k] for k, axis in enumerate("xyz")}
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 4.0, 7.0, 10.0]),
-    labels=("x", "y", "z", "vx", "vy", "vz"),
-    values=np.array(
-        [
-            [
-                0.27448131926462305,
-                -0.886707938734672,
-                -0.46233000268737606,
-                -1.0949194524135097,
-                0.15669907937027241,
-                -0.3005349357869588,
-            ],
-            [
-                0.28355107908174304,
-                -0.8880228141230467,
-                -0.45979939277578963,
-                1.093591073000519,
-                -0.16055747545216228,
-                0.3100889288234583,
-            ],
-            [
-                -0.7849130566000311,
-                -0.9814035822608986,
-                -0.19195574678939853,
-                -0.8130542198645903,
-                -0.12482297847146681,
-                0.6381768728954689,
-            ],
-            [
-                0.9997309873038353,
-                -0.9999999638258172,
-                -0.00026897651225016333,
-                -0.03245328022230178,
-                8.726822183341294e-06,
-                -0.03244454987788986,
-            ],
-        ]
-    ),
-    source="two joint angles with the loop closed in closed form, extrapolation method in extended precision",
-    tolerance=1e-10,
-)
+    return columns("xyz", point) | columns(("vx", "vy", "vz"), speed)

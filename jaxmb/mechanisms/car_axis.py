@@ -1,7 +1,6 @@
 """The car axis of the test set for initial value problem solvers."""
 
 import jax.numpy as jnp
-import numpy as np
 
 from .. import planar
 from ..linalg.rotations import norm
@@ -9,6 +8,7 @@ from ..parts.forces import Gravity
 from ..parts.functions import Constraint, Force
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -59,7 +59,7 @@ def car_axis(
         t1=3.0,
         observe=lambda trajectory: _observe(trajectory, length),
         description="Car axis: a chassis on springs over a bumpy road, two point masses and a constraint in time.",
-        references=_REFERENCES,
+        references=References.load("car_axis"),
         fix={"left.y": free_length, "right.y": free_length},
         rates={"left.y": 0.0, "right.y": 0.0},
     )
@@ -87,58 +87,9 @@ def _observe(trajectory, length):
     observed = {}
     for body, letter in (("left", "l"), ("right", "r")):
         motion = trajectory[body]
-        for k, axis in enumerate("xy"):
-            observed[f"{axis}{letter}"] = motion.position[:, k]
-            observed[f"{axis}{letter}1"] = motion.velocity[:, k]
+        observed |= columns((f"x{letter}", f"y{letter}"), motion.position)
+        observed |= columns((f"x{letter}1", f"y{letter}1"), motion.velocity)
     observed["lam1"] = trajectory.reactions["upright"].multipliers[:, 0]
     # The row of a rod is its constraint over twice the length, so that its multiplier is a force.
     observed["lam2"] = trajectory.reactions["axle"].multipliers[:, 0] / (2 * length)
     return observed
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 2.0, 3.0]),
-    labels=("xl", "yl", "xr", "yr", "xl1", "yl1", "xr1", "yr1", "lam1", "lam2"),
-    values=np.array(
-        [
-            [
-                0.027182095440113508,
-                0.49891155262926495,
-                1.024548795970379,
-                0.4263880069811677,
-                0.4191644147547946,
-                -0.024290049857216035,
-                0.2971726857631104,
-                -1.7019588283087648,
-                -0.003837120982712089,
-                -0.0012287984619505435,
-            ],
-            [
-                -0.04560448364285938,
-                0.4974453432189711,
-                0.9517407605927876,
-                0.5702633615972378,
-                -0.20321875849937474,
-                -0.02557182444824567,
-                -0.2259317161449866,
-                0.2855140962465923,
-                0.004968892596506638,
-                0.0013174621545079855,
-            ],
-            [
-                0.049345578427524205,
-                0.49698946023000806,
-                1.0417425248854264,
-                0.3739110272653658,
-                -0.07705836840359225,
-                0.007446866592066662,
-                0.01755681575354185,
-                0.7703410437796016,
-                -0.004736886590853341,
-                -0.001104680331259573,
-            ],
-        ]
-    ),
-    source="recomputed with multipliers and in two minimal coordinates, extrapolation method in extended precision",
-    tolerance=1e-13,
-)

@@ -1,11 +1,11 @@
 """Chaplygin's sleigh."""
 
 import jax.numpy as jnp
-import numpy as np
 
 from .. import planar
 from ..scene import Scene
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns, point_motion
 
 
 @mechanism()
@@ -33,7 +33,7 @@ def chaplygin_sleigh(
         t1=4.0,
         observe=lambda trajectory: _observe(trajectory, distance),
         description="Chaplygin's sleigh: a rigid body on one blade, which straightens out.",
-        references=_REFERENCES,
+        references=References.load("chaplygin_sleigh"),
         rates={"sleigh.x": speed, "sleigh.angle": spin},
     )
 
@@ -42,25 +42,8 @@ def _observe(trajectory, distance):
     sleigh = trajectory["sleigh"]
     blade, _ = point_motion(trajectory, "sleigh", (-distance, 0.0))
     c, s = jnp.cos(sleigh.angle), jnp.sin(sleigh.angle)
-    return {
-        "x_blade": blade[:, 0],
-        "y_blade": blade[:, 1],
+    return columns(("x_blade", "y_blade"), blade) | {
         "theta": sleigh.angle,
         "v": c * sleigh.velocity[:, 0] + s * sleigh.velocity[:, 1],
         "omega": sleigh.angular_velocity,
     }
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 2.0, 4.0]),
-    labels=("x_blade", "y_blade", "theta", "v", "omega"),
-    values=np.array(
-        [
-            [0.9093525070921825, 0.8720776074197882, 1.2166719092853335, 1.4936479581580446, 0.6160017596668536],
-            [1.130389915267493, 2.3702508629920396, 1.5565902538314427, 1.5333616448320357, 0.16089881875405923],
-            [0.9350308158619882, 5.434025117781834, 1.66746769015489, 1.536216468103753, 0.010705019003067275],
-        ]
-    ),
-    source="closed form",
-    tolerance=1e-14,
-)

@@ -10,7 +10,8 @@ from ..lagrangian import LagrangianSystem, Nonholonomic, QuasiVelocities, Rates
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates, point_coordinates
 
 
 @mechanism(variants=("model",))
@@ -23,7 +24,7 @@ def constant_speed_particle(
     form: Literal["constraint", "quasi"] = "constraint",
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """A particle in the vertical plane that gravity turns, while a constraint nonlinear in velocity holds its speed.
+    """A particle in the vertical plane whose speed is held by a constraint nonlinear in velocity; gravity turns it.
 
     Coordinates: x, y [m], y up, the start in the origin. Its heading φ obeys c φ̇ = −g cos φ. The constraint is not
     homogeneous in velocity, so energy is not conserved.
@@ -32,7 +33,8 @@ def constant_speed_particle(
     values in closed form, with Gudermann's function: φ = gd(C − g t / c).
 
     **Arguments:** `speed` c [m/s]; `steepness` C, with φ = gd(C) at the start; `gravity` [m/s²]; `mass` [kg]; `form`:
-    the velocities are rates with the constraint, or the heading, of nonlinear quasi-velocities |q̇| − c and φ;
+    `"constraint"`, with the coordinates' rates as velocities, or `"quasi"`, with the heading φ as the only one, from
+    the nonlinear quasi-velocities |q̇| − c and φ;
     `model`: from its Lagrangian, or as a point mass `particle`.
 
     **Labels:** `x`, `y` [m], and the velocities `u0`, …: [m/s], or the heading [rad].
@@ -41,22 +43,22 @@ def constant_speed_particle(
         raise ValueError(f"The forms are constraint, quasi; got {form!r}.")
     heading = 2.0 * jnp.arctan(jnp.tanh(jnp.asarray(steepness, jnp.result_type(float)) / 2))
     ahead = speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-    rigid = of_bodies(model, form=form == "constraint")
+    rigid = is_rigid(model, form=form == "constraint")
     if rigid:
         system = _particle(mass, speed, gravity, ahead)
     else:
-        system = _on_paper(form, {"speed": speed, "gravity": gravity, "mass": mass}, ahead, heading)
+        system = _lagrangian(form, {"speed": speed, "gravity": gravity, "mass": mass}, ahead, heading)
     return build(
         "constant_speed_particle",
         system,
         t1=1.0,
-        observe=_observe_particle if rigid else observe_coordinates,
+        observe=(lambda trajectory: point_coordinates(trajectory, "xy")) if rigid else lagrangian_coordinates,
         description="Particle with its speed held, turned by gravity; a constraint nonlinear in velocity.",
         references=_references(),
     )
 
 
-def _on_paper(form, parameters, ahead, heading) -> LagrangianSystem:
+def _lagrangian(form, parameters, ahead, heading) -> LagrangianSystem:
     held = lambda t, q, v, p: _length(v) - p["speed"]
     quasi = QuasiVelocities(
         lambda t, q, v, p: jnp.stack([_length(v) - p["speed"], jnp.arctan2(v[1], v[0])]),
@@ -82,11 +84,6 @@ def _particle(mass, speed, gravity, velocity) -> Scene:
         joints=[VelocityConstraint("held", "particle", held, parameters={"speed": speed})],
         forces=[Gravity((0.0, -gravity))],
     )
-
-
-def _observe_particle(trajectory):
-    (x, y), (u0, u1) = trajectory["particle"].position.T, trajectory["particle"].velocity.T
-    return {"x": x, "y": y, "u0": u0, "u1": u1}
 
 
 def _length(v):

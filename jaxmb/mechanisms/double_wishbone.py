@@ -4,19 +4,18 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .. import spatial
 from .._types import VectorLike
-from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.names import unknown
 from ..scene import Scene
 from ..states.assembly import assemble
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 _POINTS = {
     "lower_front": (0.14, 0.36, 0.24),
@@ -48,16 +47,16 @@ def double_wishbone(
     bushing: tuple[float, float] | None = None,
     bushing_damping: tuple[float, float] | None = None,
 ) -> Mechanism:
-    """A left wheel on a lower and an upper arm, a tie rod and a spring, jounces on its tyre beside a car that stands
-    still; x forward, y to the left, z up.
+    """The left wheel of a car at rest, on a lower and an upper arm, a tie rod and a spring, jounces on its tyre; x
+    forward, y to the left, z up.
 
-    Ball joints hold the upright with its wheel to both arms; hinges, or bushings at their ends, the arms to the car;
-    the tie rod, without mass, ends at a rack that does not move. With hinges there is one degree of freedom, with
-    bushings eleven. Spring, tyre and bushings are free of force at the start.
+    Ball joints connect the upright and its wheel with both arms; hinges, or bushings at their ends, connect the arms
+    with the car; the massless tie rod ends at a fixed rack. With hinges there is one degree of freedom, with bushings
+    there are eleven. Spring, tyre and bushings are free of force at the start.
 
     Source: data of this package. The reference values, for hinges, come from a model in the lower arm's angle.
 
-    **Arguments:** `points`: places [m] other than those of this package, by name: `lower_front`, `lower_rear`,
+    **Arguments:** `points`: positions [m] by name that replace the default ones: `lower_front`, `lower_rear`,
     `lower_ball`, `upper_front`, `upper_rear`, `upper_ball`, `rack`, `steering_arm`, `wheel`, `spring_top`,
     `spring_bottom`, the latter on the lower arm; `masses` [kg] of lower arm, upper arm, and upright with wheel;
     `stiffness` [N/m] and `damping` [N s/m] of the spring; `tyre` [N/m], vertical stiffness; `speed` [m/s] of the
@@ -112,7 +111,7 @@ def double_wishbone(
         t1=0.2,
         observe=lambda trajectory: _observe(trajectory, P["wheel"]),
         description="Double wishbone suspension of a wheel, on hinges or bushings, jouncing on its tyre.",
-        references=_REFERENCES,
+        references=References.load("double_wishbone"),
         rates=rates,
     )
 
@@ -143,7 +142,7 @@ def _pushed(poses, t, p):
 
 def _observe(trajectory, wheel):
     upright = trajectory["upright"]
-    axle = jax.vmap(lambda p: rotations.rotate(p, jnp.array([0.0, 1.0, 0.0])))(upright.orientation)
+    axle = body_axis(trajectory, "upright", (0.0, 1.0, 0.0))
     return {
         "z": upright.position[:, 2] - wheel[2],
         "y": upright.position[:, 1] - wheel[1],
@@ -151,36 +150,3 @@ def _observe(trajectory, wheel):
         "toe": jnp.arctan2(axle[:, 0], axle[:, 1]),
         "rate": upright.velocity[:, 2],
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.05, 0.1, 0.2]),
-    labels=("z", "y", "camber", "toe", "rate"),
-    values=np.array(
-        [
-            [
-                -0.0156743621862509,
-                -0.000756361288963503,
-                0.008414792126765321,
-                -0.0006506380697574503,
-                -0.6257523459093997,
-            ],
-            [
-                0.009161874569484252,
-                0.00011505724436311482,
-                -0.005243381307130886,
-                0.0003315850639836451,
-                -0.4303042464390093,
-            ],
-            [
-                -0.004944478817251574,
-                -0.00016215570172029015,
-                0.002729226927633397,
-                -0.00019287646387629816,
-                -0.3072339288850443,
-            ],
-        ]
-    ),
-    source="one coordinate with the loop closed in closed form, derivatives by complex steps, DOP853 at 3e-14",
-    tolerance=1e-11,
-)

@@ -1,6 +1,5 @@
 """The stiff flyball governor."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,6 +8,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 # Lengths [m] and density [kg/m³] of the source.
 _HEIGHT, _ARM, _SECTION, _CUBE, _OFFSET = 1.0, 1.0, 0.01, 0.1, 0.05
@@ -108,15 +108,14 @@ def flyball(
         t1=10.0,
         observe=_observe,
         description="Flyball governor with stiff springs and dampers, turning freely under gravity (IFToMM A05).",
-        references=_REFERENCES,
+        references=References.load("flyball"),
         rates={"shaft.wz": speed, "arm1.wy": 0.0, "arm2.wy": 0.0, "slider.z": 0.0},
     )
 
 
 def _observe(trajectory):
     shaft, arm, slider = trajectory["shaft"], trajectory["arm1"], trajectory["slider"]
-    turned = lambda motion: jax.vmap(lambda p: rotations.rotate(p, jnp.array([1.0, 0.0, 0.0])))(motion.orientation)
-    x, along = turned(shaft), turned(arm)
+    x, along = (body_axis(trajectory, name, (1.0, 0.0, 0.0)) for name in ("shaft", "arm1"))
     return {
         "cos": x[:, 0],
         "sin": x[:, 1],
@@ -126,69 +125,3 @@ def _observe(trajectory):
         "alpha_dot": arm.angular_velocity[:, 1],
         "s_dot": slider.velocity[:, 2],
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.1, 0.5, 1.0, 2.0, 5.0, 10.0]),
-    labels=("cos", "sin", "alpha", "s", "omega", "alpha_dot", "s_dot"),
-    values=np.array(
-        [
-            [
-                0.8126525955619577,
-                0.5827484525302604,
-                0.4961738690759003,
-                0.5238364755695757,
-                6.103717808830862,
-                -0.5226739297539802,
-                0.45927181043613385,
-            ],
-            [
-                -0.9447670695567691,
-                0.3277425579339901,
-                0.25949138154341317,
-                0.7432494247863257,
-                5.103415421971535,
-                -0.05390521849874657,
-                0.05211978015835878,
-            ],
-            [
-                0.7668751576290616,
-                -0.6417963014940192,
-                0.5218333016255462,
-                0.5014209223795677,
-                6.2711257418765545,
-                0.14088557947952698,
-                -0.12215149289772809,
-            ],
-            [
-                0.1767591630537056,
-                -0.9842541329740777,
-                0.5166637973645988,
-                0.5059092942967037,
-                6.236223614435971,
-                0.276926188572192,
-                -0.24078314698362965,
-            ],
-            [
-                -0.9454569177314796,
-                0.3257471668544338,
-                0.4828745765869399,
-                0.5355631037216434,
-                6.02249649975846,
-                0.6139170473888891,
-                -0.5436826902778727,
-            ],
-            [
-                0.8177773520197625,
-                -0.5755347100944872,
-                0.39007370184464524,
-                0.6196229170613655,
-                5.548203622654928,
-                0.8084670513455775,
-                -0.7476033541643319,
-            ],
-        ]
-    ),
-    source="three minimal coordinates, implicit and extrapolation methods in extended precision; problem: IFToMM A05",
-    tolerance=1e-13,
-)

@@ -6,6 +6,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import bar_angles
 
 
 @mechanism()
@@ -32,7 +33,7 @@ def four_bar(
     crank, coupler, rocker = lengths
     A, D = np.zeros(2), np.array([base, 0.0])
     B = A + crank * np.array([np.cos(angle), np.sin(angle)])
-    C = _above(B, D, coupler, rocker)
+    C = circles_meet(B, D, coupler, rocker)
     bar = lambda name, m, l, start, end: planar.Body(
         name,
         mass=m,
@@ -53,15 +54,15 @@ def four_bar(
         "four_bar",
         Scene(bodies, joints=joints, forces=[Gravity((0.0, -gravity))]),
         t1=10.0,
-        observe=_observe,
+        observe=lambda trajectory: bar_angles(trajectory, "crank", "coupler", "rocker"),
         description="Planar four-bar linkage of uniform bars under gravity, crank started at 4 rad/s.",
-        references=_REFERENCES,
+        references=References.load("four_bar"),
         fix={"crank.angle": angle},
         rates={"crank.angle": speed},
     )
 
 
-def _above(B, D, coupler, rocker):
+def circles_meet(B, D, coupler, rocker):
     """The intersection of circles about B and D to the left of the way from B to D, or the point nearest to both."""
     d = D - B
     distance = np.hypot(*d)
@@ -69,39 +70,3 @@ def _above(B, D, coupler, rocker):
     across = np.sqrt(max(coupler**2 - along**2, 0.0))
     e = d / distance
     return B + along * e + across * np.array([-e[1], e[0]])
-
-
-def _observe(trajectory):
-    observed = {}
-    for name in ("crank", "coupler", "rocker"):
-        observed[name] = trajectory[name].angle
-        observed[f"{name}_rate"] = trajectory[name].angular_velocity
-    return observed
-
-
-_REFERENCES = References(
-    times=np.array([5.0, 10.0]),
-    labels=("crank", "coupler", "rocker", "crank_rate", "coupler_rate", "rocker_rate"),
-    values=np.array(
-        [
-            [
-                30.916938721474885,
-                1.2718852833966114,
-                1.8706677750466523,
-                4.037617308079547,
-                -1.6655733326711997,
-                -2.808240598089986,
-            ],
-            [
-                59.202769683547,
-                0.652952369775114,
-                1.9825882365006702,
-                5.2319065738216075,
-                1.1173835556582663,
-                1.958620874745937,
-            ],
-        ]
-    ),
-    source="one coordinate, with equations of its own, extrapolation method in extended precision",
-    tolerance=1e-12,
-)

@@ -7,6 +7,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -56,51 +57,11 @@ def hanging_chain(
         t1=2.0,
         observe=lambda trajectory: _observe(trajectory, n),
         description=f"Chain of {n} masses, released in its mode {mode} of small oscillations (Bernoulli).",
-        references=_REFERENCES,
+        references=References.load("hanging_chain"),
     )
 
 
 def _observe(trajectory, n):
     places = jnp.stack([trajectory[f"mass{k + 1}"].position for k in range(n)])
     along = jnp.diff(places, axis=0, prepend=jnp.zeros_like(places[:1]))
-    observed = {"x": places[-1, :, 0], "y": places[-1, :, 1]}
-    return observed | {f"angle{k + 1}": jnp.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}
-
-
-_REFERENCES = References(
-    times=np.array([0.5, 1.0, 2.0]),
-    labels=("x", "y", "angle1", "angle2", "angle3", "angle4", "angle5"),
-    values=np.array(
-        [
-            [
-                -0.08452983967338461,
-                -0.94890114191677,
-                0.14986216497882424,
-                0.14340960462775787,
-                0.058891414923488115,
-                -0.1465160633089725,
-                -0.6786394902304814,
-            ],
-            [
-                0.035205414322076654,
-                -0.9902496546768087,
-                -0.07376887063782712,
-                -0.057735866419166004,
-                -0.03316188813547268,
-                0.05236032634848054,
-                0.2924011180995112,
-            ],
-            [
-                -0.07771980080338539,
-                -0.954222281911682,
-                0.13737321509599018,
-                0.14084739860459944,
-                0.07371121454026443,
-                -0.14495595513184523,
-                -0.6374129257940522,
-            ],
-        ]
-    ),
-    source="angles of the rods, DOP853 at 2e-14",
-    tolerance=1e-11,
-)
+    return columns("xy", places[-1]) | {f"angle{k + 1}": jnp.arctan2(along[k, :, 0], -along[k, :, 1]) for k in range(n)}

@@ -7,6 +7,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -43,49 +44,12 @@ def heavy_top(
         t1=2.0,
         observe=_observe,
         description="Lagrange's heavy symmetric top on a fixed tip.",
-        references=_REFERENCES,
+        references=References.load("heavy_top"),
         rates={"top.angular_velocity": (0.0, precession * np.sin(tilt), spin)},
     )
 
 
 def _observe(trajectory):
     top = trajectory["top"]
-    observed = {f"{axis}c": top.position[:, k] for k, axis in enumerate("xyz")}
-    observed |= {f"e{k}": top.orientation[:, k] for k in range(4)}
-    return observed | {f"w{k + 1}": top.angular_velocity[:, k] for k in range(3)}
-
-
-_REFERENCES = References(
-    times=np.array([0.5, 2.0]),
-    labels=("xc", "yc", "zc", "e0", "e1", "e2", "e3", "w1", "w2", "w3"),
-    values=np.array(
-        [
-            [
-                -0.040884508258957404,
-                0.06373918308369278,
-                0.06531288941890977,
-                0.2519318784595748,
-                0.11890694786646458,
-                -0.3991198950873447,
-                -0.8735529610220429,
-                -5.63396586860976,
-                2.0166824019112495,
-                60.0,
-            ],
-            [
-                -0.021352675758547383,
-                -0.06766491374445817,
-                0.07046646497381133,
-                0.22520335879728975,
-                0.20154143866834934,
-                0.32718301244171494,
-                -0.8953299794240533,
-                -4.7369786466465476,
-                2.2234020301755724,
-                60.0,
-            ],
-        ]
-    ),
-    source="Lagrange's solution in elliptic functions, checked by a quaternion solution in extended precision",
-    tolerance=1e-13,
-)
+    observed = columns(("xc", "yc", "zc"), top.position) | columns(("e0", "e1", "e2", "e3"), top.orientation)
+    return observed | columns(("w1", "w2", "w3"), top.angular_velocity)

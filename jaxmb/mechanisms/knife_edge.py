@@ -7,6 +7,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -37,7 +38,7 @@ def knife_edge(
         t1=5.0,
         observe=_observe,
         description="A knife edge on an incline, which drifts sideways on a cycloid.",
-        references=_REFERENCES,
+        references=References.load("knife_edge"),
         rates={"skate.angle": spin},
     )
 
@@ -45,24 +46,5 @@ def knife_edge(
 def _observe(trajectory):
     skate = trajectory["skate"]
     c, s = jnp.cos(skate.angle), jnp.sin(skate.angle)
-    return {
-        "x": skate.position[:, 0],
-        "y": skate.position[:, 1],
-        "phi": skate.angle,
-        "v": c * skate.velocity[:, 0] + s * skate.velocity[:, 1],
-    }
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 2.0, 5.0]),
-    labels=("x", "y", "phi", "v"),
-    values=np.array(
-        [
-            [0.5069451225210011, 1.458257264967837, 2.0, 2.2300519392899845],
-            [0.3511673541144531, 2.1491998625195197, 4.0, -1.8560581197426942],
-            [0.18145984292533202, 5.851375221573812, 10.0, -1.3342117744561794],
-        ]
-    ),
-    source="the cycloid in closed form",
-    tolerance=1e-14,
-)
+    speed = c * skate.velocity[:, 0] + s * skate.velocity[:, 1]
+    return columns("xy", skate.position) | {"phi": skate.angle, "v": speed}

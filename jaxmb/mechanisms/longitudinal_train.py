@@ -13,6 +13,7 @@ from ..parts.fields import as_jax
 from ..parts.planar.kinematics import PLANE
 from ._relative import RelativeTrain, velocities
 from .mechanism import Mechanism, build, mechanism
+from .observe import columns
 from .train import braking, check_train, davis, of_each, running_resistance
 
 
@@ -37,10 +38,10 @@ def longitudinal_train(
 ) -> Mechanism:
     """An emergency stop of a train of n vehicles that move along a straight track only, in relative coordinates.
 
-    Coordinates are the place `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers, so that
-    slack keeps all its digits in a train of any length, and tolerances are relative to it. (The stop of 300 vehicles,
-    coupler forces with an error of 500 N on average: rtol 1e-4 and 14000 steps; in places along the track, 4 km long,
-    1e-7 and about as many, and 5000 N with 1e-6.) Otherwise as `train`, without pitch.
+    Coordinates are the position `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers. So slack
+    loses no digits in a long train, and tolerances are relative to it. (To stop 300 vehicles with a mean error of 500 N
+    in the coupler forces takes rtol 1e-4 and 14000 steps; in positions along the track, 4 km long, it takes rtol 1e-7
+    and about as many steps, and rtol 1e-6 leaves 5000 N.) Otherwise as `train`, without pitch.
 
     Source: V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974.
 
@@ -99,5 +100,6 @@ def _observe(trajectory):
     forces = jax.vmap(system.tensions)(trajectory.ys)
     speeds = jax.vmap(velocities)(trajectory.ys.u)
     observed = {name: trajectory[name] for name in system.coordinate_names()}
-    observed |= {f"v{k + 1}": speeds[:, k] for k in range(system.nq)}
-    return observed | {f"F{k + 1}": forces[:, k] for k in range(system.nq - 1)}
+    vehicles = range(1, system.nq + 1)
+    observed |= columns((f"v{k}" for k in vehicles), speeds)
+    return observed | columns((f"F{k}" for k in vehicles[:-1]), forces)

@@ -1,17 +1,16 @@
-"""What a mechanism of the library is: a system with a consistent state, and values to compare its motion with."""
+"""A mechanism of the library: a system with a consistent state, and reference values of its motion."""
 
 import dataclasses
 import functools
 import inspect
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 from .._types import State, VectorLike
 from ..parts.names import unknown
@@ -19,24 +18,25 @@ from ..scene import Scene
 from ..states.assembly import assemble
 from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory
+from .observe import Observation
 
-Observation = dict[str, Array]
+_DATA = Path(__file__).parent / "data"
 
-# How a machine that has a Lagrangian on paper is built.
+# How a mechanism with a known Lagrangian is modelled.
 Model = Literal["lagrangian", "rigid_bodies"]
 
 
 @dataclasses.dataclass(frozen=True)
 class References:
-    """Values of a motion that do not come from this package.
+    """Reference values of a motion, from a source independent of this package.
 
     **Fields:**
 
-    - `times` [s]: when, ascending, shape (times,).
-    - `labels`: what, as in `Mechanism.observe`.
+    - `times` [s]: ascending, shape (times,).
+    - `labels`: names of the quantities, as in `Mechanism.observe`.
     - `values`: shape (times, labels), in SI units.
     - `source`: where they come from.
-    - `tolerance`: the relative error up to which the values themselves can be trusted.
+    - `tolerance`: the relative error up to which the values can be trusted.
     """
 
     times: np.ndarray
@@ -46,6 +46,7 @@ class References:
     tolerance: float
 
     def __post_init__(self):
+        object.__setattr__(self, "labels", tuple(self.labels))
         object.__setattr__(self, "times", np.asarray(self.times, dtype=float))
         object.__setattr__(self, "values", np.asarray(self.values, dtype=float))
         if self.values.shape != (len(self.times), len(self.labels)):
@@ -54,9 +55,14 @@ class References:
                 f"got shape {self.values.shape}."
             )
 
+    @classmethod
+    def load(cls, name: str) -> "References":
+        """The values in the file `data/<name>.json` of the library."""
+        return cls(**json.loads((_DATA / f"{name}.json").read_text(encoding="utf-8")))
+
     @property
     def scales(self) -> np.ndarray:
-        """The size that errors of a label are relative to: its largest value, or 1 if that is zero; shape (labels,)."""
+        """The scale of the errors of each label: its largest value, or 1 if that is zero; shape (labels,)."""
         largest = np.max(np.abs(self.values), axis=0)
         return np.where(largest > 1e-12, largest, 1.0)
 
@@ -68,17 +74,16 @@ class Mechanism:
     **Fields:**
 
     - `name`: as in `names()`.
-    - `scene`: its parts, to build on: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`;
+    - `scene`: its parts, to extend: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`;
         None for a system from a Lagrangian.
-    - `system`, `state`: the system, and a consistent state of it at t = 0.
-    - `t1`: the end of the motion that it is known for [s].
-    - `references`: values to compare with, or None where there are none (other parameters than the published ones).
-    - `observe(trajectory)`: quantities by label, arrays with a leading axis of time, among them those of the
+    - `system`, `state`: the system, and a consistent state at t = 0.
+    - `t1`: the end of its usual motion [s].
+    - `references`: reference values, or None for parameters that they do not hold for.
+    - `observe(trajectory)`: quantities by label, arrays with time as their first axis; they include those of the
         references.
-    - `description`: what it is and where its data come from.
+    - `description`: what the mechanism is and where its data come from.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
-    - `start(system, guess)`: how the state was made, or None where it was assembled and no more.
-    - `beside`: keyword arguments of other machines of this name that belong beside it in a report.
+    - `start(system, guess)`: computes the state; None if assembly alone gives it.
     """
 
     name: str
@@ -92,7 +97,6 @@ class Mechanism:
     fix: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     rates: Mapping[str, VectorLike] = dataclasses.field(default_factory=dict)
     start: Callable[[Any, State], State] | None = None
-    beside: tuple[Mapping[str, Any], ...] = ()
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
@@ -118,8 +122,8 @@ class Mechanism:
         }
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
-        """The same mechanism with some parameters replaced, its state made again near the present one; also under
-        `jit`.
+        """The same mechanism with some parameters replaced and the state computed anew near the present one; also
+        under `jit`.
 
         **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
         """
@@ -132,9 +136,10 @@ class Mechanism:
 
 
 def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mechanism]], Callable[..., Mechanism]]:
-    """Make a function a member of the library: its references hold for the default values of its parameters only.
+    """Decorate a builder of the library: it refuses unknown parameters, and drops the reference values where a
+    parameter does not have its default value.
 
-    **Arguments:** `variants`: parameters for whose values the function itself chooses the references.
+    **Arguments:** `variants`: parameters for whose values the builder itself chooses the references.
     """
 
     def decorate(function: Callable[..., Mechanism]) -> Callable[..., Mechanism]:
@@ -160,29 +165,6 @@ def _same(value: Any, default: Any) -> bool:
     return value is default or (default is not None and value is not None and np.array_equal(value, default))
 
 
-def point_motion(trajectory: Trajectory, body: str, s: VectorLike) -> tuple[Array, Array]:
-    """Position [m] and velocity [m/s] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
-    system = trajectory.system
-    space, k = system.layout.space, system.body_names.index(body)
-    s = jnp.asarray(s, float)
-
-    def at(y):
-        pose, velocity = system.poses(y.q)[k], system.velocities(y.u)[k]
-        return space.point(pose, s), space.point_velocity(pose, velocity, s)
-
-    return jax.vmap(at)(trajectory.ys)
-
-
-def point_acceleration(trajectory: Trajectory, body: str, s: VectorLike) -> Array:
-    """Acceleration [m/s²] in the world, shape (times, d), of the point `s` [m] fixed in a body."""
-    system = trajectory.system
-    space, k = system.layout.space, system.body_names.index(body)
-    s = jnp.asarray(s, float)
-    velocity = lambda q, u: space.point_velocity(system.poses(q)[k], system.velocities(u)[k], s)
-    at = lambda y, qdot, udot: jax.jvp(velocity, (y.q, y.u), (qdot, udot))[1]
-    return jax.vmap(at)(trajectory.ys, trajectory.rates, trajectory.accelerations)
-
-
 def build(
     name: str,
     scene: Scene | AbstractSystem,
@@ -194,7 +176,6 @@ def build(
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
     start: Callable[[Any, State], State] | None = None,
-    beside: tuple[Mapping[str, Any], ...] = (),
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
@@ -202,15 +183,16 @@ def build(
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
     observe = eqx.filter_jit(observe)
-    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start, beside)
+    return Mechanism(name, parts, system, state, float(t1), references, observe, description, fix, rates, start)
 
 
-def of_bodies(model: Model, **defaults: bool) -> bool:
-    """Whether a mechanism is to be a scene of rigid bodies, and not a system from its Lagrangian.
+def is_rigid(model: Model, **defaults: bool) -> bool:
+    """Whether to build a scene of rigid bodies instead of a system from a Lagrangian.
 
-    **Arguments:** `defaults`: by name, whether a parameter that says how the Lagrangian is written has its default.
+    **Arguments:** `defaults`: for every parameter that chooses the form of the Lagrangian's equations, whether it has
+    its default value.
 
-    **Raises:** `ValueError` for an unknown model, and for a way to write the Lagrangian of rigid bodies.
+    **Raises:** `ValueError` for an unknown model, and for rigid bodies with a form of the Lagrangian's equations.
     """
     if model not in get_args(Model):
         raise ValueError(f"The models are {', '.join(get_args(Model))}; got {model!r}.")
@@ -218,10 +200,3 @@ def of_bodies(model: Model, **defaults: bool) -> bool:
     if model == "rigid_bodies" and chosen:
         raise ValueError(f"model='rigid_bodies' has no Lagrangian to write: leave out {', '.join(chosen)}.")
     return model == "rigid_bodies"
-
-
-def observe_coordinates(trajectory: Trajectory) -> Observation:
-    """The coordinates of a system from a Lagrangian by their names, and its velocities as `u0`, `u1`, …."""
-    names = trajectory.system.coordinate_names()
-    rates = {f"u{k}": trajectory.ys.u[:, k] for k in range(trajectory.system.nu)}
-    return {name: trajectory[name] for name in names} | rates

@@ -2,11 +2,9 @@
 
 from typing import Literal
 
-import numpy as np
-
 from ..lagrangian import AbstractEquations
-from ._wheeled import observe_bodies, wheeled, wheeled_bodies
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from ._wheeled import build_wheeled
+from .mechanism import Mechanism, Model, mechanism
 
 
 @mechanism(variants=("model",))
@@ -51,22 +49,12 @@ def nonholonomic_cart(
         "pivot": pivot,
         "handle": handle,
     }
-    rigid = of_bodies(model, form=form == "frame", equations=equations is None)
-    start = {"angle": angle, "speed": speed, "rate": rate}
-    return build(
+    return build_wheeled(
         "nonholonomic_cart",
-        wheeled_bodies(parameters, **start) if rigid else wheeled(form, equations, parameters, **start),
-        t1=5.0,
-        observe=observe_bodies if rigid else observe_coordinates,
-        description="Cart of two wheeled platforms with a pin, coasting.",
-        references=_REFERENCES,
+        "Cart of two wheeled platforms with a pin, coasting.",
+        parameters,
+        (angle, speed, rate),
+        form=form,
+        equations=equations,
+        model=model,
     )
-
-
-_REFERENCES = References(
-    times=np.array([5.0]),
-    labels=("x", "y", "theta", "phi", "u0", "u1"),
-    values=np.array([[-0.5119887019, 3.5298075840, 2.4147753904, 3.1627826849, 1.0349349573, 0.0615793993]]),
-    source="DOP853 at 1e-12 on Hamel's equations in the frame of speed and turning rate",
-    tolerance=1e-9,
-)

@@ -6,6 +6,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, build, mechanism
+from .observe import columns
 
 
 @mechanism()
@@ -22,7 +23,7 @@ def parallelogram(
 ) -> Mechanism:
     """Parallel rockers of equal length that carry a coupler: every rocker after the second is redundant; y up.
 
-    It moves only because the rockers agree exactly. With `offset`, the last rocker's ground pin is moved, and three
+    It can move only because the rockers are exactly equal. An `offset` moves the last rocker's ground pin, and three
     rockers lock.
 
     **Arguments:** `rockers` ≥ 2; `offset` [m] of the last ground pin along x; length of a `rocker` and `spacing` of the
@@ -70,9 +71,4 @@ def parallelogram(
 
 def _observe(trajectory):
     first, coupler = trajectory["rocker1"], trajectory["coupler"]
-    return {
-        "angle": first.angle,
-        "rate": first.angular_velocity,
-        "x": coupler.position[:, 0],
-        "y": coupler.position[:, 1],
-    }
+    return {"angle": first.angle, "rate": first.angular_velocity} | columns("xy", coupler.position)

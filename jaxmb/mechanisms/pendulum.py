@@ -6,6 +6,7 @@ from .. import planar
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import columns
 
 _SOURCE = (
     "Problem A01 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics "
@@ -38,31 +39,10 @@ def pendulum(
         t1=9.99,
         observe=_observe,
         description=f"Planar pendulum: a point mass on a massless bar. {_SOURCE}.",
-        references=_REFERENCES,
+        references=References.load("pendulum"),
     )
 
 
 def _observe(trajectory):
     bob = trajectory["bob"]
-    return {
-        "x": bob.position[:, 0],
-        "y": bob.position[:, 1],
-        "vx": bob.velocity[:, 0],
-        "vy": bob.velocity[:, 1],
-    }
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 5.0, 9.99, 10.0]),
-    labels=("x", "y", "vx", "vy"),
-    values=np.array(
-        [
-            [0.9862917511318753, -0.16501085312554117, 0.2969055159163158, 1.7746436411126556],
-            [-0.9423054350437573, -0.3347543384140006, 0.8579042568859491, -2.4149286543704886],
-            [-0.3164364699130314, -0.9486137045757768, 4.0924519914940225, -1.365151120240301],
-            [-0.2750874625761169, -0.961419205099125, 4.175598100951729, -1.1947490545604753],
-        ]
-    ),
-    source="Jacobi's elliptic functions, checked by extrapolation in extended precision; problem: IFToMM A01",
-    tolerance=1e-15,
-)
+    return columns("xy", bob.position) | columns(("vx", "vy"), bob.velocity)

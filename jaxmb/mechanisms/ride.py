@@ -1,4 +1,4 @@
-"""What a designer of a tracked vehicle looks at: functions of a motion of `tracked_vehicle`.
+"""Ride comfort, suspension travel and wheel loads of a motion of `tracked_vehicle`.
 
 `unit` is 1 for the leading carrier and 2 for the towed one.
 """
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._types import VectorLike
 from ..system import parameters
 from ..trajectory import Trajectory
-from .mechanism import point_acceleration
+from .observe import point_acceleration
 
 PREFIXES = ("", "rear_")
 

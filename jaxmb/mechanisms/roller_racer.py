@@ -2,11 +2,9 @@
 
 from typing import Literal
 
-import numpy as np
-
 from ..lagrangian import AbstractEquations
-from ._wheeled import observe_bodies, wheeled, wheeled_bodies
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from ._wheeled import build_wheeled
+from .mechanism import Mechanism, Model, mechanism
 
 
 @mechanism(variants=("model",))
@@ -37,8 +35,8 @@ def roller_racer(
     heading [m/s] and turning `rate` [rad/s] at the start; `form`: the velocities are speed and turning rate, in a frame
     that satisfies the constraints; or the coordinates' rates, with the constraints; or those of θ and φ, with a
     connection that is singular where the platforms are in line; `equations`: how they are written, default
-    `Projected()`; `model`: from its Lagrangian, or as rigid bodies `rear` and `front`, the latter with some of the
-    mass, in the pin, where it adds to the rear one's as if it were fixed to it.
+    `Projected()`; `model`: from its Lagrangian, or as rigid bodies `rear` and `front`, with part of the mass moved to
+    the front one, at the pin, where it moves with both.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """
@@ -52,23 +50,21 @@ def roller_racer(
         "pivot": pivot,
         "handle": handle,
     }
-    rigid = of_bodies(model, form=form == "frame", equations=equations is None)
-    start = {"angle": angle, "speed": speed, "rate": rate}
-    return build(
+    return build_wheeled(
         "roller_racer",
-        wheeled_bodies(_with_mass_in_front(parameters), **start)
-        if rigid
-        else wheeled(form, equations, parameters, **start),
-        t1=5.0,
-        observe=observe_bodies if rigid else observe_coordinates,
-        description="Roller racer: two wheeled platforms with a pin, coasting (Krishnaprasad and Tsakiris).",
-        references=_REFERENCES,
+        "Roller racer: two wheeled platforms with a pin, coasting (Krishnaprasad and Tsakiris).",
+        parameters,
+        (angle, speed, rate),
+        form=form,
+        equations=equations,
+        model=model,
+        as_bodies=_with_mass_in_front,
     )
 
 
 def _with_mass_in_front(p):
-    """The same machine with a share of the mass in the pin: it moves with the rear platform, whose own mass centre
-    goes as far behind its axle as the common one needs to stay there.
+    """An equivalent machine with part of the mass at the pin, as the front platform's. The rear platform's own mass
+    centre lies behind its axle, so that the common one stays on it.
     """
     arm = p["mass"] * p["pivot"] ** 2
     ratio = p["inertia"] / (p["inertia"] + 2 * arm)
@@ -80,12 +76,3 @@ def _with_mass_in_front(p):
         "front_ahead": -p["handle"],
         "inertia": p["inertia"] - ratio * arm,
     }
-
-
-_REFERENCES = References(
-    times=np.array([5.0]),
-    labels=("x", "y", "theta", "phi", "u0", "u1"),
-    values=np.array([[0.5479154961, 0.1185110704, 6.2350455697, 3.5701901507, 0.8833468748, 1.4409397963]]),
-    source="DOP853 at 1e-12 on Hamel's equations in the frame of speed and turning rate",
-    tolerance=1e-9,
-)

@@ -9,6 +9,7 @@ from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
+from .observe import body_axis
 
 
 @mechanism()
@@ -56,14 +57,14 @@ def rolling_disk(
         t1=4.0,
         observe=_observe,
         description="A thin disk that rolls on a plane without slipping, in a steady circle.",
-        references=_REFERENCES,
+        references=References.load("rolling_disk"),
         rates={"disk.angular_velocity": (pitch, roll, turn)},
     )
 
 
 def _observe(trajectory):
     disk = trajectory["disk"]
-    axle = jax.vmap(lambda p: rotations.rotate(p, jnp.array([0.0, 1.0, 0.0])))(disk.orientation)
+    axle = body_axis(trajectory, "disk", (0.0, 1.0, 0.0))
     omega_W = jax.vmap(rotations.rotate)(disk.orientation, disk.angular_velocity)
     level = jnp.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
     cos, sin = axle[:, 1] / level, -axle[:, 0] / level
@@ -80,45 +81,3 @@ def _observe(trajectory):
         "w2": along(axle),
         "w3": along(e3),
     }
-
-
-_REFERENCES = References(
-    times=np.array([1.0, 2.0, 4.0]),
-    labels=("xc", "yc", "theta", "cos_psi", "sin_psi", "w1", "w2", "w3"),
-    values=np.array(
-        [
-            [
-                0.46774244528083975,
-                -0.8873882907863094,
-                0.4,
-                -0.565147910239229,
-                -0.82498959966307,
-                0.0,
-                4.1037288582515705,
-                -2.0,
-            ],
-            [
-                -0.528687330961307,
-                -0.7717653053553305,
-                0.4,
-                -0.36121567910446395,
-                0.9324822964373645,
-                0.0,
-                4.1037288582515705,
-                -2.0,
-            ],
-            [
-                0.38194030657423056,
-                -0.985983152944281,
-                0.4,
-                -0.7390464663382018,
-                -0.6736544519210254,
-                0.0,
-                4.10372885825157,
-                -2.0,
-            ],
-        ]
-    ),
-    source="the steady circle in closed form",
-    tolerance=1e-14,
-)

@@ -7,7 +7,8 @@ from .. import planar
 from ..lagrangian import CoulombFriction, Holonomic, LagrangianSystem
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates, point_coordinates
 
 
 @mechanism(variants=("model",))
@@ -33,7 +34,7 @@ def rough_ring(
 
     **Labels:** `x`, `y` [m], `u0`, `u1` [m/s].
     """
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     if rigid:
         system = _bead(radius, friction, speed, mass, gravity)
     else:
@@ -51,7 +52,7 @@ def rough_ring(
         "rough_ring",
         system,
         t1=3.0,
-        observe=_observe_bead if rigid else observe_coordinates,
+        observe=(lambda trajectory: point_coordinates(trajectory, "xy")) if rigid else lagrangian_coordinates,
         description="Bead on a ring with Coulomb friction; a constraint that is not ideal.",
         references=_references(),
     )
@@ -66,11 +67,6 @@ def _bead(radius, friction, speed, mass, gravity) -> Scene:
             Gravity((0.0, -gravity)),
         ],
     )
-
-
-def _observe_bead(trajectory):
-    (x, y), (u0, u1) = trajectory["bead"].position.T, trajectory["bead"].velocity.T
-    return {"x": x, "y": y, "u0": u0, "u1": u1}
 
 
 def _references():

@@ -55,7 +55,7 @@ def slider_crank(
         t1=0.2,
         observe=_observe,
         description="Planar slider-crank, spun up to 150 rad/s and left alone.",
-        references=_REFERENCES,
+        references=References.load("slider_crank"),
         fix={"crank.angle": angle},
         rates={"crank.angle": speed},
     )
@@ -71,31 +71,3 @@ def _observe(trajectory):
         "rod_rate": rod.angular_velocity,
         "x_dot": slider.velocity[:, 0],
     }
-
-
-_REFERENCES = References(
-    times=np.array([0.1, 0.2]),
-    labels=("crank", "rod", "x", "crank_rate", "rod_rate", "x_dot"),
-    values=np.array(
-        [
-            [
-                9.140152416941632,
-                -0.14086443541998273,
-                0.15612473949874364,
-                144.40633208906323,
-                69.99147193939002,
-                -3.19701913171785,
-            ],
-            [
-                18.39445098299742,
-                0.22158719468433913,
-                0.43594513401230367,
-                97.13941142358507,
-                -44.71943058886019,
-                9.54031293880763,
-            ],
-        ]
-    ),
-    source="one coordinate, with equations of its own, extrapolation method in extended precision",
-    tolerance=1e-12,
-)

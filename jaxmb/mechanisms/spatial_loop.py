@@ -6,7 +6,9 @@ from .. import spatial
 from ..linalg import rotations
 from ..parts.forces import Gravity
 from ..scene import Scene
-from .mechanism import Mechanism, build, mechanism, point_motion
+from .four_bar import circles_meet
+from .mechanism import Mechanism, build, mechanism
+from .observe import columns, point_motion
 
 
 @mechanism()
@@ -22,7 +24,7 @@ def spatial_loop(
 ) -> Mechanism:
     """The linkage of `four_bar` in space, with four parallel hinges and a base that is a body welded to the ground.
 
-    Hinges in space hold the bars in their plane more often than needed: of the 30 rows between 28 coordinates (26 of
+    Spatial hinges hold the bars in their plane redundantly: of the 30 rows between 28 coordinates (26 of
     joints, 4 of Euler parameters) three follow from the others, and one degree of freedom is left.
 
     Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, example 10.1.1 (the
@@ -35,11 +37,7 @@ def spatial_loop(
     crank, coupler, rocker = lengths
     A, D = np.zeros(3), np.array([base, 0.0, 0.0])
     B = crank * np.array([np.cos(angle), np.sin(angle), 0.0])
-    d = D - B
-    distance = np.linalg.norm(d)
-    along = (coupler**2 - rocker**2 + distance**2) / (2 * distance)
-    across = np.sqrt(max(coupler**2 - along**2, 0.0))
-    C = B + (along * d + across * np.array([-d[1], d[0], 0.0])) / distance
+    C = np.append(circles_meet(B[:2], D[:2], coupler, rocker), 0.0)
     z = (0.0, 0.0, 1.0)
 
     def bar(name, mass, length, start, end):
@@ -78,4 +76,4 @@ def spatial_loop(
 def _observe(trajectory, crank, rocker):
     B, _ = point_motion(trajectory, "crank", (crank / 2, 0.0, 0.0))
     C, _ = point_motion(trajectory, "rocker", (rocker / 2, 0.0, 0.0))
-    return {"x_B": B[:, 0], "y_B": B[:, 1], "x_C": C[:, 0], "y_C": C[:, 1]}
+    return columns(("x_B", "y_B"), B) | columns(("x_C", "y_C"), C)

@@ -10,7 +10,8 @@ from ..linalg import rotations
 from ..parts.functions import Force
 from ..scene import Scene
 from ..system import parameters as parameters_of
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import columns, lagrangian_coordinates
 
 _COUPLER = ((0.06, -0.004, 0.0), (-0.004, 0.05, 0.0), (0.0, 0.0, 0.03))
 _CENTRES = ((0.02, -0.05, 0.1), (0.05, -0.12, 0.15), (0.0, -0.08, 0.12))
@@ -61,20 +62,20 @@ def spherical_four_bar(
         "gravity": gravity,
     }
     q = _closed(parameters["arcs"], angle, branch)
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     return build(
         "spherical_four_bar",
-        _bodies(parameters, q) if rigid else _on_paper(parameters, q),
+        _bodies(parameters, q) if rigid else _lagrangian(parameters, q),
         t1=3.0,
-        observe=_observe_bodies if rigid else observe_coordinates,
+        observe=_observe_bodies if rigid else lagrangian_coordinates,
         description="Spherical four-bar linkage, in angles and the coupler's Euler parameters (Dooley and McCarthy).",
-        references=_REFERENCES,
+        references=References.load("spherical_four_bar"),
         fix={} if rigid else {"theta": angle},
         rates={"input.wz" if rigid else "theta": speed},
     )
 
 
-def _on_paper(parameters, q) -> LagrangianSystem:
+def _lagrangian(parameters, q) -> LagrangianSystem:
     return LagrangianSystem(
         kinetic=_kinetic,
         potential=_potential,
@@ -148,8 +149,8 @@ def _observe_bodies(trajectory):
         "u0": first.angular_velocity[:, 2],
         "u1": last.angular_velocity[:, 2],
     }
-    observed |= {f"e{k}": coupler.orientation[:, k] for k in range(4)}
-    return observed | {f"u{k + 2}": rates[:, k] for k in range(4)}
+    parameters = columns(("e0", "e1", "e2", "e3"), coupler.orientation)
+    return observed | parameters | columns(("u2", "u3", "u4", "u5"), rates)
 
 
 def _closed(arcs, theta, branch):
@@ -222,12 +223,3 @@ def _potential(t, q, p):
 
 def _force(t, q, v, p):
     return jnp.zeros_like(q).at[0].set(p["torque"])
-
-
-_REFERENCES = References(
-    times=np.array([3.0]),
-    labels=("theta", "psi", "u0"),
-    values=np.array([[0.3482026199, 4.5646228730, -3.3558259716]]),
-    source="DOP853 at 1e-12 on the equation of motion in the input angle alone",
-    tolerance=1e-9,
-)

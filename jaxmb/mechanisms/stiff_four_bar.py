@@ -5,7 +5,8 @@ import numpy as np
 from .. import planar
 from ..scene import Scene
 from .four_bar import four_bar
-from .mechanism import Mechanism, References, build, mechanism, point_motion
+from .mechanism import Mechanism, References, build, mechanism
+from .observe import bar_angles, point_motion
 
 
 @mechanism()
@@ -53,60 +54,13 @@ def stiff_four_bar(
         t1=1.0,
         observe=lambda trajectory: _observe(trajectory, foot, base),
         description="Planar four-bar linkage with a stiff, lightly damped bushing for a ground pivot, under gravity.",
-        references=_REFERENCES,
+        references=References.load("stiff_four_bar"),
         fix={name: float(rigid.state.q[coordinates[name][0]]) for name in angles},
         rates={name: float(rigid.state.u[rates[name][0]]) for name in angles},
     )
 
 
 def _observe(trajectory, foot, base):
-    observed = {}
-    for name in ("crank", "coupler", "rocker"):
-        observed[name] = trajectory[name].angle
-        observed[f"{name}_rate"] = trajectory[name].angular_velocity
     end, _ = point_motion(trajectory, "rocker", foot)
-    return observed | {"pivot_x": end[:, 0] - base, "pivot_y": end[:, 1]}
-
-
-_REFERENCES = References(
-    times=np.array([0.01, 0.1, 0.5, 1.0]),
-    labels=("crank", "coupler", "rocker", "crank_rate", "coupler_rate", "rocker_rate"),
-    values=np.array(
-        [
-            [
-                1.6106529982293498,
-                0.5236439351496772,
-                1.547529289369021,
-                3.9728015440888416,
-                0.09748362109462406,
-                1.646799370472637,
-            ],
-            [
-                1.96612354221085,
-                0.5454864604705474,
-                1.699344145464039,
-                4.005160290254868,
-                0.38498468547350484,
-                1.7324747383408747,
-            ],
-            [
-                4.760991548818586,
-                1.296171286744304,
-                2.285168482013079,
-                9.734442994186406,
-                2.39888070296558,
-                -1.4803241785182444,
-            ],
-            [
-                7.502764004940901,
-                0.5329114922021208,
-                1.3987341752532292,
-                4.6107422078540505,
-                -0.35959180682728054,
-                1.5351533722522708,
-            ],
-        ]
-    ),
-    source="open chain of three bars in their angles, extrapolation method in extended precision",
-    tolerance=1e-12,
-)
+    pivot = {"pivot_x": end[:, 0] - base, "pivot_y": end[:, 1]}
+    return bar_angles(trajectory, "crank", "coupler", "rocker") | pivot

@@ -13,7 +13,8 @@ from .. import planar
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
 from ..parts.fields import as_jax
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import columns, lagrangian_coordinates
 
 
 @mechanism(variants=("gait", "model"))
@@ -32,15 +33,15 @@ def three_platform_snake(
     """Three platforms in a row, joined by pins, each with one axle in its middle whose wheels do not slip sideways.
 
     Coordinates: x, y [m] of the middle platform, its heading θ, and φ1, φ2 [rad]: the rear platform's heading is θ
-    − φ1, the front one's θ + φ2. Three axles allow the shape's two velocities and no more: its changes move the
-    snake, by a connection, and a closed path of shapes by a geometric phase. Singular where the axles' lines meet
-    in one point or are parallel, as where φ1 = φ2.
+    − φ1, the front one's θ + φ2. Three axles leave only the two velocities of the shape: a change of shape moves the
+    snake by a connection, and a closed path of shapes by a geometric phase. The connection is singular where the lines
+    of the axles meet in one point or are parallel, as where φ1 = φ2.
 
     Source: P. S. Krishnaprasad and D. P. Tsakiris, G-Snakes: nonholonomic kinematic chains on Lie groups, Proc. 33rd
     IEEE CDC, 1994. Reference values from DOP853 on Voronets' equations, with a gait on the connection.
 
     **Arguments:** `mass` [kg], `inertia` [kg m²] and `half` length [m] of a platform; `angles` φ [rad] and `rates`
-    [rad/s] at the start, of a free motion; `gait(t)`: the angles (2,) as a function of time that holds them instead;
+    [rad/s] at the start, of a free motion; `gait(t)`: prescribes the angles, shape (2,), as a function of time;
     `form`: the velocities are those of the shape, with the connection, or the coordinates' rates, with constraints (as
     always with a gait); `equations`: how they are written, default `Projected()`; `model`: from its Lagrangian, or as
     rigid bodies `rear`, `middle` and `front`.
@@ -49,7 +50,7 @@ def three_platform_snake(
     """
     if form not in ("connection", "constraints"):
         raise ValueError(f"The forms are connection, constraints; got {form!r}.")
-    rigid = of_bodies(model, form=form == "connection", equations=equations is None)
+    rigid = is_rigid(model, form=form == "connection", equations=equations is None)
     parameters = {"mass": mass, "inertia": inertia, "half": half}
     numbers = {name: as_jax(value) for name, value in parameters.items()}
     shape, turning = as_jax(angles), as_jax(rates)
@@ -74,9 +75,9 @@ def three_platform_snake(
         "three_platform_snake",
         system,
         t1=1.0 if gait is None else 2 * np.pi,
-        observe=_observe_bodies if rigid else observe_coordinates,
+        observe=_observe_bodies if rigid else lagrangian_coordinates,
         description="SE(2)-snake of three platforms on wheels (Krishnaprasad and Tsakiris).",
-        references=_REFERENCES if gait is None else None,
+        references=References.load("three_platform_snake") if gait is None else None,
     )
 
 
@@ -117,9 +118,7 @@ def _bodies(p, q, v, gait) -> Scene:
 
 def _observe_bodies(trajectory):
     rear, middle, front = (trajectory[name] for name in ("rear", "middle", "front"))
-    return {
-        "x": middle.position[:, 0],
-        "y": middle.position[:, 1],
+    return columns("xy", middle.position) | {
         "theta": middle.angle,
         "phi1": middle.angle - rear.angle,
         "phi2": front.angle - middle.angle,
@@ -161,12 +160,3 @@ def _connection(t, q, p):
     a, b, c = matrix[:, :3]
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     return cofactors @ matrix[:, 3:] / (a @ jnp.cross(b, c))
-
-
-_REFERENCES = References(
-    times=np.array([1.0]),
-    labels=("x", "y", "theta", "phi1", "phi2"),
-    values=np.array([[-0.0441318413, -0.0015964638, 0.0684829930, 1.1937250240, 0.0387634348]]),
-    source="DOP853 at 1e-12 on Voronets' equations",
-    tolerance=3e-8,
-)

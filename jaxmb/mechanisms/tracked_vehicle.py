@@ -14,6 +14,7 @@ from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
 from ..states.equilibrium import equilibrium
 from ..system import parameters, with_parameters
+from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
@@ -58,8 +59,8 @@ def tracked_vehicle(
     gravity: float = 9.81,
 ) -> Mechanism:
     """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
-    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2`
-    another carrier is towed by a hitch, and there are twice as many less two.
+    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2` it
+    tows another carrier by a hitch, which takes away two degrees of freedom.
 
     It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
     right pair; x is forward, y up.
@@ -129,7 +130,7 @@ def tracked_vehicle(
         joints.append(planar.Revolute("hitch", *pair, point_a=hitch_rear, point_b=hitch_front))
         bend = {"stiffness": hitch_stiffness, "damping": hitch_damping, "free_angle": 0.0}
         forces.append(planar.TorsionalSpringDamper("hitch_spring", *pair, **bend))
-    road = planar.Contact(
+    road = WheelContact(
         "road",
         [body.name for body in bodies if "wheel" in body.name],
         terrain=Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
@@ -137,8 +138,6 @@ def tracked_vehicle(
         friction=contact.Coulomb(friction, transition_speed=transition_speed),
         radius=radius,
         damping=ground_damping,
-        onset="linear",
-        depth="vertical",
     )
     return build(
         "tracked_vehicle",
@@ -146,10 +145,9 @@ def tracked_vehicle(
         t1=1.5,
         observe=_observe,
         description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
-        references=_REFERENCES[units],
+        references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
         start=lambda system, guess: _rolling(system, guess, speed),
-        beside=({"units": 3 - units},),
     )
 
 
@@ -178,55 +176,3 @@ def _observe(trajectory):
             observed |= {f"{p}x": hull.position[:, 0], f"{p}y": hull.position[:, 1], f"{p}phi": hull.angle}
             observed |= {f"{p}a{k + 1}": travel[:, k] for k in range(travel.shape[1])}
     return observed
-
-
-_SOURCE = "minimal coordinates, Runge–Kutta method of order 8"
-_REFERENCES = {
-    1: References(
-        times=np.array([0.5, 1.0, 1.5]),
-        labels=("x", "y", "phi"),
-        values=np.array(
-            [
-                [2.61085798931969, 0.901098716083570, 0.00610065148341],
-                [5.35923980461595, 0.950519106033969, 0.04338680007403],
-                [8.24014542540776, 0.898593479742995, -0.01868034501957],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-10,
-    ),
-    2: References(
-        times=np.array([0.5, 1.0, 1.5]),
-        labels=("x", "y", "phi", "rear_x", "rear_y", "rear_phi"),
-        values=np.array(
-            [
-                [
-                    2.61197544144702,
-                    0.902300281302783,
-                    0.000464589124938,
-                    -2.18802717305855,
-                    0.900032447411396,
-                    0.000480341078139,
-                ],
-                [
-                    5.40640262990527,
-                    0.934491601883477,
-                    0.015504099914322,
-                    0.610171001981034,
-                    0.901807065275057,
-                    -0.001875053942165,
-                ],
-                [
-                    8.39247455278833,
-                    0.907575301554893,
-                    -0.001084883650678,
-                    3.59235957375105,
-                    0.911382517316909,
-                    -0.000501417919300,
-                ],
-            ]
-        ),
-        source=_SOURCE,
-        tolerance=1e-10,
-    ),
-}

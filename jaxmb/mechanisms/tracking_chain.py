@@ -2,14 +2,14 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import planar
 from ..lagrangian import LagrangianSystem, ServoConstraint
 from ..parts.functions import Constraint, Force
 from ..parts.servo import Servo
 from ..scene import Scene
-from .mechanism import Mechanism, Model, References, build, mechanism, observe_coordinates, of_bodies
+from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
+from .observe import lagrangian_coordinates
 
 _MASSES = ("one", "two", "three")
 
@@ -26,26 +26,27 @@ def tracking_chain(
     gains: tuple[float, float] = (0.0, 0.0),
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """Three masses in a row on nonlinear springs, driven at the end, that are to move as two given functions of time.
+    """Three masses in a row on nonlinear springs, driven at the end, with a control force that makes two of them
+    follow a desired motion.
 
     Coordinates: displacements q1, q2, q3 [m]; springs to the ground and between neighbours have the force k d + κ
-    d³. The desired motion, q1 = 0.5 sin t and q3 − q1 = 0.2 cos 2t, is a constraint on accelerations, and its force
-    `trajectory.constraint_forces["track"]` the control that achieves it exactly.
+    d³. The desired motion, q1 = 0.5 sin t and q3 − q1 = 0.2 cos 2t, is a servo constraint on accelerations; its force
+    `trajectory.constraint_forces["track"]` is the control that achieves it exactly.
 
     Source: R. E. Kalaba and F. E. Udwadia, Equations of motion for nonholonomic, constrained dynamical systems via
     Gauss's principle, J. Appl. Mech. 60(3), 1993; data of this package. Reference values from DOP853 on their
     equation.
 
     **Arguments:** `masses` [kg]; `stiffness` k [N/m] and `cubic` κ [N/m³]; `damping` [N s/m] of every mass; `drive`
-    [rad/s], of the force sin on the last mass; `offset` [m], of the start: q1 too far ahead by it, q3 − q1 behind
-    by twice as much; `gains` [1/s, 1/s²] with which deviations are brought to zero;
+    [rad/s], the frequency of the force on the last mass; `offset` [m] of the start: q1 is ahead of the desired motion
+    by it, q3 − q1 behind by twice as much; `gains` [1/s, 1/s²] of the feedback that reduces deviations;
     `model`: from its Lagrangian, or as point masses `one`, `two` and `three` on a rail along x.
 
     **Labels:** `q1`, `q2`, `q3` [m], `u0`, `u1`, `u2` [m/s].
     """
     q, u = (offset, 0.0, 0.2 - offset), (0.5, 0.0, 0.5)
     numbers = {"stiffness": stiffness, "cubic": cubic, "damping": damping, "drive": drive}
-    rigid = of_bodies(model)
+    rigid = is_rigid(model)
     if rigid:
         system = _points(masses, numbers, gains, q, u)
     else:
@@ -65,7 +66,7 @@ def tracking_chain(
         t1=20.0,
         observe=_observe_points if rigid else _observe,
         description="Three masses held to a desired motion by the least control force (Kalaba and Udwadia).",
-        references=_REFERENCES,
+        references=References.load("tracking_chain"),
     )
 
 
@@ -107,7 +108,7 @@ def _wrenches(poses, velocities, t, p):
 
 def _observe(trajectory):
     force = trajectory.constraint_forces["track"]
-    return observe_coordinates(trajectory) | {"force1": force[:, 0], "force3": force[:, 2]}
+    return lagrangian_coordinates(trajectory) | {"force1": force[:, 0], "force3": force[:, 2]}
 
 
 def _observe_points(trajectory):
@@ -116,14 +117,3 @@ def _observe_points(trajectory):
     # The program's rows are of q1 and of q3 − q1.
     first, second = trajectory.reactions["track"].multipliers.T
     return places | rates | {"force1": first - second, "force3": second}
-
-
-_REFERENCES = References(
-    times=np.array([20.0]),
-    labels=("q1", "q2", "q3", "force1", "force3"),
-    values=np.array(
-        [[0.5 * np.sin(20.0), 0.3463702111, 0.5 * np.sin(20.0) + 0.2 * np.cos(40.0), 7.88958994, 0.27118949]]
-    ),
-    source="DOP853 at 1e-12 on the equation of Kalaba and Udwadia; q1 and q3 are the desired motion",
-    tolerance=1e-8,
-)

@@ -14,6 +14,7 @@ from ..parts.base import AbstractForce
 from ..parts.fields import as_jax, as_parameter
 from ..parts.forces import Gravity
 from ..parts.functions import Force
+from ..parts.smooth import step
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 
@@ -49,8 +50,8 @@ def train(
     vehicle are applied when the pressure wave arrives from the head of the train, and rise to their force in
     `brake_rise`.
 
-    Tolerances are relative to places along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
-    coupler. Long trains want smaller ones, or `longitudinal_train`.
+    Tolerances are relative to positions along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
+    coupler. Use smaller ones for long trains, or `longitudinal_train`.
 
     Source: after V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974; the numbers
     are those of a loaded four-axle wagon, with a generic friction draft gear.
@@ -58,7 +59,7 @@ def train(
     **Arguments:**
 
     - `n` ≥ 1, the number of vehicles.
-    - `coupler(name, front, rear, point_a=, point_b=)`: makes the part that couples two vehicles: a force
+    - `coupler(name, front, rear, point_a=, point_b=)`: returns the part that couples two vehicles: a force
         (`planar.DraftGear`, `functools.partial(planar.DraftGear, slack=0.0)`, …) or a joint (`planar.Revolute`, a
         hinge; `planar.Distance`, a drawbar).
     - `coupler_length` [m], the distance of the coupled points at the start; default 0 for hinges, otherwise 1.
@@ -88,7 +89,7 @@ def train(
         planar.Body(name, mass=m, inertia=j, position=(x, 0.0), velocity=(v, 0.0))
         for name, m, j, x, v in zip(names, mass, inertia, place, speed, strict=True)
     ]
-    # Numbers that all vehicles share are made arrays once.
+    # Numbers that all vehicles share are converted only once.
     shared = lambda kind, **numbers: {name: kind(value) for name, value in numbers.items()}
     ends = shared(as_parameter, point_a=(-reach, coupler_height), point_b=(reach, coupler_height))
     couplers = [
@@ -140,7 +141,7 @@ def train(
         t1=t1,
         observe=_observe,
         description=f"Emergency stop of a train of {n} vehicles with pitch, brakes applied by a pressure wave.",
-        references=_REFERENCES,
+        references=References.load("train"),
     )
 
 
@@ -178,8 +179,7 @@ def running_resistance(v, p):
 
 def braking(t, v, p):
     """The force [N] of the brakes at a time [s] and speed [m/s]."""
-    z = jnp.clip((t - p["start"]) / p["rise"], 0.0, 1.0)
-    return -p["force"] * z**3 * (10 + z * (6 * z - 15)) * jnp.tanh(v / p["transition"])
+    return -p["force"] * step((t - p["start"]) / p["rise"]) * jnp.tanh(v / p["transition"])
 
 
 def _resistance(poses, velocities, t, p):
@@ -222,41 +222,3 @@ def coupler_forces(trajectory) -> jax.Array:
     if not system.constraints:
         return jax.vmap(of_forces)(trajectory.ts, trajectory.ys)
     return jax.vmap(of_joints)(trajectory.ts, trajectory.ys, trajectory.multipliers)
-
-
-_REFERENCES = References(
-    times=np.array([1.5, 3.0]),
-    labels=("x1", "x2", "x3", "x4", "v1", "v2", "v3", "v4", "F1", "F2", "F3"),
-    values=np.array(
-        [
-            [
-                29.78037966932884,
-                16.800980252322272,
-                3.8229695058378783,
-                -9.154651471363259,
-                19.50245217687066,
-                19.503465603910513,
-                19.507037195314105,
-                19.54664822257675,
-                -30769.22806862605,
-                -54466.8481449641,
-                -73931.87715905337,
-            ],
-            [
-                57.976985447012595,
-                44.97857503589924,
-                31.96407089156402,
-                18.945804813151657,
-                18.033800731617703,
-                18.02005237265511,
-                17.993587524172142,
-                17.96568420258797,
-                0.0,
-                0.0,
-                1386.2401575324104,
-            ],
-        ]
-    ),
-    source="equations of its own in NumPy, Runge-Kutta of order 8 with steps below a millisecond",
-    tolerance=1e-10,
-)

@@ -67,7 +67,7 @@ class AbstractPart(eqx.Module):
     def with_fields(self, **values: Any) -> Self:
         """The same part with other values in some fields."""
         out = object.__new__(type(self))
-        for field in self.__dataclass_fields__:
+        for field in fields.field_names(type(self)):
             object.__setattr__(out, field, values[field] if field in values else getattr(self, field))
         return out
 
@@ -105,11 +105,11 @@ class AbstractBody(AbstractPart):
         return self.dimensions[0]
 
     @abc.abstractmethod
-    def pose(self) -> Float[np.ndarray, "p"]:
-        """The pose that it is given with; the position alone for a body that does not rotate."""
+    def pose(self) -> Any:
+        """The pose that it is given with, a vector; the position alone for a body that does not rotate."""
 
     @abc.abstractmethod
-    def velocities(self) -> Float[np.ndarray, "v"]:
+    def velocities(self) -> Any:
         """The velocity that it is given with, in the same way."""
 
 
@@ -189,9 +189,9 @@ class AbstractJoint(AbstractPair, AbstractConstraint):
     (`point`), [m].
     """
 
-    point_a: Float[Array, "d"] = fields.point(body=0, optional=True)
-    point_b: Float[Array, "d"] = fields.point(body=1, optional=True)
-    point: Float[Array, "d"] = fields.point(body=None, gives=("point_a", "point_b"))
+    point_a: fields.Number = fields.point(body=0, optional=True)
+    point_b: fields.Number = fields.point(body=1, optional=True)
+    point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
     rheonomic: ClassVar[bool] = False
 
 
@@ -307,8 +307,10 @@ def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
         raise ValueError(f"{part.label}: give {listed} (body-fixed), or {world} (world).")
 
 
-def rows_of(part: AbstractConstraint | AbstractVelocityConstraint, space: AbstractSpace, poses: Poses) -> Array:
-    """Derivative of a constraint's rows with respect to the velocities of its bodies, (rows, k, velocity size)."""
+def rows_of(part: Any, space: AbstractSpace, poses: Poses) -> Array:
+    """Derivative of the rows of a constraint, between positions or velocities, with respect to the velocities of its
+    bodies, (rows, k, velocity size).
+    """
     velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
     if isinstance(part, AbstractVelocityConstraint):
         return jax.jacfwd(lambda v: part.residual(space, poses, v, jnp.zeros((), poses.dtype)))(velocities)

@@ -5,7 +5,6 @@ the deeper the body is in it, the harder it pushes, so contact adds no constrain
 """
 
 import abc
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +30,7 @@ class AbstractNormalLaw(AbstractLaw):
 
     @abc.abstractmethod
     def energy(self, depth: Number) -> Number:
-        """The work [J] that was done against it from no depth on."""
+        """Elastic energy [J] stored at a depth [m] > 0."""
 
 
 class Linear(AbstractNormalLaw):
@@ -40,7 +39,7 @@ class Linear(AbstractNormalLaw):
     **Arguments:** `stiffness` [N/m].
     """
 
-    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth
@@ -56,7 +55,7 @@ class Hertz(AbstractNormalLaw):
     `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
     """
 
-    stiffness: Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth**1.5
@@ -68,7 +67,7 @@ class Hertz(AbstractNormalLaw):
 class Bekker(AbstractNormalLaw):
     """Bekker's pressure and sinkage of soil, `area (cohesive_modulus / width + frictional_modulus) depth^exponent`.
 
-    The soil springs back: a rut stays where there is none to remember it.
+    Unloading follows the loading curve; permanent sinkage is not modelled.
 
     Source: M. G. Bekker, "Introduction to Terrain-Vehicle Systems", University of Michigan Press 1969.
 
@@ -76,11 +75,11 @@ class Bekker(AbstractNormalLaw):
     `width` b [m], the smaller side of the patch that presses; `area` [m²] of it.
     """
 
-    cohesive_modulus: Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
-    frictional_modulus: Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
-    exponent: Number = fields.parameter(sign="positive")
-    width: Number = fields.parameter(unit="m", sign="positive")
-    area: Number = fields.parameter(unit="m²", sign="positive")
+    cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
+    frictional_modulus: fields.Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
+    exponent: fields.Number = fields.parameter(sign="positive")
+    width: fields.Number = fields.parameter(unit="m", sign="positive")
+    area: fields.Number = fields.parameter(unit="m²", sign="positive")
 
     def force(self, depth):
         return self.area * (self.cohesive_modulus / self.width + self.frictional_modulus) * depth**self.exponent
@@ -106,11 +105,11 @@ class Coulomb(AbstractFrictionLaw):
 
     A body at rest on a slope creeps, the slower the smaller `transition_speed` is.
 
-    **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, of slip, where 76 % of the friction is there.
+    **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
 
-    coefficient: Number = fields.parameter(sign="non-negative", kw_only=False)
-    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
+    coefficient: fields.Number = fields.parameter(sign="non-negative", kw_only=False)
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         del engaged, travel
@@ -126,8 +125,8 @@ class Janosi(AbstractFrictionLaw):
     """Shear of soil by Janosi and Hanamoto, `τ = (c + p tan φ) (1 − exp(−j/K))`, under a patch along which the shear
     displacement j grows evenly to slip ratio times length.
 
-    The slip ratio is slip over the speed of travel or of the turning circumference, whichever is larger; below
-    `transition_speed` they are not told from zero.
+    The slip ratio is slip over the speed of travel or of the turning circumference, whichever is larger; speeds below
+    `transition_speed` are regularised.
 
     Source: Z. Janosi and B. Hanamoto, "The analytical determination of drawbar pull as a function of slip for tracked
     vehicles in deformable soils", 1st ISTVS Conference, Torino 1961.
@@ -136,12 +135,12 @@ class Janosi(AbstractFrictionLaw):
     `length` [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
     """
 
-    cohesion: Number = fields.parameter(unit="Pa", sign="non-negative")
-    friction_angle: Number = fields.parameter(unit="rad", sign="non-negative")
-    shear_modulus: Number = fields.parameter(unit="m", sign="positive")
-    length: Number = fields.parameter(unit="m", sign="positive")
-    area: Number = fields.parameter(unit="m²", sign="positive")
-    transition_speed: Number = fields.parameter(unit="m/s", sign="positive")
+    cohesion: fields.Number = fields.parameter(unit="Pa", sign="non-negative")
+    friction_angle: fields.Number = fields.parameter(unit="rad", sign="non-negative")
+    shear_modulus: fields.Number = fields.parameter(unit="m", sign="positive")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    area: fields.Number = fields.parameter(unit="m²", sign="positive")
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):
         strength = self.cohesion * self.area * engaged + load * jnp.tan(self.friction_angle)
@@ -156,41 +155,35 @@ class Janosi(AbstractFrictionLaw):
         return -strength * scale * jnp.where(small, series, (other + jnp.expm1(-other)) / other**2) * slip
 
 
-class Contact(AbstractPotentialForce):
-    """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
-
-    The depth δ of a body in the ground is smoothed, `½ (d + √(d² + smoothing²))` for a distance d below it, and has a
-    potential, the energy of `normal`. To its force come damping against the velocity across the ground,
-    `damping onset(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body leaves.
-
-    **Arguments:**
-
-    - `bodies`: one name or several, with one terrain, one law and so one set of parameters for all of them.
-    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
-    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
-    - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
-    - `points` [m], the centres, body-fixed, shape (d,) or (bodies, d), default the mass centres.
-    - `damping` [N s/m] ≥ 0; `damping_depth` [m] > 0, from which on it is all there; `onset`: its way there, `"smooth"`
-        with two continuous derivatives or `"linear"`.
-    - `smoothing` [m] > 0. Far above the ground it leaves a depth of `smoothing² / (4 |d|)`.
-    - `depth`: `"normal"` to the terrain, exact on even ground and to first order in its curvature, or `"vertical"` for
-        small slopes: depth and damping along the vertical, friction along the horizontal.
+class AbstractContact(AbstractPotentialForce):
+    """The base of contacts with one terrain: how a body's distance from the ground is measured, and how damping sets
+    in, is left to `distance`, `outward` and `onset`. Its fields are those of `Contact`.
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
+    bodies: fields.Names = fields.body_names()
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     friction: AbstractFrictionLaw | None = fields.law(
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
-    radius: Float[Array, "*n"] = fields.length(shape=None, sign="non-negative", default=0.0)
-    points: Float[Array, "*n d"] = fields.parameter(shape=None, unit="m", optional=True)
-    damping: Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    damping_depth: Number = fields.parameter(unit="m", sign="positive", default=0.01)
-    smoothing: Number = fields.parameter(unit="m", sign="positive", default=1e-3)
-    onset: Literal["smooth", "linear"] = fields.choice("smooth", "linear", default="smooth")
-    depth: Literal["normal", "vertical"] = fields.choice("normal", "vertical", default="normal")
+    radius: fields.Number = fields.length(shape=None, sign="non-negative", default=0.0)
+    points: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+
+    @abc.abstractmethod
+    def distance(self, centre: Vector) -> Number:
+        """Distance [m] of a point above the ground."""
+
+    @abc.abstractmethod
+    def outward(self, centre: Vector) -> Vector:
+        """Unit vector out of the ground below a point."""
+
+    @abc.abstractmethod
+    def onset(self, depth: Number) -> Number:
+        """The share of the damping, from 0 to 1, at a depth relative to `damping_depth`."""
 
     def complete(self, space, poses):
         part, n, d = self.filled(points=np.zeros(space.dimension)), len(self.bodies), space.dimension
@@ -215,30 +208,16 @@ class Contact(AbstractPotentialForce):
 
     def _depth(self, centre, radius):
         """Depth of the lowest point of a body, smoothed."""
-        above = centre[-1] - self.terrain.height(centre[:-1])
-        if self.depth == "normal":
-            slope = jax.grad(self.terrain.height)(centre[:-1])
-            above = above / jnp.sqrt(1 + jnp.dot(slope, slope))
-        return ramp(radius - above, self.smoothing)
-
-    def _normal(self, centre):
-        """The direction out of the ground."""
-        up = jnp.zeros_like(centre).at[-1].set(1.0)
-        if self.depth == "vertical":
-            return up
-        slope = jax.grad(self.terrain.height)(centre[:-1])
-        return up.at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
+        return ramp(radius - self.distance(centre), self.smoothing)
 
     def _wrench(self, space, pose, velocity, point, radius):
         centre, travel = space.point(pose, point), space.point_velocity(pose, velocity, point)
         depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
-        load, normal = self.normal.force(depth), self._normal(centre)
-        engaged = depth / self.damping_depth
-        engaged = step(engaged) if self.onset == "smooth" else jnp.clip(engaged, 0.0, 1.0)
-        # Centre and lowest point are the same to a normal force.
-        wrench = space.point_force(
-            pose, point, -load * gradient - self.damping * engaged * jnp.dot(travel, normal) * normal
-        )
+        load, normal = self.normal.force(depth), self.outward(centre)
+        engaged = self.onset(depth / self.damping_depth)
+        # A normal force has the same wrench in the centre as in the lowest point.
+        resistance = self.damping * engaged * jnp.dot(travel, normal)
+        wrench = space.point_force(pose, point, -load * gradient - resistance * normal)
         if self.friction is None:
             return wrench
         lowest = space.body_point(pose, centre - radius * normal)
@@ -246,3 +225,36 @@ class Contact(AbstractPotentialForce):
         slip = along(space.point_velocity(pose, velocity, lowest))
         friction = self.friction.force(load, engaged, slip, along(travel))
         return wrench + space.point_force(pose, lowest, friction)
+
+
+class Contact(AbstractContact):
+    """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
+
+    The depth δ of a body in the ground is smoothed, `½ (d + √(d² + smoothing²))` for a distance d below it, and has a
+    potential, the energy of `normal`. To its force are added damping against the velocity normal to the ground,
+    `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body leaves.
+
+    The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the step has two
+    continuous derivatives.
+
+    **Arguments:**
+
+    - `bodies`: one name or several, with one terrain, one law and so one set of parameters for all of them.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
+    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
+    - `points` [m], the centres, body-fixed, shape (d,) or (bodies, d), default the mass centres.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth at which it is complete.
+    - `smoothing` [m] > 0. Far above the ground it leaves a depth of `smoothing² / (4 |d|)`.
+    """
+
+    def distance(self, centre):
+        slope = jax.grad(self.terrain.height)(centre[:-1])
+        return (centre[-1] - self.terrain.height(centre[:-1])) / jnp.sqrt(1 + jnp.dot(slope, slope))
+
+    def outward(self, centre):
+        slope = jax.grad(self.terrain.height)(centre[:-1])
+        return jnp.ones_like(centre).at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
+
+    def onset(self, depth):
+        return step(depth)

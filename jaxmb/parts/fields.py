@@ -17,7 +17,7 @@ positive, and pictures and reactions take from it where a part acts.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -26,6 +26,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ..linalg.arrays import as_array, is_traced
+
+# The types of fields. A number may be given as anything that NumPy makes an array of, and is held as an array; type
+# checkers do not know the converters of these helpers.
+if TYPE_CHECKING:
+    Number = Numbers = Names = Any
+else:
+    Number, Numbers, Names = Array, dict[str, Array], tuple[str, ...]
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d"]
@@ -80,6 +87,12 @@ def declarations(cls: type) -> dict[str, Declaration]:
     """The declared fields of a class, in their order."""
     fields = dataclasses.fields(cls)
     return {field.name: field.metadata["declaration"] for field in fields if "declaration" in field.metadata}
+
+
+@functools.cache
+def field_names(cls: type) -> tuple[str, ...]:
+    """The names of all fields of a class, declared or not."""
+    return tuple(field.name for field in dataclasses.fields(cls))
 
 
 # Conversion
@@ -367,7 +380,7 @@ def anonymous(part: Any) -> Any:
     """The part without the names that tell it from its siblings, and without the state that bodies are given with."""
     declared = declarations(type(part))
     out = object.__new__(type(part))
-    for field in part.__dataclass_fields__:
+    for field in field_names(type(part)):
         value, kind = getattr(part, field), declared[field].kind if field in declared else None
         if kind in ("identity", "body"):
             value = ""
@@ -386,7 +399,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Sign | 
     dictionaries, as users call it, and its sign.
     """
     declared = declarations(type(part))
-    for field in part.__dataclass_fields__:
+    for field in field_names(type(part)):
         own = declared.get(field)
         if own is None or own.kind != "state":
             yield from _paths(getattr(part, field), (field,), (field,), None if own is None else own.sign)

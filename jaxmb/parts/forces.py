@@ -5,7 +5,6 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
@@ -19,7 +18,7 @@ class Gravity(AbstractPart):
     **Arguments:** `acceleration` [m/s²], shape (2,) in a planar scene and (3,) in a spatial one, in world axes.
     """
 
-    acceleration: Float[Array, "d"] = fields.parameter(shape=("d",), unit="m/s²", kw_only=False)
+    acceleration: fields.Number = fields.parameter(shape=("d",), unit="m/s²", kw_only=False)
     name: str = eqx.field(static=True, default="gravity", kw_only=True)
 
 
@@ -46,11 +45,11 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     given poses; `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative")
-    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    free_length: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
-    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
+    point_a: fields.Number = fields.point(body=0, default="mass centre")
+    point_b: fields.Number = fields.point(body=1, default="mass centre")
 
     def complete(self, space, poses):
         return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
@@ -78,9 +77,9 @@ class Damper(AbstractPair, AbstractForce):
     **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the mass centres.
     """
 
-    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative")
-    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
-    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative")
+    point_a: fields.Number = fields.point(body=0, default="mass centre")
+    point_b: fields.Number = fields.point(body=1, default="mass centre")
 
     def wrenches(self, space, poses, velocities, t):
         rate = separation_rate(space, self, poses, velocities)
@@ -96,8 +95,8 @@ class PointForce(AbstractForce):
 
     name: str = fields.name()
     body: str = fields.body_name()
-    force: Float[Array, "d"] = fields.parameter(shape=("d",), unit="N")
-    point: Float[Array, "d"] = fields.point(body=0, default="mass centre")
+    force: fields.Number = fields.parameter(shape=("d",), unit="N")
+    point: fields.Number = fields.point(body=0, default="mass centre")
     frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
 
     def wrenches(self, space, poses, velocities, t):

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
@@ -34,10 +33,10 @@ class Friction(AbstractNonIdeal):
 
     name: str = fields.name()
     joint: str = fields.name()
-    coefficient: Float[Array, ""] = fields.parameter(sign="non-negative")
-    radius: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", default=0.0)
-    point: Float[Array, "d"] = fields.point(body=None, optional=True)
-    smoothing: Float[Array, ""] = fields.parameter(unit="m/s", sign="positive", default=1e-4)
+    coefficient: fields.Number = fields.parameter(sign="non-negative")
+    radius: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.0)
+    point: fields.Number = fields.point(body=None, optional=True)
+    smoothing: fields.Number = fields.parameter(unit="m/s", sign="positive", default=1e-4)
 
     def complete(self, space, joint, poses):
         k = poses.shape[0] - 1

@@ -35,10 +35,10 @@ class Constraint(AbstractConstraint):
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
+    bodies: fields.Names = fields.body_names()
     function: Callable[..., Array] = fields.function()
     rows: int = eqx.field(static=True, default=1, kw_only=True)
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
     rheonomic: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def residual(self, space, poses, t):
@@ -55,10 +55,10 @@ class VelocityConstraint(AbstractVelocityConstraint):
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
+    bodies: fields.Names = fields.body_names()
     function: Callable[..., Array] = fields.function()
     rows: int = eqx.field(static=True, default=1, kw_only=True)
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
     linear: bool = eqx.field(static=True, default=False, kw_only=True)
     homogeneous: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -81,9 +81,9 @@ class Force(AbstractPotentialForce):
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
+    bodies: fields.Names = fields.body_names()
     function: Callable[..., Array] = fields.function()
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
     potential: Callable[..., Array] | None = fields.function(default=None, kw_only=True)
 
     @property
@@ -119,7 +119,7 @@ class NonIdeal(AbstractNonIdeal):
     name: str = fields.name()
     joint: str = fields.name()
     function: Callable[..., Array] = fields.function()
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
 
     def wrenches(self, space, poses, velocities, reactions, t):
         value = self.function(poses[:, : space.pose_size], velocities, reactions, t, self.parameters)

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from jaxtyping import Array, Float
-
 from . import fields
 from .base import AbstractConstraint, AbstractLink
 
@@ -25,8 +23,8 @@ class Servo(AbstractLink):
     program: Any = fields.law(
         AbstractConstraint, what="a constraint between positions, such as a Driver", kw_only=False
     )
-    damping: Float[Array, ""] = fields.parameter(unit="1/s", sign="non-negative", default=0.0, kw_only=False)
-    stiffness: Float[Array, ""] = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
+    damping: fields.Number = fields.parameter(unit="1/s", sign="non-negative", default=0.0, kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
 
     def __check_init__(self):
         taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))

@@ -15,5 +15,9 @@ def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
 
 def step(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """From 0 at s ≤ 0 to 1 at s ≥ 1 with two continuous derivatives."""
-    s = jnp.clip(s, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
+    return quintic(jnp.clip(s, 0.0, 1.0))
+
+
+def quintic(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The polynomial of degree five from 0 to 1 on [0, 1], whose first two derivatives vanish at both ends."""
+    return s**3 * (10 + s * (6 * s - 15))

@@ -1,7 +1,7 @@
 """Terrains: heights as smooth functions of the place, for contacts with the ground.
 
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
-where z is up. Terrains that are profiles along x go on unchanged across it, so they serve in both.
+where z is up. A profile along x is constant across it, so that it can be used in both.
 """
 
 import abc
@@ -40,21 +40,21 @@ class Flat(AbstractTerrain):
     **Arguments:** `level` [m].
     """
 
-    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0, kw_only=False)
+    level: fields.Number = fields.parameter(unit="m", default=0.0, kw_only=False)
 
     def height(self, place):
         return self.level
 
 
 class Bump(AbstractTerrain):
-    """A single bump, `peak sin²(π s)` with `s = (x − start) / length` in (0, 1); C¹, and smooth but at its ends.
+    """A single bump, `peak sin²(π s)` with `s = (x − start) / length` in (0, 1); C¹, and smooth except at its ends.
 
     **Arguments:** `start` [m], where it begins; `length` [m] > 0; `peak` [m], its height, negative for a ditch.
     """
 
-    start: Float[Array, ""] = fields.parameter(unit="m")
-    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    peak: Float[Array, ""] = fields.parameter(unit="m")
+    start: fields.Number = fields.parameter(unit="m")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    peak: fields.Number = fields.parameter(unit="m")
 
     def height(self, place):
         s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
@@ -67,9 +67,9 @@ class Sinusoid(AbstractTerrain):
     **Arguments:** `amplitude` [m]; `wavelength` [m] > 0; `phase` [rad].
     """
 
-    amplitude: Float[Array, ""] = fields.parameter(unit="m")
-    wavelength: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    phase: Float[Array, ""] = fields.parameter(unit="rad", default=0.0)
+    amplitude: fields.Number = fields.parameter(unit="m")
+    wavelength: fields.Number = fields.parameter(unit="m", sign="positive")
+    phase: fields.Number = fields.parameter(unit="rad", default=0.0)
 
     def height(self, place):
         return self.amplitude * jnp.sin(2 * jnp.pi * place[0] / self.wavelength + self.phase)
@@ -81,30 +81,30 @@ class Slope(AbstractTerrain):
     **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.
     """
 
-    gradient: Float[Array, ""] = fields.parameter(unit="m/m", kw_only=False)
-    level: Float[Array, ""] = fields.parameter(unit="m", default=0.0)
+    gradient: fields.Number = fields.parameter(unit="m/m", kw_only=False)
+    level: fields.Number = fields.parameter(unit="m", default=0.0)
 
     def height(self, place):
         return self.level + self.gradient * place[0]
 
 
 class Ramp(AbstractTerrain):
-    """A way up from one level to another, a polynomial of degree five with level, straight ends; C².
+    """A transition between two levels, by a polynomial of degree five; C².
 
-    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `rise` [m], negative for a way down; its steepest
+    **Arguments:** `start` [m], where it begins; `length` [m] > 0; `rise` [m], negative for a descent; its steepest
     gradient is `1.875 rise / length`, in the middle.
     """
 
-    start: Float[Array, ""] = fields.parameter(unit="m")
-    length: Float[Array, ""] = fields.parameter(unit="m", sign="positive")
-    rise: Float[Array, ""] = fields.parameter(unit="m")
+    start: fields.Number = fields.parameter(unit="m")
+    length: fields.Number = fields.parameter(unit="m", sign="positive")
+    rise: fields.Number = fields.parameter(unit="m")
 
     def height(self, place):
         return self.rise * step((place[0] - self.start) / self.length)
 
 
 class Spline(AbstractTerrain):
-    """A profile through measured points; C², and in every place a function of the four nearest points alone.
+    """A profile through measured points; C², and local: a height depends on the four nearest points only.
 
     Between two points a polynomial of degree five, whose slopes and curvatures at the points are those of the parabolas
     through a point and its two neighbours. Beyond the first and the last point it goes on straight.
@@ -112,8 +112,8 @@ class Spline(AbstractTerrain):
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """
 
-    x: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
-    heights: Float[Array, "n"] = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
+    x: fields.Number = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
+    heights: fields.Number = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
 
     def __check_init__(self):
         if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:
@@ -130,7 +130,7 @@ class Spline(AbstractTerrain):
         k = jnp.clip(jnp.searchsorted(self.x, x, side="right") - 1, 0, n - 2)
         h = self.x[k + 1] - self.x[k]
         (y0, m0, c0), (y1, m1, c1) = self._at_point(k), self._at_point(k + 1)
-        # What the straight line through both points leaves over, from slopes and curvatures at either.
+        # The difference from the straight line through both points, from slopes and curvatures at either.
         chord = (y1 - y0) / h
         a, b = (m0 - chord) * h, (chord - m1) * h
         c, d = 0.5 * c0 * h * h, 0.5 * c1 * h * h
@@ -168,7 +168,7 @@ class Surface(AbstractTerrain):
     """
 
     function: Callable[[Place, dict[str, Array]], Float[Array, ""]] = fields.function()
-    parameters: dict[str, Array] = fields.numbers()
+    parameters: fields.Numbers = fields.numbers()
 
     def height(self, place):
         return jnp.reshape(self.function(place, self.parameters), ())

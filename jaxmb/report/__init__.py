@@ -1,7 +1,7 @@
-"""What accuracy costs: error against run time and evaluations; what formulations do, and whole ways of integrating."""
+"""Reports: error against run time and evaluations, the costs of formulations, and those of integration methods."""
 
 from .formulations import (
-    Cost as Cost,
+    FormulationCost as FormulationCost,
     FormulationCosts as FormulationCosts,
     every_formulation as every_formulation,
     formulation_costs as formulation_costs,

@@ -1,20 +1,21 @@
-"""How often a run evaluated the accelerations."""
+"""The number of evaluations of the accelerations in a run."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import diffrax
 
-# Of `MultistepController`, to choose the first step.
+# Evaluations by which `MultistepController` chooses the first step.
 _FIRST_STEP = 2
 
 
 def evaluations(solver: diffrax.AbstractSolver, stats: Mapping[str, Any]) -> int | None:
-    """Evaluations of the vector field in a run with adaptive steps and a first step of its own choosing.
+    """Evaluations of the vector field in a run with adaptive steps whose first step the controller chooses.
 
-    Rejected steps count like accepted ones. A Runge–Kutta method whose first stage is the last of the step before
-    evaluates it once; evaluations to choose the first step, and again of its first stage if it is rejected, are left
-    out for these, which flatters them by one or two. None for solvers that iterate, which count nothing.
+    Rejected steps count like accepted ones. The first stage of a Runge–Kutta method that is the last stage of the
+    previous step counts once. Evaluations that choose the first step of these methods, and those repeated if it is
+    rejected, are not counted, which favours them by one or two. None for implicit Runge–Kutta methods, which do not
+    report their iterations.
     """
     if "num_evaluations" in stats:
         return int(stats["num_evaluations"]) + _FIRST_STEP

@@ -1,4 +1,4 @@
-"""What the roads to accelerations cost, side by side on one mechanism."""
+"""The cost of the formulations, side by side on one mechanism."""
 
 import dataclasses
 import functools
@@ -13,18 +13,19 @@ from jax import lax
 
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import every_row, solve_constrained, stages
-from ..linalg.elimination import Order, factor, full_pivot
+from ..formulations.formulation import row_levels, solve_constrained
+from ..linalg.elimination import PivotOrder, eliminate, full_pivot
+from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
 from .timing import interleaved
 
-# So many evaluations after each other are one timed run.
+# Consecutive evaluations in one timed run.
 _LENGTH = 200
 
 
 def every_formulation() -> dict[str, AbstractFormulation]:
-    """All of them, with their options, by name."""
+    """All formulations and their options, by name."""
     return {
         "Partitioned": Partitioned(),
         "Multipliers": Multipliers(),
@@ -37,13 +38,13 @@ def every_formulation() -> dict[str, AbstractFormulation]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Cost:
-    """One formulation.
+class FormulationCost:
+    """The cost of one formulation.
 
-    **Fields:** times of one evaluation of all accelerations, with the Jacobian and its factor in a given order [s]:
-    `evaluation`, `forward` with its derivative along one direction, `reverse` with its gradient; `lines` of HLO of the
-    three, before XLA optimises; `deviation` of the accelerations from those of the first formulation, relative to the
-    largest.
+    **Fields:** times [s] of one evaluation of all accelerations, including the Jacobian and its elimination in a given
+    pivot order: `evaluation`, `forward` with the derivative along one direction, `reverse` with the gradient; `lines`
+    of HLO of the three, before XLA optimises; `deviation` of the accelerations from those of the first formulation,
+    relative to the largest acceleration.
     """
 
     formulation: str
@@ -56,10 +57,10 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class FormulationCosts:
-    """What `formulation_costs` returns; `print` shows a table."""
+    """The result of `formulation_costs`; `print` shows a table."""
 
     mechanism: str
-    costs: tuple[Cost, ...]
+    costs: tuple[FormulationCost, ...]
 
     def __str__(self) -> str:
         head = (
@@ -75,14 +76,14 @@ class FormulationCosts:
         rows = [head, *map(_cells, self.costs)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-        return "\n".join([f"{self.mechanism}: accelerations at its start, by every formulation", *map(text, rows)])
+        return "\n".join([f"{self.mechanism}: accelerations at the start, by formulation", *map(text, rows)])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, for JSON."""
         return dataclasses.asdict(self)
 
 
-def _cells(cost: Cost) -> tuple[str, ...]:
+def _cells(cost: FormulationCost) -> tuple[str, ...]:
     times = (f"{1e6 * time:.2f}" for time in (cost.evaluation, cost.forward, cost.reverse))
     return (cost.formulation, *times, *map(str, cost.lines), f"{cost.deviation:.0e}")
 
@@ -90,30 +91,32 @@ def _cells(cost: Cost) -> tuple[str, ...]:
 def formulation_costs(
     mechanism: Mechanism, formulations: Mapping[str, AbstractFormulation] | None = None, *, repeats: int = 5
 ) -> FormulationCosts:
-    """Time accelerations by several formulations, and their derivatives with respect to the state.
+    """Time the accelerations by several formulations, and their derivatives with respect to the state.
 
-    Each evaluation depends on the one before, as in a motion, and eliminates in the order of one chart; those of all
+    Each evaluation depends on the previous one, as in a motion, and eliminates in the pivot order of one chart. The
     formulations are timed in turns.
 
     **Arguments:** `formulations` by name, default all that the mechanism's mass matrix allows; `repeats`: timed runs of
     each, of which the shortest counts.
 
-    **Raises:** `ValueError` for a mechanism without constraints, where there is nothing to choose.
+    **Raises:** `ValueError` for a mechanism without constraints, where all formulations are the same.
     """
     system, state = mechanism.system, mechanism.state
     if system.acceleration_rows == 0:
         raise ValueError(f"{mechanism.name!r} has no constraints: its accelerations are M⁻¹F by any formulation.")
     every = every_formulation() if formulations is None else dict(formulations)
-    chosen = {name: road for name, road in every.items() if system.positive_definite_mass or not road.inverts_mass}
+    chosen = {name: f for name, f in every.items() if system.positive_definite_mass or not f.inverts_mass}
     if not chosen:
-        raise ValueError(f"The mass matrix of {mechanism.name!r} is singular; no formulation was given that allows it.")
-    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), stage=stages(system))
+        raise ValueError(
+            f"The mass matrix of {mechanism.name!r} is singular; give a formulation for it, such as NullSpace()."
+        )
+    pivots = full_pivot(system.jacobian(0.0, state.q, state.u), scale=system.velocity_scale(), level=row_levels(system))
 
     modes = (_evaluated, _forward, _reverse)
     lines: dict[str, tuple[int, int, int]] = {}
     runs, accelerations = [], {}
-    for name, road in chosen.items():
-        solve = lambda y, road=road: _accelerations(system, road, y, pivots.order)
+    for name, formulation in chosen.items():
+        solve = lambda y, formulation=formulation: _accelerations(system, formulation, y, pivots.order)
         accelerations[name] = np.asarray(eqx.filter_jit(solve)(state))
         programs = [mode(solve) for mode in modes]
         value, forward, reverse = (len(jax.jit(p).lower(state).as_text().splitlines()) for p in programs)
@@ -126,18 +129,17 @@ def formulation_costs(
     for k, name in enumerate(chosen):
         deviation = float(np.max(np.abs(accelerations[name] - first))) / size
         evaluation, forward, reverse = times[3 * k : 3 * k + 3]
-        costs.append(Cost(name, evaluation, forward, reverse, lines[name], deviation))
+        costs.append(FormulationCost(name, evaluation, forward, reverse, lines[name], deviation))
     return FormulationCosts(mechanism.name, tuple(costs))
 
 
-def _accelerations(system: AbstractSystem, road: AbstractFormulation, y: State, order: Order):
+def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
     t = jnp.zeros((), y.q.dtype)
-    jacobian = system.jacobian(t, y.q, y.u)
-    if road.partitions or system.acceleration_rank < system.acceleration_rows:
-        split = factor(jacobian, order, system.acceleration_rank)
-    else:
-        split = every_row(system.acceleration_rows, system.nu, y.q.dtype)
-    return solve_constrained(system, road, t, y.q, y.u, jacobian, split)[0]
+    jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
+    if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
+        matrix = jacobian.dense().matrix
+        jacobian = DenseJacobian(matrix, eliminate(matrix, order, system.acceleration_rank))
+    return solve_constrained(system, formulation, t, y.q, y.u, jacobian)[0]
 
 
 def _evaluated(solve: Callable[[State], Any]):
@@ -153,7 +155,7 @@ def _reverse(solve: Callable[[State], Any]):
 
 
 def _repeated(program: Callable[[State], Any]):
-    """So many times, each from a state that the result before has moved by less than rounding shows."""
+    """Consecutive runs, each from a state that depends on the previous result by less than round-off."""
 
     def step(_, y):
         moved = sum(jnp.sum(x) for x in jax.tree.leaves(program(y)))

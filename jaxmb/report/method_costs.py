@@ -1,4 +1,4 @@
-"""What whole ways of integrating a constrained motion cost at equal error: in evaluations, linear algebra, and time."""
+"""The cost of methods of integrating a constrained motion at equal error: evaluations, linear algebra, and time."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,20 +25,20 @@ from .timing import interleaved
 
 ERRORS = (1e-3, 1e-5, 1e-7)
 
-# Tolerances are tried from the first on, some to a decade, until the error is small enough.
+# Tolerances, tried in this order until the error is small enough.
 _TOLERANCES = 10.0 ** -np.arange(2.5, 12.0, 0.5)
-# Of Baumgarte's stabilisation [1/s].
+# Rate of Baumgarte's stabilisation [1/s].
 _RATE = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class MethodCost:
-    """One method, with the coarsest tolerance that meets a bound of the error.
+    """The cost of one method at the coarsest tolerance that meets a bound on the error.
 
-    **Fields:** `method`; `bound` and `error`, the largest relative error of what the mechanism observes at the end;
-    `rtol`; `evaluations` of the accelerations, or of the residual of implicit equations; `matrices` made for Newton's
-    method; `flops` of linear algebra, in full matrices; `time` [s] of a warm run. NaN and zeros where no tolerance
-    meets the bound.
+    **Fields:** `method`; `bound` and `error`, the largest relative error at the end of the quantities that the
+    mechanism observes; `rtol`; `evaluations` of the accelerations, or of the residual of implicit equations; `matrices`
+    factored for Newton's method; `flops` of linear algebra, for full matrices; `time` [s] of a warm run. NaN and zeros
+    if no tolerance meets the bound.
     """
 
     method: str
@@ -53,7 +53,7 @@ class MethodCost:
 
 @dataclasses.dataclass(frozen=True)
 class MethodCosts:
-    """What `method_costs` returns; `print` shows a table. `remarks`: what was left out, and why."""
+    """The result of `method_costs`; `print` shows a table. `remarks`: methods that were skipped, and why."""
 
     mechanism: str
     t1: float
@@ -64,7 +64,7 @@ class MethodCosts:
         rows = [_HEADER, *map(_cells, self.costs)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-        title = f"{self.mechanism}, {self.t1:g} s: what it takes for an error at the end below each bound"
+        title = f"{self.mechanism}, {self.t1:g} s: cost of an error at the end below each bound"
         return "\n".join([title, *map(text, rows), *self.remarks])
 
     def to_dict(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def _cells(cost: MethodCost) -> tuple[str, ...]:
 
 
 class _Run(NamedTuple):
-    """What one run gave: its error, infinite if it failed; evaluations and matrices."""
+    """The outcome of a run: its error, infinite if it failed; evaluations and matrices."""
 
     error: float
     evaluations: int
@@ -91,7 +91,7 @@ class _Run(NamedTuple):
 
 
 class _Method(NamedTuple):
-    """`run(rtol)` is timed, `judge` says what its result is worth; floating point operations of an evaluation and of
+    """`run(rtol)` is timed, `judge` counts and measures its result; floating point operations of an evaluation and of
     a matrix.
     """
 
@@ -105,26 +105,26 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
     """Compare coordinate partitioning with integrating all coordinates, at equal error.
 
     The methods are partitioning with `Adams` and with `Hermite`; all coordinates with multipliers and Baumgarte's
-    stabilisation, with `Adams` and with `Dopri8` of diffrax; and, where scikit-sundae is there and the joints are
-    holonomic, planar and not redundant, implicit BDF (SUNDIALS' IDA) on the stabilised equations of index 2. The last
-    is called back from Python for every evaluation, which its time contains.
+    stabilisation, with `Adams` and with `Dopri8` of diffrax; and, if scikit-sundae is installed and the joints are
+    holonomic, planar and not redundant, implicit BDF (SUNDIALS' IDA) on the stabilised equations of index 2. IDA calls
+    Python for every evaluation, which its time includes.
 
-    Counts of linear algebra are those of full matrices: elimination of the constraints and Cholesky's factor of the
-    reduced mass matrix; of A M⁻¹ Aᵀ; and LU of everything for the implicit methods.
+    Operations of linear algebra are counted for full matrices: elimination of the constraints and the Cholesky factor
+    of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods.
 
-    **Arguments:** `errors`: bounds of the largest relative error at the end, of what the mechanism observes; `repeats`:
-    timed runs of each, in turns, of which the shortest counts.
+    **Arguments:** `errors`: bounds on the largest relative error at the end of the quantities that the mechanism
+    observes; `repeats`: timed runs of each, in turns, of which the shortest counts.
 
     **Raises:** `ValueError` for a mechanism without constraints.
     """
     system, state = mechanism.system, mechanism.state
     if system.acceleration_rows == 0:
-        raise ValueError(f"{mechanism.name!r} has no constraints: there are no coordinates to choose.")
+        raise ValueError(f"{mechanism.name!r} has no constraints, so there are no coordinates to choose.")
     known = reference(mechanism, min(errors) / 100)
     t1, remarks = float(known.times[-1]), []
     methods = _simulations(mechanism, known)
     if not applies_to(system):
-        remarks.append("IDA is left out: its equations are for planar, holonomic joints without redundant rows.")
+        remarks.append("IDA is skipped: its equations are for planar, holonomic joints without redundant rows.")
     else:
         try:
             methods["stabilised index 2, IDA"] = _implicit(mechanism, known, stabilised_dae(system, state, t1))
@@ -158,20 +158,20 @@ def _simulations(mechanism: Mechanism, known: References) -> dict[str, _Method]:
     system = mechanism.system
     n, m = system.nu, system.acceleration_rank
     free = n - m
-    # Gauss–Jordan on m × n at every predicted state, the reduced mass matrix and its Cholesky factor at every one.
+    # Gauss–Jordan on m × n at predicted states only; the reduced mass matrix and its Cholesky factor at all states.
     reduced = 2 * free * free * n + free**3 / 3
     eliminated = 2 * m * m * n
     multipliers = m * m * n + m**3 / 3
     # One complex matrix of the free coordinates and velocities is inverted.
     newton = 8 * (2 * free) ** 3
     stabilised = Baumgarte(_RATE)
-    ways = {
+    methods = {
         "partitioning, Adams": (Adams(), Partition(), eliminated / 2 + reduced, 0.0),
         "partitioning, Hermite": (Hermite(), Partition(), eliminated + reduced, newton),
         "multipliers, Baumgarte, Adams": (Adams(), stabilised, multipliers, 0.0),
         "multipliers, Baumgarte, Dopri8": (diffrax.Dopri8(), stabilised, multipliers, 0.0),
     }
-    return {name: _simulation(mechanism, known, *way) for name, way in ways.items()}
+    return {name: _simulation(mechanism, known, *method) for name, method in methods.items()}
 
 
 def _simulation(

@@ -1,4 +1,4 @@
-"""What the errors of a report are measured against."""
+"""Reference values that the errors of a report are relative to."""
 
 import diffrax
 import numpy as np
@@ -6,15 +6,15 @@ import numpy as np
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 
-# Below this, rounding decides.
+# Below this tolerance round-off dominates.
 _TIGHTEST = 1e-13
 
 
 def reference(mechanism: Mechanism, tolerance: float) -> References:
     """Values at the end of a mechanism's motion: published ones, or those of a run two orders tighter than `tolerance`.
 
-    The run is checked by a second method, Dormand–Prince 8, with projection where there are constraints; the largest
-    relative difference of the two is the `tolerance` of what is returned.
+    The run is checked by a second method, Dormand–Prince 8, with projection if there are constraints; the largest
+    relative difference of the two is the `tolerance` of the result.
     """
     if mechanism.references is not None:
         return mechanism.references

@@ -20,7 +20,7 @@ from .._types import State
 from ..formulations import Multipliers, accelerations
 from ..system import AbstractSystem
 
-# Of the multipliers, which follow from the rest and are not what is asked for.
+# Absolute tolerance of the multipliers, which follow from the other unknowns and need no error control.
 _LOOSE = 1e8
 
 
@@ -34,7 +34,7 @@ class DaeRun(NamedTuple):
 
 
 def applies_to(system: AbstractSystem) -> bool:
-    """Whether these equations are those of the system: q̇ = u, constraints between positions, none of them implied."""
+    """Whether these equations hold for the system: q̇ = u, holonomic constraints, no redundant rows."""
     holonomic = 0 < system.position_rows == system.acceleration_rows == system.position_rank
     return system.rates_are_velocities and system.ideal and holonomic
 
@@ -42,7 +42,7 @@ def applies_to(system: AbstractSystem) -> bool:
 def stabilised_dae(system: AbstractSystem, state: State, t1: float) -> Callable[[float], DaeRun]:
     """Runs of IDA from 0 to t1 as a function of rtol.
 
-    **Raises:** `ImportError` if scikit-sundae is not there.
+    **Raises:** `ImportError` if scikit-sundae is not installed.
     """
     try:
         from sksundae.ida import IDA  # pyright: ignore[reportMissingImports]

@@ -1,4 +1,4 @@
-"""Run times that can be compared with each other on a machine that does other things as well."""
+"""Run times that can be compared with each other on a machine with other load."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import jax
 def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
     """Trace and compile a function for its arguments.
 
-    **Returns:** the compiled function, and how long that took [s].
+    **Returns:** the compiled function, and the time that took [s].
     """
     begin = time.perf_counter()
     compiled = eqx.filter_jit(fn).lower(*args).compile()  # pyright: ignore[reportFunctionMemberAccess]
@@ -19,9 +19,9 @@ def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
 
 
 def interleaved(runs: Sequence[Callable[[], Any]], repeats: int) -> list[tuple[float, ...]]:
-    """Time several functions in turns, so that whatever else the machine does hits all of them alike.
+    """Time several functions in turns, so that other load on the machine affects all of them alike.
 
-    Each is called once before, without being timed.
+    Each is first called once without being timed.
 
     **Returns:** for every function its `repeats` times [s].
     """

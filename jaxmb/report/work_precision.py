@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import numpy as np
@@ -12,10 +12,13 @@ from .._results import RESULTS
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 from ..solvers import Adams
+from ..viz.figure import new_figure
 from .evaluations import evaluations
-from .plot import plot_work_precision
 from .reference import reference
 from .timing import interleaved, timed_compile
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 
@@ -31,7 +34,7 @@ class Run:
 
     **Fields:** `solver`; `rtol`; `error`: the largest relative error at the end, NaN if the run failed; `times` [s] of
     the warm runs; `compile_time` [s]; `steps`, accepted and rejected together, and `rejected`; `evaluations` of the
-    accelerations, None where they are not known; `message`: why it failed, or empty.
+    accelerations, None if unknown; `message`: why the run failed, or empty.
     """
 
     solver: str
@@ -46,7 +49,7 @@ class Run:
 
     @property
     def shortest(self) -> float:
-        """The shortest warm run time [s], the one least disturbed by what else the machine did."""
+        """The shortest warm run time [s], the one least disturbed by other load."""
         return min(self.times)
 
     @property
@@ -57,7 +60,7 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class WorkPrecision:
-    """What `work_precision` returns; `print` shows a table, a notebook too.
+    """The result of `work_precision`; `print` and notebooks show a table.
 
     **Fields:** `mechanism`: its name; `t1` [s]; `runs`; `source` of the reference values, and `disagreement`, the
     relative error up to which they can be trusted: as published, or the difference of the two methods that computed
@@ -91,10 +94,9 @@ class WorkPrecision:
     def figure(self, path: str | Path) -> None:
         """Write a picture (PNG, SVG or PDF by the path's ending): error against run time and against evaluations.
 
-        **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
+        **Raises:** `ImportError` that names the extra to install if matplotlib is missing.
         """
-        title = f"{self.mechanism}, {self.t1:g} s"
-        plot_work_precision(title, self.runs, self.disagreement).savefig(path, dpi=150)
+        _plot(self).savefig(path, dpi=150)
 
 
 _HEADER = ("solver", "rtol", "error", "run [ms]", "median", "compile [s]", "steps", "rejected", "evaluations")
@@ -121,16 +123,16 @@ def work_precision(
     *,
     repeats: int = 5,
 ) -> WorkPrecision:
-    """Measure the error that solvers make on a mechanism, and what it costs.
+    """Measure the errors of solvers on a mechanism, and their cost.
 
-    Every run is compiled first, apart from what is timed; then all of them run in turns `repeats` times. Only the end
-    of the motion is saved, so that no solver pays for interpolation.
+    Every run is compiled before it is timed; then all of them run in turns `repeats` times. Only the end of the motion
+    is saved, so that no run includes interpolation.
 
     **Arguments:** `mechanism`: of the library; `solvers` by name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax
     with projection; `tolerances`: values of `rtol`, with `atol` one hundredth of it, default 1e-4 … 1e-10; `repeats`:
     at least 1.
 
-    **Returns:** a `WorkPrecision`. A run that fails keeps its row and says why.
+    **Returns:** a `WorkPrecision`. A failed run keeps its row, with a message.
 
     **Raises:** `ValueError` for no solvers, no tolerances or no repeats.
     """
@@ -179,3 +181,29 @@ def _simulation(solver, rtol, t1):
 def _error(mechanism: Mechanism, known: References, trajectory) -> float:
     errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
     return max(float(error[-1]) for error in errors.values())
+
+
+def _plot(report: WorkPrecision) -> "Figure":
+    """Error against run time and against evaluations, both axes logarithmic; failed runs are not shown."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    figure = new_figure(9.0, 4.0)
+    panels = figure.subplots(1, 2, sharey=True)
+    quantities = (("run time, warm [ms]", lambda run: 1e3 * run.shortest), ("evaluations", lambda run: run.evaluations))
+    for axes, (label, quantity) in zip(panels, quantities, strict=True):
+        for k, solver in enumerate(dict.fromkeys(run.solver for run in report.runs)):
+            points = [(quantity(run), run.error) for run in report.runs if run.solver == solver and not run.message]
+            points = [(x, error) for x, error in points if x is not None]
+            if points:
+                axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
+        if report.disagreement > 0:
+            axes.axhline(report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
+        axes.set_xlabel(label)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize="small")
+    panels[0].set_ylabel("relative error at the end")
+    figure.suptitle(f"{report.mechanism}, {report.t1:g} s")
+    return figure

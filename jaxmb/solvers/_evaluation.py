@@ -94,7 +94,7 @@ def restore(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluat
     manifold = _manifold(term)
     if manifold is None or before.near is None:
         return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.restore(t * term.direction, unravel_like(like, flat), before.near, args)
+    out = manifold.project_near(t * term.direction, unravel_like(like, flat), before.near, args)
     return _raveled(term, out, flat.dtype)
 
 
@@ -109,7 +109,8 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
 
     def constrained(t, flat):
         assert manifold is not None
-        out = _raveled(term, manifold.settle(t * term.direction, unravel_like(like, flat), chart, args), flat.dtype)
+        out = manifold.project_cold(t * term.direction, unravel_like(like, flat), chart, args)
+        out = _raveled(term, out, flat.dtype)
         return (out.y, out.f), (out.chart, out.failed)
 
     return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)

@@ -3,7 +3,7 @@
 A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` is the same equation together with
 invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart).
 The solver keeps its history for *all* components of `y`; the chart only says which of them are integrated and
-which are solved for (`restore`), so a change of chart costs neither history nor order.
+which are solved for (`project_near`), so a change of chart costs neither history nor order.
 """
 
 import abc
@@ -26,8 +26,9 @@ class ManifoldEvaluation(NamedTuple):
     - `y`: the state, on the manifold if that was asked for.
     - `f`: the vector field there.
     - `chart`: the chart with the same index sets; it may carry what makes the next evaluation cheaper, and counters.
-    - `failed`: true where the state could not be evaluated or restored; the step is then retried with a smaller one.
-    - `factors`: what makes restoring a state nearby at the same time cheaper; any pytree of arrays, or None.
+    - `failed`: true where the state could not be evaluated or projected; the step is then retried with a smaller one.
+    - `factors`: factors that make the projection of a state nearby at the same time cheaper; any pytree of arrays, or
+        None.
     """
 
     y: Y
@@ -57,26 +58,26 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
-        """Evaluate the vector field at a state on the manifold or near it, a prediction; it need not be restored."""
+        """Evaluate the vector field at a state on the manifold or near it, a prediction; it need not be projected."""
 
     @abc.abstractmethod
-    def restore(self, t: Any, y: Y, near: ManifoldEvaluation, args: Args) -> ManifoldEvaluation:
-        """Restore a state to the manifold, and evaluate the vector field there.
+    def project_near(self, t: Any, y: Y, linearized_at: ManifoldEvaluation, args: Args) -> ManifoldEvaluation:
+        """Project a state on the manifold, and evaluate the vector field there.
 
-        The independent components of `y` are kept; the others are a first guess and are solved for. `near` is the
-        evaluation of the prediction that `y` corrects, at the same time; its `factors` may make this one cheap.
+        The independent components of `y` are kept; the others are a first guess and are solved for. `linearized_at` is
+        the evaluation of the prediction that `y` corrects, at the same time; its `factors` may make this one cheap.
         """
 
-    def settle(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
-        """`restore` where nothing near the state has been evaluated yet; `y` is a first guess from anywhere around.
+    def project_cold(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
+        """`project_near` where no state nearby has been evaluated yet; `y` is a first guess.
 
-        A manifold that can do so with a single evaluation, of the restored state, has a method of its own.
+        A manifold that can do so with a single evaluation, of the projected state, has a method of its own.
         """
-        # Where the state is restored from does not matter to its derivative.
+        # The state that is linearised at does not matter to the derivative.
         manifold, *at = jax.tree.map(stop, (self, t, y, args))
-        near = manifold.evaluate(at[0], at[1], chart, at[2])
-        out = self.restore(t, y, near, args)
-        return out._replace(failed=out.failed | near.failed)
+        linearized_at = manifold.evaluate(at[0], at[1], chart, at[2])
+        out = self.project_near(t, y, linearized_at, args)
+        return out._replace(failed=out.failed | linearized_at.failed)
 
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:

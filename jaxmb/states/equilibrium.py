@@ -1,13 +1,13 @@
-"""Static equilibrium: a configuration in which nothing starts to move.
+"""Static equilibrium: a configuration from which nothing starts to move.
 
 At rest the applied forces and those of the constraints balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search
-follows the forces along the displacements that the constraints allow, by Newton's method with the curvatures of the
-potential made positive and with bounded steps, so that it goes down to where a conservative system rests and not up to
-where it would be balanced. Derivatives are those of the balance, by the implicit function theorem.
+follows the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and
+bounded steps, so that a conservative system is taken to a minimum of its potential and not to a maximum.
+Derivatives are those of the balance, by the implicit function theorem.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,10 +17,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import is_traced
+from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..system import AbstractSystem
-from .assembly import configuration, tangent_solve, tolerance
+from .arguments import check_system, checked_guess, checked_time
+from .assembly import configuration
+from .closest import tolerance
 
 _ITERATIONS = 200
 
@@ -41,36 +44,41 @@ def equilibrium(
 ) -> State:
     """Find a static equilibrium near a guess.
 
-    Where displacements meet no resistance (a vehicle may roll along level ground, its wheels may turn) every place is
-    an equilibrium. One near the guess is found, by steps that are the shortest in the scales of the velocities; `fix`
-    may tell which. Wheels that roll without slipping get there by rolling.
+    Where displacements meet no resistance (a vehicle may roll along level ground, its wheels may turn) equilibria form
+    a family. One near the guess is found, by the shortest steps in the scales of the velocities; `fix` selects another.
+    Wheels that roll without slipping reach it by rolling.
 
     **Arguments:**
 
     - `system`: a compiled scene, or another system; its forces at rest must not need velocities to balance.
     - `guess`: where to start, default the poses given with the bodies; assembled first.
-    - `fix`: coordinates that must have these values, by name, as in `assemble`; whatever holds them bears a force.
+    - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription bears a force.
     - `t`: the time, for forces and drivers that depend on it [s].
-    - `throw`: whether it is an error that none is found. With `False` the state is NaN instead, so that one member of a
+    - `throw`: whether a failed search is an error. With `False` the state is NaN instead, so that one member of a
         batch does not spoil the others.
 
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
-    **Raises:** `ValueError` if the mechanism cannot be assembled, if something is driven at time t, or if there is no
-    equilibrium; the message names the coordinates whose forces nothing balances. Under `jit` a run-time error without
+    **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, or
+    if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a run-time error without
     the names.
     """
+    check_system("equilibrium", system)
     if not system.ideal_on_velocities:
-        raise ValueError("Equilibria are of systems whose constraints are ideal and bind positions or velocities.")
-    guess = system.guess if guess is None else guess
-    time: Any = as_array(t, guess.q.dtype)
+        raise ValueError(
+            "equilibrium needs ideal constraints that bind positions or velocities; leave friction and servos out."
+        )
+    guess = checked_guess("equilibrium", system, guess)
+    time = checked_time("equilibrium", t, guess.q.dtype)
     start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
     still = _still(system, time, start, u)
     concrete = not is_traced(still)
     if concrete and throw and not bool(still):
-        raise ValueError("Something is driven at this time, and moves; give a time t at which it stands.")
+        raise ValueError(
+            "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
+        )
     q, unbalanced, ok = _balanced(system, time, start, held)
     if concrete and throw and not bool(ok):
         raise ValueError(_not_found(system, unbalanced))
@@ -78,13 +86,15 @@ def equilibrium(
         return State(q, u)
     ok = ok & still & assembled
     if throw:
-        q = eqx.error_if(q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see what is loose.")
+        q = eqx.error_if(
+            q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see the unbalanced coordinates."
+        )
     return State(q if throw else jnp.where(ok, q, jnp.nan), u)
 
 
 @eqx.filter_jit
 def _still(system, t, q, u):
-    """Whether nothing is driven."""
+    """Whether all prescribed motions are at rest."""
     speeds = jnp.concatenate([system.velocity_residual(t, q, u), system.rates(t, q, u)])
     return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(q.dtype)
 
@@ -126,7 +136,7 @@ class _Balance(eqx.Module):
         return rows * self.system.velocity_scale()[None, :]
 
     def residual(self, q, jacobian, z):
-        """How far the rows are from holding; those between velocities by the displacement alone."""
+        """Residuals of the rows; those between velocities depend on the displacement alone."""
         constraints = slice(self.system.position_rows, self.system.velocity_rows)
         rolled = jacobian[constraints] @ z
         return jnp.concatenate(
@@ -138,10 +148,11 @@ class _Balance(eqx.Module):
 
 
 class _Linearised(NamedTuple):
-    """The balance for small displacements z from a configuration, `force − stiffness z` along what the rows allow.
+    """The balance for small displacements z from a configuration, `force − stiffness z` along those that the rows
+    allow.
 
-    `curvatures` and `directions` of the symmetric part of the stiffness, in which what the rows forbid counts as stiff;
-    `loose`, those directions that meet no stiffness; `multipliers` of the rows; `correction`, the displacement back to
+    `curvatures` and `directions` of the symmetric part of the stiffness, in which forbidden directions count as stiff;
+    `loose`, the directions without stiffness; `multipliers` of the rows; `correction`, the displacement back to
     the rows; `sizes` of the rows, and `implied`, the projector on combinations of them that vanish.
     """
 
@@ -162,7 +173,7 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     sizes = norm(jacobian)
     sizes = jnp.where(sizes > 0, sizes, 1.0)
     left, values, right = jnp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
-    # Off the constraints, rows that are implied on them are not quite so: they are left out by number.
+    # Rows that are implied on the constraints are only nearly so off them: the rank tells how many to leave out.
     kept = (jnp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * jnp.max(values, initial=0.0))
     left, right = jnp.where(kept[None, :], left, 0.0), jnp.where(kept[:, None], right, 0.0)
     inverse = right.T @ (left / jnp.where(kept, values, 1.0)[None, :]).T
@@ -189,49 +200,49 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     )
 
 
-def _step(near: _Linearised) -> Float[Array, "n"]:
+def _step(local: _Linearised) -> Float[Array, "n"]:
     """Newton's step with curvatures made positive; none along loose directions without force."""
-    along = near.directions.T @ near.force
+    along = local.directions.T @ local.force
     largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
-    noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(near.curvatures) + largest(near.sizes * near.multipliers))
-    quiet = near.loose & (jnp.abs(along) <= noise)
-    size = jnp.abs(near.curvatures)
+    noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
+    quiet = local.loose & (jnp.abs(along) <= noise)
+    size = jnp.abs(local.curvatures)
     # Quiet directions count as stiff, so that rounding errors of the others do not move along them.
     size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
-    stiffness = near.stiffness + (near.directions * (size - near.curvatures)[None, :]) @ near.directions.T
-    return jnp.linalg.solve(stiffness, near.directions @ jnp.where(quiet, 0.0, along))
+    stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
+    return jnp.linalg.solve(stiffness, local.directions @ jnp.where(quiet, 0.0, along))
 
 
 @eqx.filter_jit
 def _balanced(
     system: AbstractSystem, t: Array, start: Float[Array, "nq"], held: tuple[int, ...]
 ) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Bool[Array, ""]]:
-    """The equilibrium, what is left of the generalized forces there, and whether that is nothing."""
+    """The equilibrium, the residual forces there, and whether they vanish."""
     balance = _Balance(system, t, start[np.array(held, int)], held)
-    q, near, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
+    q, local, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
 
-    # The equations that it solves, for their derivatives. What is loose or implied is made definite: nothing moves
-    # along loose directions, and multipliers are as small as they can be.
-    n, stiff = system.nu, jnp.max(jnp.abs(near.curvatures))
-    loose = jnp.where(near.loose[None, :], near.directions, 0.0) @ near.directions.T
+    # The equations of the equilibrium, for its derivatives. Loose directions and implied rows are made definite: the
+    # configuration does not move along loose directions, and multipliers are the smallest ones.
+    n, stiff = system.nu, jnp.max(jnp.abs(local.curvatures))
+    loose = jnp.where(local.loose[None, :], local.directions, 0.0) @ local.directions.T
     jacobian = lax.stop_gradient(balance).jacobian(q)
 
     def equations(x):
         z, multipliers = x[:n], x[n:]
         there = balance.moved(q, z)
         force = balance.force(there, multipliers) - stiff * (loose @ z)
-        rows = balance.residual(there, jacobian, z) / near.sizes
-        rows += near.implied @ (near.sizes * multipliers) / stiff
+        rows = balance.residual(there, jacobian, z) / local.sizes
+        rows += local.implied @ (local.sizes * multipliers) / stiff
         # Where there is no equilibrium, equations with a solution, so that their derivatives stay finite.
         return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
 
-    known = jnp.concatenate([jnp.zeros(n, q.dtype), near.multipliers])
-    solved = lax.custom_root(equations, known, lambda _, x: x, tangent_solve)
-    return balance.moved(q, solved[:n]), near.force / system.velocity_scale(), ok
+    known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
+    solved = root(equations, known, lambda _, x: x)
+    return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), ok
 
 
 def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
-    """Follow the forces to where they vanish; and whether they do."""
+    """Follow the forces until they vanish; also returns whether they do."""
     close = jnp.finfo(start.dtype).eps ** 0.5
 
     def proceed(carry):
@@ -239,29 +250,29 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         return ~found & (radius > close) & (k < _ITERATIONS)
 
     def advance(carry):
-        q, near, step, radius, _, k = carry
-        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(near.correction))
-        trial = balance.moved(q, step + near.correction)
+        q, local, step, radius, _, k = carry
+        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(local.correction))
+        trial = balance.moved(q, step + local.correction)
         there = _linearise(balance, trial)
-        # Too long a step ends where the forces push back half as hard as they pushed at its beginning, or harder.
-        # What the correction of the rows does to the forces is not counted.
-        other = jnp.max(jnp.abs(near.curvatures)) * norm(near.correction) * norm(step)
-        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(near.force, step)) - other
-        better = ~back | (norm(there.force) < norm(near.force))
+        # A step is too long if the forces at its end push back at least half as hard as they pushed at its beginning.
+        # The effect of the rows' correction on the forces is not counted.
+        other = jnp.max(jnp.abs(local.curvatures)) * norm(local.correction) * norm(step)
+        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(local.force, step)) - other
+        better = ~back | (norm(there.force) < norm(local.force))
         good = (k == 0) | (better & jnp.all(jnp.isfinite(there.force)))
-        q, near = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, near))
+        q, local = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, local))
         radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
-        step = _step(near)
+        step = _step(local)
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
-        # What is left after so small a step of Newton's method is its square.
-        return q, near, step, radius, good & (size <= close) & (k > 0), k + 1
+        # The error after a small step of Newton's method is of the size of its square.
+        return q, local, step, radius, good & (size <= close) & (k > 0), k + 1
 
-    # At first nothing is known, and nothing moves.
+    # Before the first linearisation nothing is known, and the step is zero.
     unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))
     at = (start, unknown, balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
-    q, near, _, _, found, _ = lax.while_loop(proceed, advance, at)
-    return q, near, found
+    q, local, _, _, found, _ = lax.while_loop(proceed, advance, at)
+    return q, local, found
 
 
 def _not_found(system, unbalanced):
@@ -270,6 +281,6 @@ def _not_found(system, unbalanced):
     worst = [k for k in np.argsort(-size)[:4] if size[k] > 1e-6 * np.max(size)]
     listed = ", ".join(f"{names[k]} ({unbalanced[k]:.3g})" for k in worst)
     return (
-        f"No static equilibrium was found: forces remain along {listed or 'nothing'}, in N and N m. Hold such a "
-        "coordinate with fix, take away what drives it, or give a guess nearer to the equilibrium."
+        f"No static equilibrium was found: residual forces along {listed or 'nothing'}, in N and N m. Hold such a "
+        "coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium."
     )

@@ -1,51 +1,64 @@
-"""The structure of a compiled scene: numbers of independent rows, and which rows are implied by which joints."""
+"""The structure of a compiled scene: numbers of independent rows, which rows are implied by which joints, and the order
+in which joints are eliminated.
+"""
+
+import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from ..linalg.elimination import full_pivot
-from ..system.chain import VERY_LONG, may_be_long
 from ..system.equation import Ranks
+from ..system.joint_graph import elimination_order
 from ..system.rigid_bodies import Implied, RigidBodySystem
-from . import chain_assembly as _chain_assembly
-from .assembly import INDEPENDENT, nearest, open_joints, residual_size, tolerance
+from .assembly import violated_joints
+from .closest import (
+    INDEPENDENT,
+    configuration_by_blocks,
+    eliminates_by_blocks,
+    meet_constraints,
+    residual_size,
+    tolerance,
+)
 
-# Smallest singular value of the equilibrated Jacobian of a part without freedom: below the first it does move, and
-# between the two it would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
+# Smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first they do move, and
+# between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
 # 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# More rows than this do not fit in dense matrices of reasonable size.
+# Dense matrices of more rows than this are too large.
 _DENSE = 3000
 
 
-def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]:
-    """Assemble from the given poses on concrete numbers, and eliminate.
+def with_structure(system: RigidBodySystem) -> RigidBodySystem:
+    """The system with its ranks, implied rows and order of elimination. They are found once, by assembling from the
+    given poses and eliminating on concrete numbers; afterwards they are static.
 
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations.
     """
-    if may_be_long(system, VERY_LONG):
-        rows = system.velocity_rows
-        if bool(_independent_chain(system)):
-            return Ranks(rows, rows, rows, rows), ()
+    order, rows = elimination_order(system), system.velocity_rows
+    structured = dataclasses.replace(system, elimination=order)
+    if eliminates_by_blocks(structured):
+        if bool(_independent_by_blocks(structured)):
+            return dataclasses.replace(structured, ranks=Ranks(rows, rows, rows, rows))
         if rows > _DENSE:
-            listed = open_joints(system, 0.0, system.guess.q)
+            listed = violated_joints(system, 0.0, system.guess.q)
             raise ValueError(
-                f"These {rows} constraint rows are too many for dense matrices, and joint by joint they cannot be "
+                f"These {rows} constraint rows are too many for dense matrices, and by blocks they cannot be "
                 + (
-                    f"assembled from the given poses, which leave open {listed}. Give poses nearer to the constraints."
+                    f"assembled from the given poses, which violate {listed}. Give poses nearer to the constraints."
                     if listed
-                    else "told from redundant ones. Move the points of joints apart."
+                    else "told from redundant rows. Move the points of joints apart."
                 )
             )
     found = _analyse(system)
     if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
+        listed = violated_joints(system, 0.0, found["q"], least=0.0)
         raise ValueError(
-            "The mechanism cannot be assembled from the given poses: residuals remain in "
-            f"{open_joints(system, 0.0, found['q'])}. Check lengths, points and axes for joints that contradict each "
-            "other, or give better poses."
+            f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
+            "points and axes for joints that contradict each other, or give better poses."
         )
     for what in ("velocities", "accelerations"):
         _check_left_over(system, what, *map(np.asarray, found[what]))
@@ -55,14 +68,17 @@ def find_structure(system: RigidBodySystem) -> tuple[Ranks, tuple[Implied, ...]]
     coordinate = position + system.coordinate_rows - system.position_rows
     implied = _implied(system, jacobian, np.asarray(found["rows"]), velocity)
     _check_determined(system, implied)
-    return Ranks(position, coordinate, velocity, int(found["acceleration rank"])), implied
+    ranks = Ranks(position, coordinate, velocity, int(found["acceleration rank"]))
+    # Block elimination drops no rows.
+    order = order if velocity == rows else None
+    return dataclasses.replace(system, ranks=ranks, implied=implied, elimination=order)
 
 
 @eqx.filter_jit
-def _independent_chain(system):
-    """Whether a long chain of joints can be assembled, and none of them is near to being redundant."""
+def _independent_by_blocks(system):
+    """Whether the scene can be assembled by blocks, and none of its rows is near to being redundant."""
     held = np.zeros(system.nq, bool)
-    _, ok, pivot = _chain_assembly.positions(
+    _, ok, pivot = configuration_by_blocks(
         system, jnp.zeros((), system.guess.q.dtype), system.guess.q, held, tolerance(system.guess.q.dtype)
     )
     return ok & (pivot > INDEPENDENT)
@@ -70,17 +86,17 @@ def _independent_chain(system):
 
 @eqx.filter_jit
 def _analyse(system):
-    """Everything that needs the system's kernels, in one compiled function."""
+    """All evaluations of the system, in one compiled function."""
     q, u = system.normalize(system.guess.q), system.guess.u
     t = jnp.zeros((), q.dtype)
     scale = system.velocity_scale()
     residual = jnp.zeros((), q.dtype)
     if system.position_rows:
-        q, near = nearest(system, t, q, system.coordinate_scale())
-        residual = residual_size(system, t, q, near)
+        q, linearized = meet_constraints(system, t, q, system.coordinate_scale())
+        residual = residual_size(system, t, q, linearized)
     jacobian = system.velocity_jacobian(t, q, u)
-    stage = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
-    every = full_pivot(jacobian, scale=scale, stage=stage)
+    level = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
+    every = full_pivot(jacobian, scale=scale, level=level)
     holonomic = system.velocity_rows == system.position_rows
     positions = every if holonomic else full_pivot(jacobian[: system.position_rows], scale=scale)
     out = {
@@ -98,7 +114,7 @@ def _analyse(system):
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.drift_free):
-        # Implied rows must ask for nothing else than the rows that imply them; what least squares leaves over is
+        # Implied rows must be consistent with the rows that imply them; what least squares leaves over is a
         # contradiction.
         if system.velocity_rows:
             asked = system.velocity_residual(t, q, u)
@@ -121,7 +137,7 @@ def _check_left_over(system, what, left, asked):
     if np.any(bad):
         names = sorted({name for (name, _), b in zip(system.rows, bad, strict=True) if b})
         raise ValueError(
-            f"The {what} asked for by {', '.join(names)} contradict each other (largest residual "
+            f"The {what} prescribed by {', '.join(names)} contradict each other (largest residual "
             f"{np.abs(left).max():.3g}). Remove one of them, or make their motions agree."
         )
 
@@ -152,7 +168,7 @@ def _check_locked(system, jacobian):
 
 
 def _connected(system):
-    """Bodies that joints connect other than through the ground, with their rows; none that are driven in time."""
+    """Sets of bodies that joints connect without the ground, with their rows; sets with a driver are left out."""
     ground, row = system.layout.bodies, 0
     # A union-find forest: the root of a body's tree stands for all that are connected with it.
     parent = list(range(ground))
@@ -182,7 +198,7 @@ def _connected(system):
 
 
 def _check_determined(system, implied):
-    """Refuse laws of joints whose force is not determined."""
+    """Refuse friction laws of joints whose force is not determined."""
     for g in system.nonideal:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}

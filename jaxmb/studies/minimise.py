@@ -1,4 +1,4 @@
-"""Two ways to make residuals small: Levenberg–Marquardt from optimistix, and any optimiser of optax."""
+"""Two ways to make residuals small: Levenberg–Marquardt, and any optimiser of optax."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import optimistix as optx
 from jaxtyping import Array, Float
 
 # Residuals of the unknowns z, given how to differentiate the simulation in them; infinite where it fails.
@@ -18,8 +17,8 @@ Residuals = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[
 # Residuals and their Jacobian; infinite where the simulation fails.
 Linearised = Callable[[Float[Array, "n"]], tuple[Float[Array, "residuals"], Float[Array, "residuals n"]]]
 
-# In place of infinite residuals: no sum of squares comes near it, and it has a square.
-_FAILED = 1e100
+# Damping of the first step of Levenberg–Marquardt, and its smallest value.
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
 
 
 class Minimum(NamedTuple):
@@ -31,39 +30,39 @@ class Minimum(NamedTuple):
 
 
 def levenberg_marquardt(linearised: Linearised, z: Float[Array, "n"], tol: float, limit: int) -> Minimum:
-    """Minimise `|r(z)|²`; trials that fail are rejected.
+    """Minimise `½ |r(z)|²`; trials that fail are rejected.
 
-    **Arguments:** `linearised`: residuals and their Jacobian; `tol`: change of unknowns and of residuals at which to
-    stop, absolute and relative; `limit`: largest number of trials.
+    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt). The damping μ follows
+    the gain, the ratio of the decrease of the objective to that of the linear model.
+
+    Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
+
+    **Arguments:** `linearised`: residuals and their Jacobian; `tol`: change of the unknowns and of the objective at
+    which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`.
     """
-    solver, state = optx.LevenbergMarquardt(rtol=tol, atol=tol), None
-    for iteration in range(limit):
-        trial = z if state is None else state.y_eval
-        z, state = _levenberg_marquardt(solver, (trial, *linearised(trial)), z, state)
-        stuck = bool(state.result != optx.RESULTS.successful)
-        if stuck or bool(state.terminate):
-            return Minimum(z, iteration + 1, not stuck)
+    residuals, jacobian = map(np.asarray, linearised(z))
+    objective = 0.5 * residuals @ residuals
+    damping, growth = _FIRST_DAMPING, 2.0
+    for iteration in range(1, limit):
+        norms = np.linalg.norm(jacobian, axis=0)
+        weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
+        rows, target = np.vstack([jacobian, np.diag(weights)]), np.append(-residuals, np.zeros_like(weights))
+        step = np.linalg.lstsq(rows, target, rcond=None)[0]
+        trial = z + jnp.asarray(step, z.dtype)
+        trial_residuals, trial_jacobian = map(np.asarray, linearised(trial))
+        trial_objective = 0.5 * trial_residuals @ trial_residuals
+        decrease = objective - trial_objective
+        predicted = 0.5 * step @ (weights**2 * step - jacobian.T @ residuals)
+        gain = decrease / predicted if predicted > 0 else 0.0
+        converged = np.all(np.abs(step) <= tol * (1 + np.abs(z))) and abs(decrease) <= tol * (1 + objective)
+        if gain > 0:
+            damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
+            z, residuals, jacobian, objective = trial, trial_residuals, trial_jacobian, trial_objective
+        else:
+            damping, growth = damping * growth, 2 * growth
+        if converged:
+            return Minimum(z, iteration + 1, True)
     return Minimum(z, limit, False)
-
-
-@eqx.filter_jit
-def _levenberg_marquardt(solver: Any, known: tuple[Array, Array, Array], z: Float[Array, "n"], state: Any):
-    """One step of the solver, from its state (None: the first); what it asks for at the trial point is known there."""
-    at, residuals, jacobian = known
-    finite = jnp.isfinite(residuals)
-    known = at, jnp.where(finite, residuals, _FAILED), jnp.where(finite[:, None], jacobian, 0.0)
-
-    # The tangent at the trial point, the only place where it is evaluated: so the program of the simulation and its
-    # derivatives is compiled once, outside, for all who need it.
-    def fn(z, known):
-        at, residuals, jacobian = known
-        return residuals + jacobian @ (z - at), None
-
-    rest: Any = known, {"jac": "fwd"}
-    if state is None:
-        state = solver.init(fn, z, *rest, *eqx.filter_eval_shape(fn, z, known), frozenset())
-    z, state, _ = solver.step(fn, z, *rest, state, frozenset())
-    return z, state
 
 
 def descend(

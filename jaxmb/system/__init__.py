@@ -1,13 +1,13 @@
 """The equation of constrained motion, and the compiled rigid-body system."""
 
-from .equation import AbstractSystem as AbstractSystem
-from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
-from .inertia import (
+from ..linalg.inertia import (
     AbstractInertia as AbstractInertia,
     BlockInertia as BlockInertia,
     DenseInertia as DenseInertia,
     DiagonalInertia as DiagonalInertia,
 )
+from .equation import AbstractSystem as AbstractSystem
+from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
 from .parameters import parameters as parameters, with_parameters as with_parameters
 from .quantities import BodyMotion as BodyMotion, Quantity as Quantity, Reaction as Reaction
 from .rigid_bodies import RigidBodySystem as RigidBodySystem

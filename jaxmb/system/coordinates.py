@@ -1,12 +1,15 @@
 """Coordinates and rates by name: which entries of q and u a name such as `"crank.angle"` stands for."""
 
 from collections.abc import Mapping
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import VectorLike
-from ..linalg.arrays import as_array, replaced
+from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import unknown
 from .layout import Layout
 
@@ -52,16 +55,33 @@ def prescribe(
 
     **Returns:** the vector, and a static mask of the entries that were prescribed.
 
-    **Raises:** `ValueError` for unknown names and wrong shapes.
+    **Raises:** `ValueError` for unknown names, wrong shapes, and values that are no real numbers.
     """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"A {what} is prescribed by name, {{'crank.angle': 0.3}}; got {values!r}.")
     fixed = np.zeros(vector.shape[0], bool)
     for name, value in values.items():
         if name not in names:
             raise unknown(what, name, names)
         index = names[name]
+        shape = real_numbers(f"{what.capitalize()} {name!r}", value)
+        if shape not in ((), (len(index),)) or (shape == () and len(index) > 1):
+            raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {shape}.")
         value = as_array(value, vector.dtype)
-        if value.shape not in ((), (len(index),)) or (value.shape == () and len(index) > 1):
-            raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {value.shape}.")
         vector = replaced(vector, np.array(index), value)
         fixed[index] = True
     return vector, fixed
+
+
+def real_numbers(label: str, value: Any) -> tuple[int, ...]:
+    """The shape of a real number or an array of them.
+
+    **Raises:** `ValueError` for text, None, complex numbers and ragged lists, with the label.
+    """
+    try:
+        array = jax.eval_shape(jnp.asarray, value) if is_traced(value) else np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{label} must be a real number or an array of them, got {value!r}.") from error
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{label} must be a real number or an array of them, got {value!r}.")
+    return array.shape

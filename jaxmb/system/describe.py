@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .chain import is_long
 from .description import Description
 from .equation import AbstractSystem
 
@@ -86,8 +85,8 @@ def describe_scene(
         ],
     }
     specialised = specialised_constraints(system)
-    if is_long(system):
-        specialised.append("joints in chains: no matrix of all constraints, no charts; joint by joint with Adams")
+    if system.elimination is not None:
+        specialised.append("joint chain: no dense Jacobian and no charts with Adams; block-tridiagonal elimination")
     if not spatial:
         specialised.append("planar: no Euler parameters, no gyroscopic moment")
     if not forces and not laws:

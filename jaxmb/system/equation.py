@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
+from ..linalg.inertia import AbstractInertia
+from ..linalg.jacobian import AbstractJacobian, EliminationOrder
 from .description import Description
-from .inertia import AbstractInertia
 from .quantities import Quantity, Reaction
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class AbstractSystem(eqx.Module):
         otherwise it gives that of a coordinate.
     - `guess`: a state to begin an assembly with; `length` [m]: the size that residuals of positions are relative to.
     - `rows`: name of the part, and number within it, of every row of A.
+    - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
     """
 
     nq: AbstractVar[int]
@@ -80,6 +82,7 @@ class AbstractSystem(eqx.Module):
     length: AbstractVar[Float[Array, ""]]
     ranks: AbstractVar[Ranks]
     rows: AbstractVar[tuple[tuple[str, int], ...]]
+    elimination: AbstractVar[EliminationOrder | None]
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:
@@ -158,6 +161,10 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "acceleration_rows nu"]:
         """`A`."""
+
+    @abc.abstractmethod
+    def structured_jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> AbstractJacobian:
+        """`A` in blocks where the system has an order of `elimination`, else as a dense matrix without a factor."""
 
     @abc.abstractmethod
     def constraint_force(

@@ -1,5 +1,8 @@
 """Systems in generalized coordinates, without bodies: views of a motion by the names of the coordinates."""
 
+from typing import ClassVar
+
+from ..linalg.jacobian import DenseJacobian
 from .equation import AbstractSystem
 from .quantities import Quantity
 
@@ -9,9 +12,14 @@ class AbstractGeneralizedSystem(AbstractSystem):
     forces of constraints: `"theta"`, `"theta.rate"`, `"A.force"`.
     """
 
+    elimination: ClassVar[None] = None
+
     @property
     def has_bodies(self) -> bool:
         return False
+
+    def structured_jacobian(self, t, q, u):
+        return DenseJacobian(self.jacobian(t, q, u))
 
     def motion_names(self):
         return tuple(self.coordinate_names())

@@ -10,6 +10,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
+from ..linalg.jacobian import DenseJacobian, EliminationOrder, block_jacobian
 from ..linalg.rotations import cross, normalize, rotate
 from .body_motion import attachments, body_motion, body_quantities, outline
 from .coordinates import coordinate_names, rate_names
@@ -24,7 +26,6 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
-from .inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from .layout import Layout, pick
 from .parameter_paths import parameter_paths, positive_parameters
 from .quantities import Quantity
@@ -43,7 +44,8 @@ class RigidBodySystem(AbstractSystem):
     """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
 
     **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
-    bodies; `length` [m], the scene's size; `body_names`.
+    bodies; `length` [m], the scene's size; `body_names`; `elimination`, the order in which the joints are
+    eliminated, or None.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -60,6 +62,7 @@ class RigidBodySystem(AbstractSystem):
     gravity_name: str = eqx.field(static=True)
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
+    elimination: EliminationOrder | None = eqx.field(static=True)
 
     # Sizes
 
@@ -149,10 +152,9 @@ class RigidBodySystem(AbstractSystem):
         return None if self.gravity is None else self.gravity_name
 
     def describe(self):
-        kinds = {
-            kind: [name for name, own in zip(self.body_names, self.layout.rotates, strict=True) if own == rotates]
-            for kind, rotates in (("Body", True), ("PointMass", False))
-        }
+        kinds: dict[str, list[str]] = {}
+        for g in self.bodies:
+            kinds.setdefault(type(g.group.part).__name__, []).extend(g.group.names)
         return describe_scene(
             self,
             spatial=self.spatial,
@@ -324,9 +326,18 @@ class RigidBodySystem(AbstractSystem):
     def jacobian(self, t, q, u):
         return self._jacobian(t, q, u, self.joints)
 
-    def _jacobian(self, t, q, u, groups):
+    def structured_jacobian(self, t, q, u):
+        if self.elimination is None:
+            return DenseJacobian(self.jacobian(t, q, u))
+        blocks = [*self._blocks(t, q, u, self.joints), jnp.zeros(1, q.dtype)]
+        return block_jacobian(_join(blocks, q.dtype), self.elimination)
+
+    def _blocks(self, t, q, u, groups):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        blocks = [g.jacobian(t, poses, velocities) for g in groups]
+        return [g.jacobian(t, poses, velocities) for g in groups]
+
+    def _jacobian(self, t, q, u, groups):
+        blocks = self._blocks(t, q, u, groups)
         return self._assemble(blocks, groups, q.dtype, of_poses=False)
 
     @eqx.filter_jit

@@ -40,8 +40,8 @@ class Circle(AbstractManifoldTerm):
     def evaluate(self, t, y, chart, args):
         return ManifoldEvaluation(y, self.vf(t, y, args), chart, jnp.array(False))
 
-    def restore(self, t, y, near, args):
-        chart = near.chart
+    def project_near(self, t, y, linearized_at, args):
+        chart = linearized_at.chart
         kept = y[chart["free"]]
         room = 1 - kept**2
         failed = room < 0.01

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .. import fields
 from ..base import AbstractBody, AbstractPlanarPart
@@ -18,10 +17,10 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     """
 
     name: str = fields.name()
-    position: Float[Array, "2"] = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
-    angle: Float[Array, ""] = fields.guess(unit="rad", default=0.0)
-    velocity: Float[Array, "2"] = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
-    angular_velocity: Float[Array, ""] = fields.guess(unit="rad/s", default=0.0)
+    position: fields.Number = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
+    angle: fields.Number = fields.guess(unit="rad", default=0.0)
+    velocity: fields.Number = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
+    angular_velocity: fields.Number = fields.guess(unit="rad/s", default=0.0)
     rotates: ClassVar[bool] = True
 
     def pose(self):
@@ -39,8 +38,8 @@ class Body(AbstractRigidBody):
     `angular_velocity` [rad/s] likewise.
     """
 
-    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
-    inertia: Float[Array, ""] = fields.parameter(unit="kg m²", sign="positive")
+    mass: fields.Number = fields.parameter(unit="kg", sign="positive")
+    inertia: fields.Number = fields.parameter(unit="kg m²", sign="positive")
 
 
 class PointMass(AbstractPlanarPart, AbstractBody):
@@ -50,9 +49,9 @@ class PointMass(AbstractPlanarPart, AbstractBody):
     """
 
     name: str = fields.name()
-    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
-    position: Float[Array, "2"] = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
-    velocity: Float[Array, "2"] = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
+    mass: fields.Number = fields.parameter(unit="kg", sign="positive")
+    position: fields.Number = fields.guess(shape=(2,), unit="m", default=(0.0, 0.0))
+    velocity: fields.Number = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
     rotates: ClassVar[bool] = False
 
     @property

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
+from ..smooth import quintic
 from ..space import force_pair, separation, separation_rate
 
 
@@ -38,18 +39,18 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         centres.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
-    unloading: Float[Array, ""] = fields.parameter(sign="non-negative", default=0.4)
-    preload: Float[Array, ""] = fields.parameter(unit="N", sign="non-negative", default=5e4)
-    slack: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", default=0.02)
-    travel: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.11)
-    stop_stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
-    damping: Float[Array, ""] = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    transition: Float[Array, ""] = fields.parameter(unit="m/s", sign="positive", default=0.01)
-    smoothing: Float[Array, ""] = fields.parameter(unit="m", sign="positive", default=0.005)
-    free_length: Float[Array, ""] = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: Float[Array, "d"] = fields.point(body=0, default="mass centre")
-    point_b: Float[Array, "d"] = fields.point(body=1, default="mass centre")
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
+    unloading: fields.Number = fields.parameter(sign="non-negative", default=0.4)
+    preload: fields.Number = fields.parameter(unit="N", sign="non-negative", default=5e4)
+    slack: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.02)
+    travel: fields.Number = fields.parameter(unit="m", sign="positive", default=0.11)
+    stop_stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    transition: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=0.005)
+    free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
+    point_a: fields.Number = fields.point(body=0, default="mass centre")
+    point_b: fields.Number = fields.point(body=1, default="mass centre")
 
     def validate(self):
         if self.unloading > 1:
@@ -81,11 +82,11 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         return self.stored(norm(separation(space, self, poses)) - self.free_length)
 
     def _against(self, stroke, rate):
-        step, ramp, _ = self._engaged(stroke)
-        spring = self.preload * step + self.stiffness * ramp
+        engaged, ramp, _ = self._engaged(stroke)
+        spring = self.preload * engaged + self.stiffness * ramp
         friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * jnp.tanh(rate / self.transition)
         _, stop, _ = self._engaged(stroke - self.travel)
-        return spring * friction + self.stop_stiffness * stop + self.damping * step * rate
+        return spring * friction + self.stop_stiffness * stop + self.damping * engaged * rate
 
     def _stored(self, stroke):
         _, ramp, area = self._engaged(stroke)
@@ -93,12 +94,11 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         return 0.5 * (1 + self.unloading) * (self.preload * ramp + self.stiffness * area) + self.stop_stiffness * stop
 
     def _engaged(self, x):
-        """A smooth step from 0 to 1, its integral and the integral of that."""
+        """A smooth step from 0 to 1 over the width `smoothing`, its integral and the integral of that."""
         width = self.smoothing
         z = jnp.clip(x / width + 0.5, 0.0, 1.0)
         beyond = jnp.maximum(x - 0.5 * width, 0.0)
-        step = z**3 * (10 + z * (6 * z - 15))
         ramp = z**4 * (2.5 + z * (z - 3))
         area = z**5 * (0.5 + z * (z / 7 - 0.5))
         # With x = width/2 + beyond: the ramp is x, its integral x²/2 + width²/56.
-        return step, width * ramp + beyond, width**2 * area + beyond * (0.5 * width + 0.5 * beyond)
+        return quintic(z), width * ramp + beyond, width**2 * area + beyond * (0.5 * width + 0.5 * beyond)

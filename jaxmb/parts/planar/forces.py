@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .. import fields
 from ..base import AbstractForce, AbstractPair, AbstractPlanarPart, AbstractPotentialForce
@@ -26,7 +25,7 @@ class Torque(AbstractPlanarPart, AbstractForce):
     name: str = fields.name()
     reaction: str = fields.body_name(default="ground")
     body: str = fields.body_name()
-    torque: Float[Array, ""] = fields.parameter(unit="N m")
+    torque: fields.Number = fields.parameter(unit="N m")
 
     def wrenches(self, space, poses, velocities, t):
         return _moment_pair(self.torque)
@@ -39,9 +38,9 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
     default that of the given poses.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad", sign="non-negative")
-    damping: Float[Array, ""] = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
-    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    stiffness: fields.Number = fields.parameter(unit="N m/rad", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
+    free_angle: fields.Number = fields.parameter(unit="rad", optional=True)
 
     def complete(self, space, poses):
         return self.filled(free_angle=relative_angle(poses))
@@ -65,11 +64,11 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     [rad] > 0.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad^exponent", sign="non-negative")
-    lower: Float[Array, ""] = fields.parameter(unit="rad")
-    upper: Float[Array, ""] = fields.parameter(unit="rad")
-    exponent: Float[Array, ""] = fields.parameter(sign="positive", default=3.0)
-    smoothing: Float[Array, ""] = fields.parameter(unit="rad", sign="positive", default=1e-3)
+    stiffness: fields.Number = fields.parameter(unit="N m/rad^exponent", sign="non-negative")
+    lower: fields.Number = fields.parameter(unit="rad")
+    upper: fields.Number = fields.parameter(unit="rad")
+    exponent: fields.Number = fields.parameter(sign="positive", default=3.0)
+    smoothing: fields.Number = fields.parameter(unit="rad", sign="positive", default=1e-3)
 
     def validate(self):
         if not self.lower < self.upper:
@@ -96,14 +95,14 @@ class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     points as in `Revolute`; `free_angle` [rad], default that of the given poses.
     """
 
-    stiffness: Float[Array, "3"] = fields.parameter(shape=(3,), unit="N/m, N m/rad", sign="non-negative")
-    damping: Float[Array, "3"] = fields.parameter(
+    stiffness: fields.Number = fields.parameter(shape=(3,), unit="N/m, N m/rad", sign="non-negative")
+    damping: fields.Number = fields.parameter(
         shape=(3,), unit="N s/m, N m s/rad", sign="non-negative", default=(0.0, 0.0, 0.0)
     )
-    point_a: Float[Array, "2"] = fields.point(body=0, optional=True)
-    point_b: Float[Array, "2"] = fields.point(body=1, optional=True)
-    point: Float[Array, "2"] = fields.point(body=None, gives=("point_a", "point_b"))
-    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    point_a: fields.Number = fields.point(body=0, optional=True)
+    point_b: fields.Number = fields.point(body=1, optional=True)
+    point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
+    free_angle: fields.Number = fields.parameter(unit="rad", optional=True)
 
     def complete(self, space, poses):
         return self.filled(free_angle=relative_angle(poses))

@@ -42,7 +42,7 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
     **Arguments:** points as in `Revolute`; `angle` [rad], default that of the given poses.
     """
 
-    angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    angle: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 3
 
     def complete(self, space, poses):
@@ -59,8 +59,8 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     `axis` in the world at the given pose.
     """
 
-    axis_a: Float[Array, "2"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "2"] = fields.axis(body=None, gives=("axis_a",))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
 
     def residual(self, space, poses, t):
@@ -74,9 +74,9 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     **Arguments:** as in `PointOnLine`; `angle` [rad], default that of the given poses.
     """
 
-    axis_a: Float[Array, "2"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "2"] = fields.axis(body=None, gives=("axis_a",))
-    angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
+    angle: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 2
 
     def complete(self, space, poses):
@@ -99,9 +99,9 @@ class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     **Arguments:** `point_a`, `point_b` [m], shape (2,), body-fixed; `length` [m] > 0, default that of the given poses.
     """
 
-    point_a: Float[Array, "2"] = fields.point(body=0, default=(0.0, 0.0))
-    point_b: Float[Array, "2"] = fields.point(body=1, default=(0.0, 0.0))
-    length: Float[Array, ""] = fields.length(sign="positive", optional=True)
+    point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0))
+    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
+    length: fields.Number = fields.length(sign="positive", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -122,8 +122,8 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """
 
     curve: Callable[[Float[Array, "2"], Any], Scalar] = fields.function()
-    point_b: Float[Array, "2"] = fields.point(body=1, default=(0.0, 0.0))
-    parameters: dict[str, Array] = fields.numbers()
+    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
+    parameters: fields.Numbers = fields.numbers()
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -139,9 +139,9 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     holds both axles, default ground; `offset` [rad], default that of the given poses.
     """
 
-    ratio: Float[Array, ""] = fields.parameter(sign="nonzero")
+    ratio: fields.Number = fields.parameter(sign="nonzero")
     carrier: str = fields.body_name(default="ground")
-    offset: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    offset: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -164,11 +164,11 @@ class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     poses.
     """
 
-    radius: Float[Array, ""] = fields.length(sign="positive")
-    axis_b: Float[Array, "2"] = fields.axis(body=1, default=(1.0, 0.0))
-    point_a: Float[Array, "2"] = fields.point(body=0, default=(0.0, 0.0))
-    point_b: Float[Array, "2"] = fields.point(body=1, default=(0.0, 0.0))
-    offset: Float[Array, ""] = fields.parameter(unit="m", optional=True)
+    radius: fields.Number = fields.length(sign="positive")
+    axis_b: fields.Number = fields.axis(body=1, default=(1.0, 0.0))
+    point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0))
+    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
+    offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 

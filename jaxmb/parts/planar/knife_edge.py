@@ -2,8 +2,6 @@
 
 from typing import ClassVar
 
-from jaxtyping import Array, Float
-
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractVelocityConstraint
 
@@ -18,8 +16,8 @@ class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
 
     name: str = fields.name()
     body: str = fields.body_name()
-    point: Float[Array, "2"] = fields.point(body=0, default=(0.0, 0.0))
-    axis: Float[Array, "2"] = fields.axis(body=0, default=(1.0, 0.0))
+    point: fields.Number = fields.point(body=0, default=(0.0, 0.0))
+    axis: fields.Number = fields.axis(body=0, default=(1.0, 0.0))
     rows: ClassVar[int] = 1
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True

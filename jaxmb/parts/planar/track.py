@@ -37,15 +37,13 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
     """
 
     name: str = fields.name()
-    bodies: tuple[str, ...] = fields.body_names()
-    owners: tuple[int, ...] = eqx.field(static=True)
-    points: Float[Array, "n 2"] = fields.parameter(shape=None, unit="m", kw_only=False)
-    pretension: Float[Array, ""] = fields.parameter(unit="N", sign="non-negative", kw_only=False)
-    stiffness: Float[Array, ""] = fields.parameter(unit="N/m", sign="non-negative", kw_only=False)
-    free_length: Float[Array, ""] = fields.parameter(unit="m", optional=True, kw_only=False)
-    radii: Float[Array, "n"] | None = fields.parameter(
-        shape=None, unit="m", sign="non-negative", optional=True, kw_only=False
-    )
+    bodies: fields.Names = fields.body_names()
+    owners: tuple[int, ...] = eqx.field(static=True, default=())
+    points: fields.Number = fields.parameter(shape=None, unit="m", kw_only=False)
+    pretension: fields.Number = fields.parameter(unit="N", sign="non-negative", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", kw_only=False)
+    free_length: fields.Number = fields.parameter(unit="m", optional=True, kw_only=False)
+    radii: fields.Number = fields.parameter(shape=None, unit="m", sign="non-negative", optional=True, kw_only=False)
 
     def __init__(
         self,

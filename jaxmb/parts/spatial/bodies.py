@@ -29,10 +29,10 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
     """
 
     name: str = fields.name()
-    position: Float[Array, "3"] = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
-    orientation: Float[Array, "4"] = fields.attitude(state=True, default=(1.0, 0.0, 0.0, 0.0))
-    velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
-    angular_velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="rad/s", default=(0.0, 0.0, 0.0))
+    position: fields.Number = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
+    orientation: fields.Number = fields.attitude(state=True, default=(1.0, 0.0, 0.0, 0.0))
+    velocity: fields.Number = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
+    angular_velocity: fields.Number = fields.guess(shape=(3,), unit="rad/s", default=(0.0, 0.0, 0.0))
     rotates: ClassVar[bool] = True
 
     def pose(self):
@@ -59,8 +59,8 @@ class Body(AbstractRigidBody):
         in the body frame, likewise.
     """
 
-    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
-    inertia: Float[Array, "3 3"] = fields.parameter(
+    mass: fields.Number = fields.parameter(unit="kg", sign="positive")
+    inertia: fields.Number = fields.parameter(
         shape=None, unit="kg m²", sign="positive definite", converter=inertia_matrix
     )
 
@@ -95,9 +95,9 @@ class PointMass(AbstractSpatialPart, AbstractBody):
     """
 
     name: str = fields.name()
-    mass: Float[Array, ""] = fields.parameter(unit="kg", sign="positive")
-    position: Float[Array, "3"] = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
-    velocity: Float[Array, "3"] = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
+    mass: fields.Number = fields.parameter(unit="kg", sign="positive")
+    position: fields.Number = fields.guess(shape=(3,), unit="m", default=(0.0, 0.0, 0.0))
+    velocity: fields.Number = fields.guess(shape=(3,), unit="m/s", default=(0.0, 0.0, 0.0))
     rotates: ClassVar[bool] = False
 
     @property

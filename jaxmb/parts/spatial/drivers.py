@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..._types import Scalar
 from ...linalg.rotations import norm
@@ -36,13 +36,13 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
 
     quantity: Literal["angle", "x", "y", "z", "distance"] = fields.choice("angle", "x", "y", "z", "distance")
     motion: Callable[[Scalar, dict[str, Array]], Scalar] = fields.function(kw_only=True)
-    parameters: dict[str, Array] = fields.numbers()
-    point_a: Float[Array, "3"] = fields.point(body=0, optional=True)
-    point_b: Float[Array, "3"] = fields.point(body=1, optional=True)
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",), needed=False)
-    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
+    parameters: fields.Numbers = fields.numbers()
+    point_a: fields.Number = fields.point(body=0, optional=True)
+    point_b: fields.Number = fields.point(body=1, optional=True)
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",), needed=False)
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
 

@@ -3,7 +3,6 @@
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .. import fields
 from ..base import AbstractForce, AbstractPair, AbstractPotentialForce, AbstractSpatialPart
@@ -21,7 +20,7 @@ class Torque(AbstractSpatialPart, AbstractForce):
     name: str = fields.name()
     reaction: str = fields.body_name(default="ground")
     body: str = fields.body_name()
-    torque: Float[Array, "3"] = fields.parameter(shape=(3,), unit="N m")
+    torque: fields.Number = fields.parameter(shape=(3,), unit="N m")
     frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
 
     def wrenches(self, space, poses, velocities, t):
@@ -42,13 +41,13 @@ class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotential
     is zero at the given poses; `free_angle` [rad], default that of the given poses.
     """
 
-    stiffness: Float[Array, ""] = fields.parameter(unit="N m/rad", sign="non-negative")
-    damping: Float[Array, ""] = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
-    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    free_angle: Float[Array, ""] = fields.parameter(unit="rad", optional=True)
+    stiffness: fields.Number = fields.parameter(unit="N m/rad", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad", sign="non-negative", default=0.0)
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
+    free_angle: fields.Number = fields.parameter(unit="rad", optional=True)
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -76,14 +75,14 @@ class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     the given poses.
     """
 
-    stiffness: Float[Array, "6"] = fields.parameter(shape=(6,), unit="N/m (3), N m/rad (3)", sign="non-negative")
-    damping: Float[Array, "6"] = fields.parameter(
+    stiffness: fields.Number = fields.parameter(shape=(6,), unit="N/m (3), N m/rad (3)", sign="non-negative")
+    damping: fields.Number = fields.parameter(
         shape=(6,), unit="N s/m (3), N m s/rad (3)", sign="non-negative", default=(0.0,) * 6
     )
-    point_a: Float[Array, "3"] = fields.point(body=0, optional=True)
-    point_b: Float[Array, "3"] = fields.point(body=1, optional=True)
-    point: Float[Array, "3"] = fields.point(body=None, gives=("point_a", "point_b"))
-    orientation: Float[Array, "4"] = fields.attitude(optional=True)
+    point_a: fields.Number = fields.point(body=0, optional=True)
+    point_b: fields.Number = fields.point(body=1, optional=True)
+    point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
+    orientation: fields.Number = fields.attitude(optional=True)
 
     def complete(self, space, poses):
         return with_given_orientation(self, poses)

@@ -11,7 +11,6 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
 from .. import fields
@@ -57,9 +56,9 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
     body; or `axis`, unit, shape (3,), world.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 5
 
     def residual(self, space, poses, t):
@@ -73,10 +72,10 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     `body_a` and in `body_b`; each may be given in the world instead, as `axis_a_W` and `axis_b_W`.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    axis_a_W: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
-    axis_b_W: Float[Array, "3"] = fields.axis(body=None, gives=("axis_b",))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis_a_W: fields.Number = fields.axis(body=None, gives=("axis_a",))
+    axis_b_W: fields.Number = fields.axis(body=None, gives=("axis_b",))
     rows: ClassVar[int] = 4
 
     def validate(self):
@@ -98,9 +97,9 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     **Arguments:** as in `Revolute`.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 4
 
     def residual(self, space, poses, t):
@@ -121,13 +120,13 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     shape (3,), body-fixed and across the axis, between which θ is measured, default zero angle at the given poses.
     """
 
-    pitch: Float[Array, ""] = fields.parameter(unit="m", sign="nonzero")
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    x_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    offset: Float[Array, ""] = fields.parameter(unit="m", optional=True)
+    pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
+    offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
 
     def complete(self, space, poses):
@@ -155,9 +154,9 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
     poses.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
-    orientation: Float[Array, "4"] = fields.attitude(optional=True)
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
+    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 5
 
     def complete(self, space, poses):
@@ -173,9 +172,9 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis_b: Float[Array, "3"] = fields.axis(body=1, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
     rows: ClassVar[int] = 3
 
     def residual(self, space, poses, t):
@@ -189,7 +188,7 @@ class Fixed(AbstractSpatialPart, AbstractJoint):
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """
 
-    orientation: Float[Array, "4"] = fields.attitude(optional=True)
+    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 6
 
     def complete(self, space, poses):
@@ -207,9 +206,9 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; `length` [m] > 0, default that of the given poses.
     """
 
-    point_a: Float[Array, "3"] = fields.point(body=0, default=(0.0, 0.0, 0.0))
-    point_b: Float[Array, "3"] = fields.point(body=1, default=(0.0, 0.0, 0.0))
-    length: Float[Array, ""] = fields.length(sign="positive", optional=True)
+    point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
+    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0, 0.0))
+    length: fields.Number = fields.length(sign="positive", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -228,8 +227,8 @@ class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     `axis` in the world.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
 
     def residual(self, space, poses, t):
@@ -243,8 +242,8 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
     `axis` in the world.
     """
 
-    axis_a: Float[Array, "3"] = fields.axis(body=0, optional=True)
-    axis: Float[Array, "3"] = fields.axis(body=None, gives=("axis_a",))
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 2
 
     def residual(self, space, poses, t):

@@ -6,7 +6,6 @@ The plane is fixed in the world, given by a point and its normal `e`, which poin
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ...linalg.rotations import cross, norm
 from .. import fields
@@ -26,9 +25,9 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
 
     name: str = fields.name()
     body: str = fields.body_name()
-    point: Float[Array, "3"] = fields.point(body=0, default=(0.0, 0.0, 0.0))
-    axis: Float[Array, "3"] = fields.axis(body=0, default=(1.0, 0.0, 0.0))
-    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
+    point: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
+    axis: fields.Number = fields.axis(body=0, default=(1.0, 0.0, 0.0))
+    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
     rows: ClassVar[int] = 1
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
@@ -43,10 +42,10 @@ class AbstractDisk(AbstractSpatialPart):
 
     name: str = fields.name()
     body: str = fields.body_name()
-    radius: Float[Array, ""] = fields.length(sign="positive")
-    axis: Float[Array, "3"] = fields.axis(body=0, default=(0.0, 0.0, 1.0))
-    center: Float[Array, "3"] = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
-    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
+    radius: fields.Number = fields.length(sign="positive")
+    axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
+    center: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
 
 def _lowest_rim_point(space, part, pose):
@@ -76,7 +75,7 @@ class RollingDisk(AbstractDisk, AbstractCompound):
     the world.
     """
 
-    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
+    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
 
     def components(self):
         disk = {"radius": self.radius, "axis": self.axis, "center": self.center, "normal": self.normal}
@@ -86,7 +85,7 @@ class RollingDisk(AbstractDisk, AbstractCompound):
 class DiskContact(AbstractDisk, AbstractConstraint):
     """A disk that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisk`."""
 
-    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
+    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -112,10 +111,10 @@ class AbstractBall(AbstractSpatialPart):
 
     name: str = fields.name()
     body: str = fields.body_name()
-    radius: Float[Array, ""] = fields.length(sign="positive")
-    center: Float[Array, "3"] = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
-    point: Float[Array, "3"] = fields.point(body=None, default=(0.0, 0.0, 0.0))
-    normal: Float[Array, "3"] = fields.axis(body=None, default=(0.0, 0.0, 1.0))
+    radius: fields.Number = fields.length(sign="positive")
+    center: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
+    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
 
 class RollingSphere(AbstractBall, AbstractCompound):
@@ -126,7 +125,7 @@ class RollingSphere(AbstractBall, AbstractCompound):
     rate at which the plane turns about its normal through `point`, default a plane at rest.
     """
 
-    spin: Float[Array, ""] = fields.parameter(unit="rad/s", optional=True)
+    spin: fields.Number = fields.parameter(unit="rad/s", optional=True)
 
     def components(self):
         ball = {"radius": self.radius, "center": self.center, "point": self.point, "normal": self.normal}
@@ -153,7 +152,7 @@ class SphereRolling(AbstractBall, AbstractVelocityConstraint):
     Arguments as in `RollingSphere`; with a turntable the rows do not vanish at rest.
     """
 
-    spin: Float[Array, ""] = fields.parameter(unit="rad/s", optional=True)
+    spin: fields.Number = fields.parameter(unit="rad/s", optional=True)
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
 

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..linalg.elimination import cholesky, solve_positive
-from ..linalg.rotations import cross
+from .blocks import matrix_products
+from .elimination import cholesky, solve_positive
+from .rotations import cross
 
 
 class AbstractInertia(eqx.Module):
@@ -53,11 +54,11 @@ class DiagonalInertia(AbstractInertia):
 class BlockInertia(AbstractInertia):
     """Spatial bodies about their mass centres: mass on translations, a 3 × 3 matrix on the body-frame angular velocity.
 
-    **Fields:** `mass`: shape (bodies,) [kg]; `rotary`: shape (bodies, 3, 3) [kg m²].
+    **Fields:** `mass`: shape (bodies,) [kg]; `inertia`: shape (bodies, 3, 3) [kg m²].
     """
 
     mass: Float[Array, "b"]
-    rotary: Float[Array, "b 3 3"]
+    inertia: Float[Array, "b 3 3"]
 
     def _apply(self, rotate, scale, v):
         blocks = v.reshape(self.mass.shape[0], 6, -1)
@@ -65,16 +66,16 @@ class BlockInertia(AbstractInertia):
         return jnp.concatenate([translations, rotate(blocks[:, 3:])], axis=1).reshape(v.shape)
 
     def product(self, v):
-        return self._apply(lambda w: _block_product(self.rotary, w), self.mass, v)
+        return self._apply(lambda w: matrix_products(self.inertia, w), self.mass, v)
 
     def solve(self, f):
-        return self._apply(lambda n: _block_product(_inverse_3x3(self.rotary), n), 1 / self.mass, f)
+        return self._apply(lambda n: matrix_products(_inverse_3x3(self.inertia), n), 1 / self.mass, f)
 
     def root(self):
-        return BlockInertia(jnp.sqrt(self.mass), jax.vmap(cholesky)(self.rotary))
+        return BlockInertia(jnp.sqrt(self.mass), jax.vmap(cholesky)(self.inertia))
 
     def transpose(self):
-        return BlockInertia(self.mass, self.rotary.swapaxes(1, 2))
+        return BlockInertia(self.mass, self.inertia.swapaxes(1, 2))
 
 
 class DenseInertia(AbstractInertia):
@@ -93,11 +94,6 @@ class DenseInertia(AbstractInertia):
 
     def transpose(self):
         return DenseInertia(self.matrix.T)
-
-
-def _block_product(J, w):
-    # Written out: a batched dot of 3 × 3 blocks costs a library call, a sum of products fuses.
-    return jnp.sum(J[:, :, :, None] * w[:, None, :, :], axis=2)
 
 
 def _inverse_3x3(J):

@@ -3,11 +3,11 @@
 import diffrax
 
 from .manifold import AbstractManifold, all_rows_formulation
-from .projection import project_normalized
+from .orthogonal_projection import project_normalized
 from .vector_field import VectorField
 
 
-class Free(AbstractManifold):
+class Unconstrained(AbstractManifold):
     """Integrate all coordinates and leave the constraints to themselves.
 
     The policy of systems without constraints. With constraints the state drifts off them by the error of integration;

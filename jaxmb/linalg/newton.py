@@ -1,0 +1,87 @@
+"""Newton's method and its chord variant inside `lax`, and the derivative of what they find.
+
+Iterations are not differentiated: the derivative of a root follows from its equation, by the implicit function theorem.
+(The implicit solvers have an iteration of their own, in `solvers/_implicit.py`, which imports nothing of the package.)
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+
+def newton(
+    correct: Callable[[PyTree], tuple[PyTree, Float[Array, ""]]],
+    far: Callable[[PyTree, Float[Array, ""]], Bool[Array, ""]],
+    start: PyTree,
+    *,
+    most: int,
+    dtype: Any,
+) -> tuple[PyTree, Float[Array, ""]]:
+    """Correct an iterate until it is close enough.
+
+    **Arguments:** `correct(x)`: the next iterate and the size of the correction; `far(x, size)`: whether to go on from
+    an iterate that a correction of this size has led to; `most`: the largest number of corrections; `dtype` of sizes.
+
+    **Returns:** the last iterate and the size of its correction.
+    """
+
+    def advance(carry):
+        x, _, k = carry
+        return *correct(x), k + 1
+
+    def proceed(carry):
+        x, size, k = carry
+        return far(x, size) & (k < most)
+
+    x, size, _ = lax.while_loop(proceed, advance, (start, jnp.array(jnp.inf, dtype), 0))
+    return x, size
+
+
+def chord(
+    correct: Callable[[Array], tuple[Array, Float[Array, ""]]],
+    start: Array,
+    *,
+    first: Float[Array, ""],
+    tol: Any,
+    most: int,
+) -> tuple[Array, Int[Array, ""], Bool[Array, ""]]:
+    """Newton's method with one matrix for all corrections.
+
+    Corrections shrink by a constant factor, so the next one is known: no iteration is spent on verifying it. The
+    iteration ends where the next correction is below `tol`, or at the level of rounding errors, where corrections stop
+    shrinking; it fails where a correction exceeds 1.
+
+    **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
+    first correction is compared with (1: the matrix is as wrong as the first correction is large; 0: nothing is known
+    of it, and a second correction is made); `tol`; `most`: the largest number of corrections.
+
+    **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
+    """
+
+    def advance(carry):
+        x, before, _, k = carry
+        x, size = correct(x)
+        rate = jnp.where(size < before, size / before, 1.0)
+        rounded = (size < 4096 * jnp.finfo(size.dtype).eps) & (rate > 0.5)
+        return x, size, jnp.where(rounded, 0.0, size * rate), k + 1
+
+    def proceed(carry):
+        _, size, ahead, k = carry
+        return (ahead > tol) & (size < 1.0) & (k < most)
+
+    x, _, ahead, k = lax.while_loop(proceed, advance, advance((start, first, first, jnp.array(0))))
+    return x, k, ~(ahead <= tol)
+
+
+def root(residual: Callable[[Array], Array], start: Array, solve: Callable[[Callable, Array], Array]) -> Array:
+    """The root that `solve(residual, start)` finds, with the derivative that its equation gives it."""
+    return lax.custom_root(residual, start, solve, solve_linear)
+
+
+def solve_linear(linear: Callable[[Array], Array], b: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Solve `linear(x) = b` with the matrix of a linear function."""
+    return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)

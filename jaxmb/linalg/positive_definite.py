@@ -1,0 +1,79 @@
+"""Symmetric positive definite matrices by their structure: factored once, solved with as often as needed."""
+
+import abc
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from .elimination import gauss_jordan
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+
+class AbstractPositiveDefinite(eqx.Module):
+    """A symmetric positive definite matrix T. Its vectors may have a shape of their own, such as one row per block."""
+
+    @abc.abstractmethod
+    def product(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """`T x`."""
+
+    @abc.abstractmethod
+    def factor(self) -> "AbstractPositiveFactor":
+        """Eliminate once, for any number of right-hand sides."""
+
+
+class AbstractPositiveFactor(eqx.Module):
+    """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination carry none."""
+
+    matrix: AbstractVar[Any]
+
+    @abc.abstractmethod
+    def substitute(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """`T⁻¹ b` by the numbers of the elimination."""
+
+    @abc.abstractmethod
+    def smallest_pivot(self) -> Float[Array, ""]:
+        """The smallest share of a row of a Gram matrix that the rows before it leave over, between 0 (implied by them)
+        and 1 (orthogonal to them).
+        """
+
+    def solve(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """`T⁻¹ b`, differentiated implicitly, by the equation `T x = b`."""
+        return lax.custom_linear_solve(self.matrix.product, b, lambda _, b: self.substitute(b), symmetric=True)
+
+    def for_matrix(self, matrix: AbstractPositiveDefinite) -> Any:
+        """The same factor for a matrix of the same value that has derivatives of its own."""
+        return eqx.tree_at(lambda factor: factor.matrix, self, matrix)
+
+
+class DensePositiveDefinite(AbstractPositiveDefinite):
+    """A full matrix, shape (n, n)."""
+
+    matrix: Float[Array, "n n"]
+
+    def product(self, x):
+        return self.matrix @ x
+
+    def factor(self):
+        matrix = lax.stop_gradient(self.matrix)
+        inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
+        return DensePositiveFactor(self, inverse)
+
+
+class DensePositiveFactor(AbstractPositiveFactor):
+    """The inverse of a full matrix, shape (n, n)."""
+
+    matrix: DensePositiveDefinite
+    inverse: Float[Array, "n n"]
+
+    def substitute(self, b):
+        return self.inverse @ b
+
+    def smallest_pivot(self):
+        return jnp.min(1 / (jnp.diag(self.inverse) * jnp.diag(self.matrix.matrix)), initial=1.0)

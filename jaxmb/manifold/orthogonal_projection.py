@@ -1,0 +1,132 @@
+"""Projection of states on the constraints, with exact derivatives.
+
+`project` makes the smallest change in the scales of the coordinates; `project_in_metric` the smallest one in any metric
+of the velocities, by the projector of the Jacobian's structure.
+
+Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from .._types import Scalar, State
+from ..linalg.elimination import full_pivot, solve_positive
+from ..linalg.inertia import AbstractInertia, DiagonalInertia
+from ..linalg.jacobian import MassProjector
+from ..linalg.newton import chord, newton, root
+from ..system import AbstractSystem
+from .manifold import normalize_state
+
+_ITERATIONS = 8
+
+
+def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
+    """`project` from coordinates that need not satisfy their own invariants, such as interpolated ones."""
+    return project(system, t, normalize_state(system, t, y))
+
+
+def project(system: AbstractSystem, t: Scalar, y: State) -> State:
+    """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order where the
+    Jacobian is one dense matrix.
+    """
+    if system.elimination is not None:
+        metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
+        t, tol = jnp.asarray(t, y.q.dtype), 64 * jnp.finfo(y.q.dtype).eps
+        linearized_at = system.structured_jacobian(t, y.q, y.u).projector(metric)
+        return project_in_metric(system, t, y, lambda y: metric, linearized_at, tol)[0]
+    q = y.q
+    if system.coordinate_rank > 0:
+        t = jnp.asarray(t, q.dtype)
+        square = system.coordinate_scale() ** 2
+        jacobian = system.coordinate_jacobian(t, q)
+        rows = _independent(jacobian, system.coordinate_scale(), system.coordinate_rank)
+        ahead = jacobian[rows] * square[None, :]
+        gram = ahead @ jacobian[rows].T
+        moved = lambda multipliers: q - ahead.T @ multipliers
+        residual = lambda multipliers: system.coordinate_residual(t, moved(multipliers))[rows]
+        q = moved(_multipliers(residual, gram))
+    u = y.u
+    if system.velocity_rank > 0:
+        square = system.velocity_scale() ** 2
+        for _ in range(1 if system.linear else 3):
+            jacobian = system.velocity_jacobian(t, q, u)
+            rows = _independent(jacobian, system.velocity_scale(), system.velocity_rank)
+            ahead = jacobian[rows] * square[None, :]
+            u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
+    return State(q, u)
+
+
+def _independent(jacobian: Array, scale: Array, rank: int) -> Any:
+    return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
+
+
+def _multipliers(residual, gram: Array) -> Array:
+    """The root of the residual, by the chord method from zero multipliers."""
+    start = jnp.zeros(gram.shape[0], gram.dtype)
+    gram = lax.stop_gradient(gram)
+
+    def solve(residual, start):
+        def correct(x):
+            step = solve_positive(gram, residual(x))  # the residual falls as the multipliers grow
+            return x + step, jnp.max(jnp.abs(step))
+
+        far = lambda x, size: size > 64 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=1e-8)
+        return newton(correct, far, start, most=_ITERATIONS, dtype=start.dtype)[0]
+
+    return root(residual, start, solve)
+
+
+def project_in_metric(
+    system: AbstractSystem,
+    t: Scalar,
+    y: State,
+    metric_at: Callable[[State], AbstractInertia],
+    linearized_at: MassProjector,
+    tol: Scalar,
+) -> tuple[State, MassProjector, Int[Array, ""], Bool[Array, ""]]:
+    """Project a state on constraints that are linear in velocities, by the smallest displacement in a metric.
+
+    Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.
+
+    **Arguments:** `metric_at`: the metric at a state; `linearized_at`: the projector at a state close by, whose
+    derivatives do not count; `tol`: size of the last Newton correction, relative to the system's size.
+
+    **Returns:** the state, the projector there, the number of Newton iterations, and whether they failed.
+    """
+    fixed_system, fixed_t, before, fixed, tol = lax.stop_gradient((system, t, y, linearized_at, tol))
+    scale = fixed_system.velocity_scale()
+
+    def correct(q):
+        step = fixed.cancel(_position_rows(fixed_system, fixed_t, q))
+        return _moved(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
+
+    first = jnp.ones((), y.q.dtype)
+    found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
+    # The solution depends on the state that it was found from as one Newton correction at it does, with constant
+    # matrices.
+    own = fixed_system.structured_jacobian(fixed_t, found, before.u)
+    own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
+    q = y.q + (found - before.q)
+    q = _moved(system, t, q, own.cancel(_position_rows(system, t, q)))
+    at = State(q, y.u)
+    here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
+    u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
+    return State(q, u), here, iterations, failed
+
+
+def _moved(system, t, q, step):
+    """The coordinates after a small displacement along the velocities."""
+    if system.rates_are_velocities:
+        return q + step
+    _, change = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))
+    return system.normalize(q + change)
+
+
+def _position_rows(system, t, q):
+    """Φ, and zeros for the rows that bind velocities only."""
+    return jnp.pad(system.position_residual(t, q), (0, system.velocity_rows - system.position_rows))
