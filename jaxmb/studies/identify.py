@@ -45,7 +45,7 @@ class Identification:
         Without `sigma` the noise is estimated from the residuals. Infinite for parameters that the data do not
         determine, NaN where there are no more residuals than parameters and no `sigma`.
     - `covariance`: of all components, in the order of `components`, the names of all scalar components.
-    - `undetermined`: names of components that may change together, or alone, without changing the residuals.
+    - `undetermined`: names of components that can change, alone or together, without changing the residuals.
     - `residuals`: weighted, at the solution; `rms`: their root mean square.
     - `iterations`; `success`: whether the iteration converged; `message` says how it ended.
     - `system`, `state`: with the estimated parameters, ready for `simulate`.
@@ -118,9 +118,10 @@ def identify(
 
     - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
         it every quantity is weighted by its own range, and the noise is estimated from the residuals.
-    - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Masses and moments of inertia
-        of bodies stay positive, and inertia matrices positive definite, without being told; of a `LagrangianSystem` no
-        name means anything. Unbounded parameters are scaled by their start.
+    - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
+        to be positive, such as masses and moments of inertia, stay so without bounds, and inertia matrices stay
+        positive definite; the parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are
+        scaled by their start.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
         optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.

@@ -118,7 +118,7 @@ def free_parameters(
 
     **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
     `(low, high)` by name, either of them None. The system's `positive_parameters`, such as masses and moments of
-    inertia of bodies, stay positive, or positive definite if they are matrices, without bounds.
+    inertia of bodies, stay positive without bounds, or positive definite if they are matrices.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
     bounds.

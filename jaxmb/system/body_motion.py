@@ -48,9 +48,9 @@ def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
         stacked = group.group
         for k, of_parts in enumerate(stacked.body_index.T):
             anchors = stacked.part.anchor(k)
-            for body, point in zip(
-                of_parts, () if anchors is None else np.asarray(anchors), strict=anchors is not None
-            ):
+            if anchors is None:
+                continue
+            for body, point in zip(of_parts, np.asarray(anchors), strict=True):
                 if body < bodies:
                     points[body][tuple(np.round(point, 12))] = point
     return [np.stack(list(own.values())) if own else np.zeros((0, 0)) for own in points]
