@@ -119,7 +119,7 @@ class ProjectionTerm(AbstractManifoldTerm):
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
-    """A solver followed by the projection of what it returns."""
+    """A Runge–Kutta solver whose steps end with a projection on the constraints."""
 
     solver: diffrax.AbstractSolver
     system: AbstractSystem
