@@ -1,4 +1,4 @@
-"""Block-tridiagonal matrices against dense ones."""
+"""Structured positive definite matrices against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxmb.linalg.block_tridiagonal import BlockTridiagonal
+from jaxmb.linalg.positive_definite import DensePositiveDefinite
 
 
 def dense(diagonal, coupling):
@@ -52,3 +53,20 @@ def test_solution_and_its_derivatives(k, r):
     # What the last block leaves over of a row, given all others, from the inverse of the whole.
     last = np.diag(np.linalg.inv(T))[-r:] * np.diag(T)[-r:]
     assert 0 < pivot <= np.min(1 / last) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_dense_matrices(n):
+    rng = np.random.default_rng(n)
+    root, change = rng.normal(size=(2, n, n))
+    T, dT = root @ root.T + n * np.eye(n), change + change.T
+    b = rng.normal(size=n)
+    solve = lambda T: DensePositiveDefinite(T).factor().solve(b)
+    x, dx = jax.jvp(solve, (jnp.asarray(T),), (jnp.asarray(dT),))
+    np.testing.assert_allclose(x, np.linalg.solve(T, b), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(dx, -np.linalg.solve(T, dT @ x), rtol=0, atol=1e-12)
+    # The factor of one matrix with the derivatives of another of the same value.
+    borrowed = lambda s: DensePositiveDefinite(T).factor().for_matrix(DensePositiveDefinite(T + s * dT)).solve(b)
+    np.testing.assert_allclose(jax.jacrev(borrowed)(0.0), dx, rtol=0, atol=1e-12)
+    pivot = DensePositiveDefinite(jnp.asarray(T)).factor().smallest_pivot()
+    assert pivot == pytest.approx(np.min(1 / (np.diag(np.linalg.inv(T)) * np.diag(T))), rel=1e-12)

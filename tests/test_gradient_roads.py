@@ -93,6 +93,7 @@ HANGING = diffrax.Event(lambda t, y, args, **kwargs: y.q[2] + 0.3, optx.Newton(r
 
 ROADS = {
     "projection": (double_pendulum, {"solver": diffrax.Dopri8()}, at_the_end),
+    "projection by Adams": (double_pendulum, {"manifold": mb.manifold.Projection()}, at_the_end),
     "multipliers, saved times": (
         double_pendulum,
         {"formulation": mb.formulations.Multipliers(), "saveat": TIMES},

@@ -448,6 +448,7 @@ def dry_friction():
         (ring, {"formulation": Poincare()}, r"Projection with Adams finds accelerations by Multipliers\(\)"),
         (skater, {}, "linear in velocities"),
         (dry_friction, {}, "ideal"),
+        (lambda: mb.mechanisms.get("spherical_four_bar").system, {}, "inverse of the mass matrix"),
     ],
 )
 def test_projection_with_adams_refuses(build, options, message):

@@ -1,4 +1,4 @@
-"""What a formulation is: a way to solve one linear-quadratic problem for accelerations and multipliers.
+"""A formulation: a method of solving one linear-quadratic problem for accelerations and multipliers.
 
     minimise ½ (u̇ − M⁻¹F)ᵀ M (u̇ − M⁻¹F)  subject to  A u̇ = γ,    M u̇ = F + Aᵀ λ
 

@@ -1,4 +1,4 @@
-"""Mass matrices by structure, so that products and solves cost what the structure costs."""
+"""Mass matrices by their structure: full, diagonal, or one block per body."""
 
 import abc
 
@@ -14,7 +14,7 @@ from .rotations import cross
 
 
 class AbstractInertia(eqx.Module):
-    """A symmetric positive definite mass matrix M (n × n), or a root of one, in its structure."""
+    """A symmetric positive definite mass matrix M (n × n), or a root of one."""
 
     @abc.abstractmethod
     def product(self, v: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -26,7 +26,7 @@ class AbstractInertia(eqx.Module):
 
     @abc.abstractmethod
     def root(self) -> "AbstractInertia":
-        """L with `M = L Lᵀ`: in the frame of the quasi-velocities `Lᵀ u` the mass matrix is the identity."""
+        """L with `M = L Lᵀ`: in the quasi-velocities `Lᵀ u` the mass matrix is the identity."""
 
     @abc.abstractmethod
     def transpose(self) -> "AbstractInertia":

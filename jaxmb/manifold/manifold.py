@@ -1,4 +1,4 @@
-"""What a manifold policy is: how the state stays on the constraints while it is integrated."""
+"""A manifold policy: how the state stays on the constraints while it is integrated."""
 
 import abc
 from collections.abc import Callable

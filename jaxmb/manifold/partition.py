@@ -59,8 +59,8 @@ class Partition(AbstractManifold):
     The formulation finds the accelerations of predicted states; those of corrected states follow by one step of
     Newton's method with the same factor.
 
-    **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to what it was when the chart was
-    made, whichever is more: errors of the independent components reach the dependent ones multiplied by H and its
+    **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to its value when the chart was made,
+    whichever is larger: errors of the independent components reach the dependent ones multiplied by H and its
     rates; `newton_tol`: size of the last Newton correction relative to the system's size, default tied to the
     tolerance of integration.
     """

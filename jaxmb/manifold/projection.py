@@ -63,7 +63,12 @@ class Projection(AbstractManifold):
 
 
 def _check_multistep(system, formulation):
-    """Refuse what one factor of `A M⁻¹ Aᵀ` does not serve."""
+    """Refuse systems and formulations that one factor of `A M⁻¹ Aᵀ` does not serve."""
+    if not system.regular:
+        raise ValueError(
+            "Projection with Adams needs the inverse of the mass matrix, which is singular in these velocities; use "
+            "Partition()."
+        )
     if not isinstance(formulation, Multipliers):
         raise ValueError(
             f"Projection with Adams finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
@@ -126,7 +131,7 @@ class ProjectionTerm(AbstractManifoldTerm):
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
-    """A solver followed by the projection of what it returns."""
+    """A Runge–Kutta solver whose steps end with a projection on the constraints."""
 
     solver: diffrax.AbstractSolver
     system: AbstractSystem

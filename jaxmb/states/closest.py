@@ -234,6 +234,6 @@ def velocities_by_blocks(
 
 
 def _projector(system, t, q, held) -> MassProjector:
-    # What is held has an infinite mass.
+    # Coordinates and rates that are held have an infinite mass.
     metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
     return system.structured_jacobian(t, q, jnp.zeros_like(q)).projector(metric)

@@ -50,7 +50,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
                 + (
                     f"assembled from the given poses, which violate {listed}. Give poses nearer to the constraints."
                     if listed
-                    else "told from redundant rows. Move the points of joints apart."
+                    else "distinguished from redundant rows. Move the points of joints apart."
                 )
             )
     found = _analyse(system)
@@ -114,7 +114,7 @@ def _analyse(system):
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.drift_free):
-        # Implied rows must be consistent with the rows that imply them; what least squares leaves over is a
+        # Implied rows must be consistent with the rows that imply them; a residual of least squares is a
         # contradiction.
         if system.velocity_rows:
             asked = system.velocity_residual(t, q, u)
@@ -127,7 +127,7 @@ def _analyse(system):
 
 
 def _least_squares(jacobian, scale, asked):
-    """The smallest solution x of `jacobian x + asked = 0`, and what it leaves over."""
+    """The smallest least-squares solution x of `jacobian x + asked = 0`, and its residual."""
     x = -scale * (jnp.linalg.pinv(jacobian * scale[None, :], rtol=1e-8) @ asked)
     return x, jacobian @ x + asked
 
