@@ -64,7 +64,7 @@ class Projection(AbstractManifold):
 
 def _check_multistep(system, formulation):
     """Refuse systems and formulations that one factor of `A M⁻¹ Aᵀ` does not serve."""
-    if not system.regular:
+    if not system.positive_definite_mass:
         raise ValueError(
             "Projection with Adams needs the inverse of the mass matrix, which is singular in these velocities; use "
             "Partition()."
