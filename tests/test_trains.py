@@ -227,7 +227,9 @@ def test_hinge_forces_are_those_of_one_matrix_of_all(n):
         q, u = random_state(system, rng)
         (udot, multipliers), force = solve(q, u)
         arrays = (np.asarray(x).reshape(n, 3) for x in (q, u, force))
-        expected, forces = oracle.hinged_accelerations(*arrays, np.asarray(system.mass), np.asarray(system.moments_of_inertia))
+        expected, forces = oracle.hinged_accelerations(
+            *arrays, np.asarray(system.mass), np.asarray(system.moments_of_inertia)
+        )
         np.testing.assert_allclose(udot.reshape(n, 3), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
         np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, rtol=0, atol=1e-12 * np.max(np.abs(forces)))
 
