@@ -194,4 +194,4 @@ def test_building_a_scene_compiles_nothing_but_its_analysis():
         stiffness = mb.parameters(mb.with_parameters(system, {"coil.stiffness": 4.0}))["coil.stiffness"]
     assert float(stiffness) == 4.0
     # Whether its joint and its spring turn the point mass is asked of themselves.
-    assert names == {"_analyse", "_felt"}
+    assert names == {"_analyse", "_strength"}

@@ -102,8 +102,8 @@ class LagrangianSystem(AbstractLagrangian):
             coordinates=_names(coordinates, guess.q.size),
             sizes=constraint_sizes(*functions, constraints, kinematics, guess, numbers),
         )
-        for name in model.__dataclass_fields__:
-            setattr(self, name, getattr(model, name))
+        for field in dataclasses.fields(model):
+            setattr(self, field.name, getattr(model, field.name))
         for name, value in find_structure(model)._asdict().items():
             setattr(self, name, value)
         self.equations.check(self)

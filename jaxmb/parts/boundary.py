@@ -26,7 +26,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
     """
     dtype = np.dtype(jnp.result_type(float))
-    poses = np.tile(np.asarray(space.prepare(jnp.asarray(space.ground, dtype))), (bodies, 1))
+    poses = np.tile(space.prepare(np.asarray(space.ground, dtype)), (bodies, 1))
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
     if isinstance(part, AbstractConstraint):

@@ -40,7 +40,8 @@ class PlanarSpace(AbstractSpace):
         return _turned_back(pose, v_W)
 
     def prepare(self, pose):
-        return jnp.concatenate([pose, jnp.cos(pose[2:3]), jnp.sin(pose[2:3])])
+        xp = namespace(pose)
+        return xp.concatenate([pose, xp.cos(pose[2:3]), xp.sin(pose[2:3])])
 
     def rates(self, pose, velocity):
         if not _prepared(pose):

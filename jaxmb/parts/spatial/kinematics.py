@@ -5,6 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from ...linalg import rotations as rot
+from ...linalg.arrays import namespace
 from ..space import AbstractSpace
 
 
@@ -38,7 +39,7 @@ class SpatialSpace(AbstractSpace):
         return _turned_back(pose, v_W)
 
     def prepare(self, pose):
-        return jnp.concatenate([pose, rot.rotation_matrix(pose[3:]).reshape(-1)])
+        return namespace(pose).concatenate([pose, rot.rotation_matrix(pose[3:]).reshape(-1)])
 
     def rates(self, pose, velocity):
         rates = jnp.concatenate([velocity[:3], rot.rates(pose[3:7], velocity[3:])])
