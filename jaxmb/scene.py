@@ -89,13 +89,10 @@ class Scene(eqx.Module):
 
         gravity, parts, laws, joints = None, [], [], {}
         for part in (*self.joints, *self.forces):
-            if isinstance(part, Gravity):
-                part.check(space.dimension)
-                gravity = part
-            elif isinstance(part, AbstractNonIdeal):
+            if isinstance(part, AbstractNonIdeal):
                 joint, own = joints[part.joint]
                 laws.append((part.resolve(space, joint, given[list(own)]), own))
-            else:
+            elif isinstance(part, AbstractLink):
                 own = tuple(index[name] for name in part.bodies)
                 poses = given[list(own)]
                 resolved = _call(part, "resolve", space, poses)
@@ -103,6 +100,9 @@ class Scene(eqx.Module):
                 components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
                 _check_rotation(resolved, components, own, layout, poses)
                 parts += [(component, own) for component in components]
+            else:
+                part.check(space.dimension)
+                gravity = part
 
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
@@ -151,9 +151,10 @@ def _check_kinds(scene: Scene):
         if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
             raise ValueError(f"joints must hold constraints, got {part!r}.")
     for part in scene.forces:
+        # A concrete class: gravity is of no kind but its own, since it acts on every body.
         if not isinstance(part, AbstractForce | AbstractNonIdeal | Gravity):
             raise ValueError(f"forces must hold force elements, friction of joints, or Gravity, got {part!r}.")
-    if sum(isinstance(part, Gravity) for part in scene.forces) > 1:
+    if sum(not isinstance(part, AbstractForce | AbstractNonIdeal) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     dimension = scene.bodies[0].dimension
     for part in (*scene.bodies, *scene.joints, *scene.forces):
@@ -174,16 +175,15 @@ def _check_names(scene: Scene):
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(part.name)
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
-    # A program of a Servo is no joint: nothing slides in it.
-    joints = dict.fromkeys(part.name for part in scene.joints if not isinstance(part, Servo))
+    # The program of a servo is no joint: nothing slides in it.
+    kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
+    joints = dict.fromkeys(part.name for part in scene.joints if isinstance(part, kinds))
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractNonIdeal):
             if part.joint not in joints:
                 raise ValueError(f"{part.label}: {unknown('joint', part.joint, joints)}")
             continue
-        if isinstance(part, Gravity):
-            continue
-        for name in part.bodies:
+        for name in part.bodies if isinstance(part, AbstractLink) else ():
             if name not in known:
                 raise ValueError(f"{part.label}: {unknown('body', name, known)}")
         twice = [name for name in part.bodies if part.bodies.count(name) > 1]
@@ -210,7 +210,7 @@ def _strength(part, space, poses):
     if isinstance(part, AbstractForce):
         velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
         return jnp.abs(part.wrenches(space, poses, velocities, jnp.zeros((), poses.dtype)))
-    rows = rows_of(part.program if isinstance(part, Servo) else part, space, poses)
+    rows = rows_of(part, space, poses)
     return jnp.sum(jnp.abs(rows), axis=0)
 
 

@@ -6,7 +6,7 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,11 +29,13 @@ class AbstractFormulation(eqx.Module):
 
     `inverts_mass` says whether it needs the inverse of the mass matrix, which some systems do not have; `partitions`
     says whether it needs the velocities split into dependent and independent ones. A formulation that does not
-    partition needs only the independent rows, so no pivots are searched for where no row is redundant.
+    partition needs only the independent rows, so no pivots are searched for where no row is redundant. `takes_blocks`
+    says whether it takes a Jacobian in blocks as it is; others make one dense matrix of it.
     """
 
     partitions: AbstractVar[bool]
     inverts_mass: AbstractVar[bool]
+    takes_blocks: ClassVar[bool] = False
 
     @abc.abstractmethod
     def solve(

@@ -14,6 +14,7 @@ class Multipliers(AbstractFormulation):
 
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = True
+    takes_blocks: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma):
         free = inertia.solve(force)

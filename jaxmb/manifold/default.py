@@ -2,7 +2,7 @@
 
 import diffrax
 
-from ..formulations import AbstractFormulation, Multipliers
+from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
 from ..system import AbstractSystem
 from .manifold import AbstractManifold
@@ -20,5 +20,5 @@ def default_manifold(
     if not isinstance(solver, AbstractMultistep):
         return Projection()
     # Block elimination serves multipliers only: it singles out no independent columns.
-    in_blocks = system.elimination is not None and isinstance(formulation, Multipliers | None)
+    in_blocks = system.elimination is not None and (formulation is None or formulation.takes_blocks)
     return Projection() if in_blocks and not solver.solves_implicitly else Partition()

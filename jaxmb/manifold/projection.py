@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..formulations import AbstractFormulation, Multipliers
+from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
@@ -69,7 +69,7 @@ def _check_multistep(system, formulation):
             "Projection with Adams needs the inverse of the mass matrix, which is singular in these velocities; use "
             "Partition()."
         )
-    if not isinstance(formulation, Multipliers):
+    if not formulation.takes_blocks:
         raise ValueError(
             f"Projection with Adams finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
             "the formulation out, or use Partition()."

@@ -179,6 +179,7 @@ def build(
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
+    # A concrete class: only a scene has parts to build on, and is still to be compiled.
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)

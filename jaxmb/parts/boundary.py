@@ -1,7 +1,7 @@
 """Checks of what the kernels of a part return, by abstract evaluation: nothing is computed or compiled."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
     """
     dtype = np.dtype(jnp.result_type(float))
-    poses = np.tile(space.prepare(np.asarray(space.ground, dtype)), (bodies, 1))
+    poses = np.tile(space.prepare(cast(Any, np.asarray(space.ground, dtype))), (bodies, 1))
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
     if isinstance(part, AbstractConstraint):

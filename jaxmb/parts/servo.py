@@ -43,5 +43,13 @@ class Servo(AbstractLink):
     def dimensions(self):
         return self.program.dimensions
 
+    @property
+    def rows(self):
+        return self.program.rows
+
+    def residual(self, space, poses, t):
+        """Φ of the program."""
+        return self.program.residual(space, poses, t)
+
     def complete(self, space, poses):
         return self.with_fields(program=self.program.resolve(space, poses))
