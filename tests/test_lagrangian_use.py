@@ -116,7 +116,7 @@ def test_messages_of_construction(changes, message):
         ({"rates": {"w": 1.0}}, "there are 'x', 'y', 'z'"),
         ({"fix": {"x": 1.3}}, r"with x fixed: residuals remain in rod"),
         ({"fix": {"x": 0.6, "y": 0.8}}, "not independent of each other"),
-        ({"rates": {"x": 0.6, "y": 0.9}}, "rates x, y fixed: rod"),
+        ({"rates": {"x": 0.6, "y": 0.9}}, "satisfy rod with the rates x, y fixed"),
     ],
 )
 def test_messages_of_assembly(system, prescribed, message):
