@@ -30,46 +30,51 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
     if isinstance(part, AbstractConstraint):
-        _check(part, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
+        check_returns(part.label, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
     elif isinstance(part, AbstractVelocityConstraint):
-        _check(part, "residual", (part.rows,), lambda x, v, t: part.residual(space, x, v, t), poses, velocities, t)
+        check_returns(
+            part.label, "residual", (part.rows,), lambda x, v, t: part.residual(space, x, v, t), poses, velocities, t
+        )
     elif isinstance(part, AbstractNonIdeal):
         kernel = lambda x, v, r, t: part.wrenches(space, x, v, r, t)
-        _check(part, "wrenches", of_bodies, kernel, poses, velocities, velocities, t)
+        check_returns(part.label, "wrenches", of_bodies, kernel, poses, velocities, velocities, t)
     elif isinstance(part, AbstractForce):
-        _check(part, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t)
+        check_returns(
+            part.label, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t
+        )
         if isinstance(part, AbstractPotentialForce):
             if part.conservative:
-                _check(part, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
+                check_returns(part.label, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
         elif hasattr(part, "energy"):
             raise ValueError(
                 f"{part.label} has an energy that nothing asks for; derive it from AbstractPotentialForce."
             )
 
 
-def _check(part: Any, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
-    out = _evaluated(part, name, kernel, given)
+def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
+    """Raise a `ValueError` unless a kernel of NumPy arrays returns this shape, and the dtype of the first of them."""
+    out = _evaluated(label, name, kernel, given)
     if not hasattr(out, "shape") or out.shape != shape:
         found = getattr(out, "shape", type(out).__name__)
-        raise ValueError(f"{part.label}: {name} must return shape {shape}, got {found}.")
+        raise ValueError(f"{label}: {name} must return shape {shape}, got {found}.")
     if out.dtype != given[0].dtype:
-        raise ValueError(f"{part.label}: {name} must return {given[0].dtype} numbers, got {out.dtype}.")
+        raise ValueError(f"{label}: {name} must return {given[0].dtype} numbers, got {out.dtype}.")
 
 
-def _evaluated(part: Any, name: str, kernel: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     try:
         # NumPy's arrays refuse an index past their end, which JAX's replace by the last one.
         return jax.eval_shape(lambda: _as_array(kernel(*given)))
     except IndexError as error:
         if "out of bounds" in str(error):
-            raise ValueError(f"{part.label}: {name} takes what is not there: {error}.") from error
+            raise ValueError(f"{label}: {name} takes what is not there: {error}.") from error
     except Exception:
         # What NumPy's arrays cannot do, such as `.at[...]`.
         pass
     try:
         return jax.eval_shape(lambda *given: _as_array(kernel(*given)), *given)
     except Exception as error:
-        raise ValueError(f"{part.label}: {name} cannot be evaluated: {str(error).strip().splitlines()[0]}") from error
+        raise ValueError(f"{label}: {name} cannot be evaluated: {str(error).strip().splitlines()[0]}") from error
 
 
 def _as_array(value: Any) -> Any:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
+from .boundary import check_returns
 from .smooth import ramp, step
 from .terrain import AbstractTerrain
 
@@ -191,6 +192,8 @@ class AbstractContact(AbstractPotentialForce):
             shape = getattr(part, field).shape
             if shape not in shapes:
                 raise ValueError(f"{self.label}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
+        place = np.zeros(d - 1, part.points.dtype)
+        check_returns(self.label, "terrain.height", (), self.terrain.height, place)
         return part
 
     def wrenches(self, space, poses, velocities, t):
