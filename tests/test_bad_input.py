@@ -275,7 +275,7 @@ def lock_up(rod_length):
     return mb.Scene([crank, block], joints=joints).compile()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lock_up_ends_with_its_own_result():
     def turn(length, throw=False):
         system = lock_up(length)

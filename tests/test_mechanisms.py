@@ -43,7 +43,7 @@ CASES = [
     ("rod_chain", {"n": 2}, 1e-6),
     ("rod_chain", {"n": 5}, 1e-6),
     ("rod_chain", {"n": 10}, 1e-6),
-    pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.slow),
+    pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.long),
     ("train", {}, 1e-5),
     ("four_bar", {}, 1e-7),
     ("slider_crank", {}, 1e-7),
@@ -57,8 +57,8 @@ CASES = [
     ("free_body", {}, 1e-7),
     ("heavy_top", {}, 1e-7),
     ("rolling_disk", {}, 1e-8),
-    pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.slow),
-    pytest.param("bricard", {}, 1e-6, marks=pytest.mark.slow),
+    pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.long),
+    pytest.param("bricard", {}, 1e-6, marks=pytest.mark.long),
     *((name, {}, 1e-8) for name in LINKAGES),
     ("roller_racer", {}, 1e-7),
     ("nonholonomic_cart", {}, 1e-7),
@@ -329,7 +329,7 @@ def test_stiff_bushings_tend_to_hinges():
 # The rolling disk beyond steady motion
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("spin, frequency", [(3.0, 2.429815), (5.0, 6.656125), (8.0, 11.743253)])
 def test_an_upright_rolling_disk_wobbles_at_the_frequency_of_small_oscillations(spin, frequency):
     mechanism = mechanisms.rolling_disk(radius=0.5, lean=1e-4, roll=spin, turn=0.0)

@@ -41,7 +41,7 @@ def test_lint(path):
             assert not FORBIDDEN.search(text), f"{path.name}: {FORBIDDEN.search(text)!r}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 # Of the kernel's own files, which this package does not touch.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")

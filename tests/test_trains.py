@@ -531,7 +531,7 @@ def test_program_and_memory_of_long_trains(coupler):
     assert large <= 4.2 * small
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="needs a machine for itself: no tests beside it")
 @pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute])
 def test_time_of_long_trains(coupler):

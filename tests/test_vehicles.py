@@ -30,7 +30,7 @@ def poses(model, z):
     return np.concatenate([r, angles[..., None]], axis=-1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("units", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("units", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_degrees_of_freedom_statics_and_motion(units):
     made, model = vehicle(units), oracle.Vehicle(units)
     system = made.system
