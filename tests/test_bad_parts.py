@@ -1,4 +1,4 @@
-"""Mistakes in a user's own part are refused when its scene is compiled, by an error that names the part and the cure."""
+"""Mistakes in a user's own part are refused when its scene is compiled; the error names the part and the cure."""
 
 import jax.numpy as jnp
 import numpy as np

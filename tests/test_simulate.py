@@ -303,3 +303,13 @@ def test_a_system_without_bodies_has_the_same_views(tmp_path):
         mb.viz.plot_mechanism(motion)
     coordinates = mb.viz.plot_motion(motion).axes[0]
     assert [line.get_label() for line in coordinates.lines] == ["x1", "y1", "y2"]
+
+
+def test_moment_of_a_blade_is_about_its_point():
+    """A blade exerts a force at its contact point and no moment there."""
+    sleigh = mb.mechanisms.chaplygin_sleigh()
+    sol = mb.simulate(sleigh.system, sleigh.state, t1=0.5, rtol=1e-9)
+    (name,) = sol.reactions
+    reaction = sol.reactions[name]
+    assert float(jnp.max(jnp.abs(reaction.force))) > 0.1
+    np.testing.assert_allclose(reaction.moment, 0.0, atol=1e-12)
