@@ -182,13 +182,13 @@ def _check_names(scene: Scene):
         if isinstance(part, AbstractNonIdeal):
             if part.joint not in joints:
                 raise ValueError(f"{part.label}: {unknown('joint', part.joint, joints)}")
-            continue
-        for name in part.bodies if isinstance(part, AbstractLink) else ():
-            if name not in known:
-                raise ValueError(f"{part.label}: {unknown('body', name, known)}")
-        twice = [name for name in part.bodies if part.bodies.count(name) > 1]
-        if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
-            raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
+        elif isinstance(part, AbstractLink):
+            for name in part.bodies:
+                if name not in known:
+                    raise ValueError(f"{part.label}: {unknown('body', name, known)}")
+            twice = [name for name in part.bodies if part.bodies.count(name) > 1]
+            if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
+                raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
 
 
 def _check_rotation(part, components, own, layout, poses):
