@@ -87,3 +87,22 @@ def test_double_precision_is_left_to_the_user():
     code = "import jax, jaxmb; print(jax.config.jax_enable_x64)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
+
+
+def test_concrete_classes_are_seldom_looked_for():
+    """Behaviour is asked of objects; where a concrete class is looked for, a comment above says why."""
+    trees = {module: ast.parse(path.read_text()) for module, path in FILES.items()}
+    classes = {node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    concrete = {name for name in classes if not name.startswith("Abstract")} - {"State"}
+    found = []
+    for module, tree in trees.items():
+        lines = FILES[module].read_text().splitlines()
+        for node in ast.walk(tree):
+            if not (isinstance(node, ast.Call) and getattr(node.func, "id", "") == "isinstance"):
+                continue
+            named = {own.id for own in ast.walk(node.args[1]) if isinstance(own, ast.Name)}
+            if named & concrete:
+                found.append(f"{module}:{node.lineno}")
+                above = lines[max(node.lineno - 6, 0) : node.lineno]
+                assert any("A concrete class" in line for line in above), f"{found[-1]} gives no reason"
+    assert len(found) <= 10, found
