@@ -145,14 +145,14 @@ def _check_kinds(scene: Scene):
     for body in scene.bodies:
         if not isinstance(body, AbstractBody):
             raise ValueError(
-                f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own."
+                f"bodies must hold Body or PointMass, got {body!r}; pass the others as joints= and forces=."
             )
     for part in scene.joints:
         if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
             raise ValueError(f"joints must hold constraints, got {part!r}.")
     for part in scene.forces:
         if not isinstance(part, AbstractForce | AbstractNonIdeal | Gravity):
-            raise ValueError(f"forces must hold force elements, friction of joints, or Gravity, got {part!r}.")
+            raise ValueError(f"forces must hold force elements, joint friction, or Gravity, got {part!r}.")
     if sum(isinstance(part, Gravity) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     dimension = scene.bodies[0].dimension

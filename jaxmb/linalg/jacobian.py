@@ -98,7 +98,7 @@ class DenseJacobian(AbstractJacobian):
     @property
     def pivoted(self) -> Factor:
         """The factor, for formulations that split velocities into dependent and independent ones."""
-        assert self.factor is not None, "a formulation that partitions is given the factor of a chart"
+        assert self.factor is not None, "a partitioning formulation needs the factor of a chart"
         return self.factor
 
     def product(self, v):

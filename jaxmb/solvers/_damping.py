@@ -56,7 +56,7 @@ def sectors(family: str) -> NDArray[np.float64]:
     return out
 
 
-# One member of a batch after the other; see `jaxmb.elimination`.
+# One member of a batch after the other; see `jaxmb.linalg`.
 @jax.custom_batching.sequential_vmap
 def _lapack_eigenvalues(matrix):
     return jnp.linalg.eigvals(matrix)

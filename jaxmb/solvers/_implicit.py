@@ -131,17 +131,17 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """What solves `(P - c) x = r`, with `P = 1 - a J - b J²`, and c the b of the derivative of g at a held rate.
+    """Inverses for `(P - C) x = r`, with `P = 1 - a J - b J²` and `C = b K`, K the derivative of g at a held rate.
 
-    **Fields:** `square`: the inverse of P; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of J² in P is less than the
-    one asked for; `rest`: what is to be applied after P⁻¹, for that and for c. Where the rate is wrong it can be so
-    small as to hide errors: what decides about a step is measured by P⁻¹ alone.
+    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + b J)`; `missing`: how much less than b the factor of J² in P is; `c`:
+    `(1 - P⁻¹ (C + missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate `c` can be so small that it hides errors:
+    errors of a step are measured by P⁻¹ alone.
     """
 
-    square: Float[Array, "free free"]
-    rate: Float[Array, "free free"]
-    beyond: Float[Array, ""]
-    rest: Float[Array, "free free"]
+    p: Float[Array, "free free"]
+    p_rate: Float[Array, "free free"]
+    missing: Float[Array, ""]
+    c: Float[Array, "free free"]
 
 
 def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
@@ -156,14 +156,14 @@ def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free fr
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
-    rate = a * along + (real**2 - imaginary**2) * across
-    square = along + real * across
-    beyond = jnp.maximum(least - product, jnp.zeros_like(product))
-    rest = inverse(identity - square @ (b * held + beyond * jacobian @ jacobian))
-    return Inverses(square, rate, beyond, rest)
+    p_rate = a * along + (real**2 - imaginary**2) * across
+    p = along + real * across
+    missing = jnp.maximum(least - product, jnp.zeros_like(product))
+    c = inverse(identity - p @ (b * held + missing * jacobian @ jacobian))
+    return Inverses(p, p_rate, missing, c)
 
 
-# One member of a batch after the other; see `jaxmb.elimination`.
+# One member of a batch after the other; see `jaxmb.linalg`.
 @jax.custom_batching.sequential_vmap
 def _lapack_inverse(matrix):
     return jnp.linalg.inv(matrix)
@@ -251,8 +251,8 @@ def solve(
         g = push(jnp.ones_like(t), along)[1]
         # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
-        without = inverses.square @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
-        change = inverses.rest @ without
+        without = inverses.p @ ((y - past)[free] - b * mismatch) - inverses.p_rate @ f[free]
+        change = inverses.c @ without
         corrected = f - matrix.rate @ change
         g = g + matrix.rate @ (corrected - along)[free] - matrix.acceleration @ change
         now = jnp.maximum(size(matrix.state @ change), size(matrix.state @ without))
@@ -289,8 +289,8 @@ def solve(
         work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
         return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
-    square = jnp.zeros((free.size, free.size), past.dtype)
-    inverses = Inverses(square, square, square[0, 0], square)
+    zeros = jnp.zeros((free.size, free.size), past.dtype)
+    inverses = Inverses(zeros, zeros, zeros[0, 0], zeros)
     carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
     k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
@@ -337,8 +337,8 @@ def _differentiable_jvp(primals, tangents):
     def correction(change):
         # What is large is kept together as in `solve`, and nothing rests on the last digits of an inverse.
         rate = moved[1][free] + jacobian @ change
-        mismatch = change - load - b * held @ change - inverses.beyond * jacobian @ rate
-        return inverses.rest @ (inverses.square @ mismatch - inverses.rate @ rate), rate
+        mismatch = change - load - b * held @ change - inverses.missing * jacobian @ rate
+        return inverses.c @ (inverses.p @ mismatch - inverses.p_rate @ rate), rate
 
     change = -correction(still)[0]
     left, rate = correction(change)

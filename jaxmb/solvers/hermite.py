@@ -288,7 +288,7 @@ class Hermite(AbstractMultistep):
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = changes[:, free] @ (matrix.state @ inverses.square).T
+        errors = changes[:, free] @ (matrix.state @ inverses.p).T
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     @property

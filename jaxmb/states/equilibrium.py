@@ -66,7 +66,7 @@ def equilibrium(
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
         raise ValueError(
-            "equilibrium needs ideal constraints that bind positions or velocities; leave friction and servos out."
+            "equilibrium needs ideal constraints that bind positions or velocities; remove friction and servos."
         )
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)

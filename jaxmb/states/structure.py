@@ -205,7 +205,7 @@ def _check_determined(system, implied):
             if others:
                 raise ValueError(
                     f"{type(g.group.part).__name__} {name!r} needs the force of {joint!r}, which is not determined: "
-                    f"rows of {', '.join(sorted(others))} imply one another. Leave the redundant ones out."
+                    f"rows of {', '.join(sorted(others))} imply one another. Remove the redundant ones."
                 )
 
 

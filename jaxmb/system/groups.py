@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.fields import anonymous
 from ..parts.space import AbstractSpace
-from .layout import Layout, pick
+from .layout import Layout
 
 
 class Group(eqx.Module):
@@ -35,9 +36,9 @@ class Group(eqx.Module):
     def rows(self) -> int:
         return self.part.rows
 
-    def own(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
-        """What each part's bodies have, from poses or velocities of all bodies and the ground."""
-        return pick(of_bodies, self.body_index)
+    def gather(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
+        """Rows of each part's bodies, from those of all bodies and the ground."""
+        return unchecked_take(of_bodies, self.body_index)
 
 
 def stack(
@@ -130,7 +131,7 @@ class AbstractConstraintGroup(eqx.Module):
 
     def _map(self, single, *of_bodies, more=()):
         """`single(part, …)` of every part, with what its own bodies have and `more` of the parts themselves."""
-        return jax.vmap(single)(self.group.part, *map(self.group.own, of_bodies), *more)
+        return jax.vmap(single)(self.group.part, *map(self.group.gather, of_bodies), *more)
 
 
 class ConstraintGroup(AbstractConstraintGroup):
@@ -226,13 +227,13 @@ class ForceGroup(eqx.Module):
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts k v"]:
         single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
-        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities))
+        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities))
 
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
-        return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))
+        return jnp.sum(jax.vmap(single)(self.group.part, self.group.gather(poses)))
 
 
 class ServoGroup(AbstractConstraintGroup):
@@ -282,4 +283,4 @@ class NonIdealGroup(eqx.Module):
     ) -> Float[Array, "parts k v"]:
         """What the laws do to the bodies of their joints; `reactions`: what the ideal joints do."""
         single = lambda part, x, v, own: part.wrenches(self.group.layout.space, x, v, own, t)
-        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities), reactions)
+        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities), reactions)

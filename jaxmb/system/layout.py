@@ -4,14 +4,8 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from ..parts.space import AbstractSpace
-
-
-def pick(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
-    """`values[index]` for indices that are known to be right: a gather and nothing else."""
-    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 @dataclasses.dataclass(frozen=True)

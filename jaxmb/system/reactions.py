@@ -53,7 +53,7 @@ def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Arra
     layout = group.layout
     bodies = group.bodies[k]
     last = max(i for i, body in enumerate(bodies) if body < layout.bodies)
-    pose, wrench = group.own(poses)[k, last], wrenches[last]
+    pose, wrench = group.gather(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)
     point = part.anchor(last)
     if layout.space.dimension == 2:

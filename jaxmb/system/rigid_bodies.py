@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.arrays import unchecked_take
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian, EliminationOrder, block_jacobian
 from ..linalg.rotations import cross, normalize, rotate
@@ -26,7 +27,7 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
-from .layout import Layout, pick
+from .layout import Layout
 from .parameter_paths import parameter_paths, positive_parameters
 from .quantities import Quantity
 from .reactions import applied_wrenches, reaction
@@ -234,7 +235,7 @@ class RigidBodySystem(AbstractSystem):
         if len(of_groups) == 1:
             return of_groups[0]
         order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
-        return pick(jnp.concatenate(of_groups), order)
+        return unchecked_take(jnp.concatenate(of_groups), order)
 
     # Kinematics
 
@@ -253,13 +254,13 @@ class RigidBodySystem(AbstractSystem):
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
-        return pick(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
+        return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
     def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
         """Velocities of the bodies."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
-        return pick(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
+        return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
 
     def rates(self, t, q, u):
         if self.rates_are_velocities:
@@ -362,7 +363,7 @@ class RigidBodySystem(AbstractSystem):
         wrenches = []
         for g in self.nonideal:
             # A joint may be made of several constraints, all between the same bodies.
-            own = pick(reactions, self.layout.reaction_source(joints, g.joints))
+            own = unchecked_take(reactions, self.layout.reaction_source(joints, g.joints))
             wrenches.append(g.wrenches(t, poses, velocities, jnp.sum(own, axis=1)))
         return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
 
@@ -374,7 +375,7 @@ class RigidBodySystem(AbstractSystem):
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
-        return pick(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
+        return unchecked_take(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
 
     # Dynamics
 
@@ -409,7 +410,7 @@ class RigidBodySystem(AbstractSystem):
         if not wrenches:
             return jnp.zeros(self.nu, dtype)
         source = self.layout.force_source(bodies)
-        return jnp.sum(pick(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
+        return jnp.sum(unchecked_take(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
 
     def _own_wrenches(self, u):
         """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
