@@ -22,12 +22,12 @@ from .closest import (
     tolerance,
 )
 
-# Smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first they do move, and
-# between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
-# 6e-5.)
+# Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
+# bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
+# mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# Dense matrices of more rows than this are too large.
+# Dense matrices with more rows are too large.
 _DENSE = 3000
 
 
@@ -114,8 +114,7 @@ def _analyse(system):
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.drift_free):
-        # Implied rows must be consistent with the rows that imply them; a residual of least squares is a
-        # contradiction.
+        # Implied rows must be consistent with the rows that imply them: a least-squares residual is a contradiction.
         if system.velocity_rows:
             asked = system.velocity_residual(t, q, u)
             change, left = _least_squares(jacobian, scale, asked)
@@ -168,9 +167,9 @@ def _check_locked(system, jacobian):
 
 
 def _connected(system):
-    """Sets of bodies that joints connect without the ground, with their rows; sets with a driver are left out."""
+    """Sets of bodies that joints connect without the ground, with their rows, except sets with a driver."""
     ground, row = system.layout.bodies, 0
-    # A union-find forest: the root of a body's tree stands for all that are connected with it.
+    # A union-find forest: the root of a tree represents all bodies connected to it.
     parent = list(range(ground))
 
     def root(body):
@@ -198,7 +197,7 @@ def _connected(system):
 
 
 def _check_determined(system, implied):
-    """Refuse friction laws of joints whose force is not determined."""
+    """Refuse friction laws of joints whose reaction is indeterminate."""
     for g in system.nonideal:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
@@ -210,7 +209,7 @@ def _check_determined(system, implied):
 
 
 def _implied(system, jacobian, order, rank):
-    """Express each dropped row by the kept ones; joints with a share in it imply it."""
+    """Express each dropped row by the kept ones; the joints that contribute imply it."""
     kept, dropped = order[:rank], order[rank:]
     out = []
     for row in dropped:

@@ -1,4 +1,4 @@
-"""Systems in generalized coordinates, without bodies: views of a motion by the names of the coordinates."""
+"""Systems in generalized coordinates, without bodies: views of a motion by coordinate name."""
 
 from typing import ClassVar
 
@@ -8,8 +8,8 @@ from .quantities import Quantity
 
 
 class AbstractGeneralizedSystem(AbstractSystem):
-    """A system whose motion is that of its coordinates. Measured are coordinates, their rates q̇, and the generalized
-    forces of constraints: `"theta"`, `"theta.rate"`, `"A.force"`.
+    """A system whose motion is that of its coordinates. Measurable quantities are the coordinates, their rates q̇, and
+    generalized constraint forces: `"theta"`, `"theta.rate"`, `"A.force"`.
     """
 
     elimination: ClassVar[None] = None

@@ -20,7 +20,7 @@ def applied_wrenches(
     poses: Float[Array, "b_ground p"],
     velocities: Float[Array, "b_ground v"],
 ) -> Float[Array, "bodies v"]:
-    """Wrenches of one force element on its bodies, those of its components added up."""
+    """Wrenches of one force element on its bodies, summed over its components."""
     own = [
         g.wrenches(t, poses, velocities)[k] for g in forces for k, other in enumerate(g.group.names) if other == name
     ]

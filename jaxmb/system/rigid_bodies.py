@@ -231,7 +231,7 @@ class RigidBodySystem(AbstractSystem):
         return self._in_order([g.inertia for g in self.bodies])
 
     def _in_order(self, of_groups):
-        """What bodies have, group by group, in the order of the bodies."""
+        """Per-body values of all groups, in the order of the bodies."""
         if len(of_groups) == 1:
             return of_groups[0]
         order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
@@ -240,7 +240,7 @@ class RigidBodySystem(AbstractSystem):
     # Kinematics
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
-        """Poses of the bodies and of the ground, as parts take them."""
+        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
         return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
@@ -288,7 +288,7 @@ class RigidBodySystem(AbstractSystem):
         sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
         return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
 
-    # Constraints. Each kernel is a compiled function, so that it is traced once for all its places in a program.
+    # Constraints. Each kernel is a compiled function, so that it is traced once for all its uses in a program.
 
     @eqx.filter_jit
     def position_residual(self, t, q):
@@ -384,7 +384,7 @@ class RigidBodySystem(AbstractSystem):
             return BlockInertia(self.mass, self.moments_of_inertia)
         if self.spatial:
             points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            # Any moment of inertia serves a point mass; one makes the matrix regular.
+            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular.
             moments = self.moments_of_inertia
             moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
             return _MixedInertia(BlockInertia(self.mass, moments), self.layout)
@@ -475,7 +475,7 @@ class RigidBodySystem(AbstractSystem):
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies and point masses together. `blocks` has some for the rotations of point masses, too."""
+    """Spatial bodies and point masses together. `blocks` has unit blocks for the rotations of point masses."""
 
     blocks: BlockInertia
     layout: Layout = eqx.field(static=True)
