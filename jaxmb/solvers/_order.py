@@ -9,8 +9,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-# The constants were chosen by measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
-# orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs 10-20%.
+# The constants were chosen by measuring evaluations against true error on Kepler's problem, the Pleiades and
+# Arenstorf's orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs
+# 10-20%.
 # Weights of the steps of the lower and of the higher order relative to that of the present order.
 LOWER, _UPPER = 0.98, 0.95
 # The fraction of the deviation from the target that the next step corrects.
