@@ -30,7 +30,7 @@ class BlockTridiagonal(AbstractPositiveDefinite):
         behind = jnp.concatenate([jnp.zeros_like(x[:1]), behind[:-1]])
         return vector_products(self.diagonal, x) + vector_products(self.coupling, ahead) + behind
 
-    def factor(self):
+    def eliminate(self):
         diagonal, coupling = lax.stop_gradient((self.diagonal, self.coupling))
 
         def eliminate(carry, row):

@@ -54,7 +54,7 @@ class AbstractJacobian(eqx.Module):
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
         """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
         gram = self.gram(metric)
-        return MassProjector(self, metric, gram.factor() if factor is None else factor.for_matrix(gram))
+        return MassProjector(self, metric, gram.eliminate() if factor is None else factor.for_matrix(gram))
 
 
 class MassProjector(eqx.Module):

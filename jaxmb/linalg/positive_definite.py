@@ -24,7 +24,7 @@ class AbstractPositiveDefinite(eqx.Module):
         """`T x`."""
 
     @abc.abstractmethod
-    def factor(self) -> "AbstractPositiveFactor":
+    def eliminate(self) -> "AbstractPositiveFactor":
         """Eliminate once, for any number of right-hand sides."""
 
 
@@ -60,7 +60,7 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
     def product(self, x):
         return self.matrix @ x
 
-    def factor(self):
+    def eliminate(self):
         matrix = lax.stop_gradient(self.matrix)
         inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
         return DensePositiveFactor(self, inverse)

@@ -80,7 +80,7 @@ class Mechanism:
     - `t1`: the end of its usual motion [s].
     - `references`: reference values, or None if they do not apply to the parameters.
     - `observe(trajectory)`: quantities by label, arrays with time as axis 0, including the labels of the references.
-    - `description`: what the mechanism is and where its data come from.
+    - `description`: the mechanism and the source of its data.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
     - `start(system, guess)`: computes the state; None if `assemble` does.
     """
@@ -135,8 +135,8 @@ class Mechanism:
 
 
 def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mechanism]], Callable[..., Mechanism]]:
-    """Decorate a builder of the library: it refuses unknown parameters, and drops the reference values where a
-    parameter does not have its default value.
+    """Decorate a builder of the library: it refuses unknown parameters, and drops the reference values if a parameter
+    differs from its default.
 
     **Arguments:** `variants`: parameters for whose values the builder itself chooses the references.
     """

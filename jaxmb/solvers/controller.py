@@ -54,8 +54,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
 
-    If no acceptable step is found down to `dtmin`, or down to what the floating-point time can resolve, the solve ends
-    with `diffrax.RESULTS.dt_min_reached`.
+    If no acceptable step is found down to `dtmin`, or to the resolution of the floating-point time, the solve ends with
+    `diffrax.RESULTS.dt_min_reached`.
     """
 
     rtol: Any
@@ -87,7 +87,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             raveled state.
         - `norm`: the norm of the weighted error.
         - `dtmin`, `dtmax`: bounds of the step.
-        - `force_dtmin`: if true, steps of size `dtmin` are accepted whatever their error, and the solve goes on.
+        - `force_dtmin`: if true, steps of size `dtmin` are accepted with any error, and the solve continues.
         - `safety`: multiplies every step that the error estimates allow.
         - `factormin`, `factormax`: the smallest factor after a rejection, and the largest after an accepted step.
 

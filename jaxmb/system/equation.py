@@ -59,8 +59,8 @@ class AbstractSystem(eqx.Module):
         those that violate constraints.
     - `rates_are_velocities`: whether q̇ = u.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
-    - `has_bodies`: whether the system is made of bodies, and `Trajectory[...]` gives the motion of a body by its name;
-        otherwise it gives that of a coordinate.
+    - `has_bodies`: whether the system has bodies; `Trajectory[name]` is the motion of a body if so, otherwise of a
+        coordinate.
     - `guess`: the default guess of `assemble`; `length` [m]: the scale of position residuals.
     - `rows`: for every row of A, the name of its part and its number within the part.
     - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
@@ -86,11 +86,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:
-        """Indices in q of every name of a coordinate, or of several."""
+        """Indices in q by name; one name may stand for several coordinates."""
 
     @abc.abstractmethod
     def rate_names(self) -> dict[str, list[int]]:
-        """Indices in u of every name of a rate, or of several."""
+        """Indices in u by name; one name may stand for several rates."""
 
     @abc.abstractmethod
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
@@ -102,7 +102,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def describe(self) -> Description:
-        """Parts, rows, degrees of freedom, redundant rows, and what is specialised away, as text and as HTML."""
+        """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
 
     # A motion, with time as axis 0: `ts` of shape (times,), `ys` a `State`, `multipliers` of shape (times, rows).
 
