@@ -326,7 +326,7 @@ def check_kinds(part: Any, label: str) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    # Also what a transformation puts in place of an array.
+    # JAX transformations may put other objects in place of arrays.
     return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
 
 

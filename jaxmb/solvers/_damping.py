@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ._formulas import FAMILIES
 from .stability import boundary_locus, formula, spectral_radius
 
-# Growth in a step that is harmless.
+# Harmless growth in one step.
 _GROWTH = 1.001
 # Sizes of `h λ`, four to an octave. Useful formulas are stable in the left half-plane for smaller and larger sizes.
 _PER_OCTAVE = 4

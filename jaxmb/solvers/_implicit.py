@@ -26,7 +26,7 @@ Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Floa
 _MAX_ITERATIONS = 10
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
 _SLOW = 0.2
-# After a matrix of an earlier step has failed, this number of steps compute their own.
+# If a matrix of an earlier step has failed, this number of steps compute their own.
 _DISTRUST = 10
 # If a correction is larger than this fraction of the state and its change, the matrix is not reliable at its end.
 _FAR = 0.1
@@ -78,8 +78,8 @@ def probed_derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivativ
 
 def _warn():
     warnings.warn(
-        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and would be wrong "
-        "without a sign: look for `stop_gradient`, for rounding, and for integers on the way from the state.",
+        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its "
+        "results would be wrong: look for `stop_gradient`, rounding and integers in the vector field.",
         stacklevel=2,
     )
 
@@ -238,7 +238,7 @@ def solve(
     than round-off.
 
     If the error of the prediction is as large as the state, as at the end of a fast transient, the matrix there may be
-    so large that the second correction is negligible far from any solution; it is not computed.
+    so large that the second correction appears negligible far from any solution; it is not computed.
     """
 
     shapes = eqx.filter_eval_shape(derivatives, field, t, predicted[0])

@@ -30,7 +30,7 @@ _ITERATIONS = 200
 # Half the initial bound of steps, and the largest bound, in units of the system's size and radians.
 _FIRST, _LONGEST = 0.025, 0.5
 
-# Singular values and curvatures below this share of the largest are rounding errors.
+# Singular values and curvatures below this fraction of the largest are rounding errors.
 _NEGLIGIBLE = 1e-12
 
 

@@ -86,11 +86,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:
-        """Indices in q by name; one name may stand for several coordinates."""
+        """Indices in q by name; one name may denote several coordinates."""
 
     @abc.abstractmethod
     def rate_names(self) -> dict[str, list[int]]:
-        """Indices in u by name; one name may stand for several rates."""
+        """Indices in u by name; one name may denote several rates."""
 
     @abc.abstractmethod
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:

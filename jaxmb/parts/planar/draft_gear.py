@@ -68,7 +68,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         return self._against(extension - self.slack, rate) - self._against(-extension - self.slack, -rate)
 
     def stored(self, extension: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Energy [J] of the springs: that of the mean of loading and unloading force, which friction only reduces."""
+        """Energy [J] of the springs, from the mean of loading and unloading force; friction only dissipates."""
         return self._stored(extension - self.slack) + self._stored(-extension - self.slack)
 
     def wrenches(self, space, poses, velocities, t):

@@ -28,9 +28,7 @@ from .axes import (
 
 
 def _across(axis_a, w):
-    """The components `u·w`, `v·w` perpendicular to the axis of a vector in A; both are zero if it is parallel to the
-    axis.
-    """
+    """The components `u·w`, `v·w` of a vector in A; both are zero if it is parallel to the axis."""
     return jnp.sum(perpendiculars(axis_a) * w[None, :], axis=1)
 
 
