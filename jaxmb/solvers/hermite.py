@@ -66,8 +66,8 @@ class Hermite(AbstractMultistep):
         $k \le 2$, stiffly stable for all, and zero-stable for any sequence of steps. The default.
     - `"B"`, order $k + 1$, $k \le 8$: backward differentiation of $y$ with the second derivative at the new point.
         A-stable for $k \le 3$; steps may only grow slowly at high orders.
-    - `"H"`, order $2k + 2$, $k \le 3$: as E, with $f'$ at every point. A-stable, without damping at infinity, for $k =
-        1$; unsuitable for stiff problems otherwise.
+    - `"H"`, order $2k + 2$, $k \le 3$: as E, with $f'$ at every point. A-stable, without damping at infinity, for
+        $k = 1$; unsuitable for stiff problems otherwise.
     - `"Y"`, order $2k + 1$, $k \le 3$: as B, with $y'$ at every point. A-stable for $k = 1$.
 
     Formulas that are not A-stable amplify lightly damped vibrations when a step covers a few radians of them. They are

@@ -76,7 +76,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 
 @eqx.filter_jit
 def _independent_by_blocks(system):
-    """Whether the scene can be assembled by blocks, and none of its rows is near to being redundant."""
+    """Whether the scene can be assembled by blocks, and none of its rows is nearly redundant."""
     held = np.zeros(system.nq, bool)
     _, ok, pivot = configuration_by_blocks(
         system, jnp.zeros((), system.guess.q.dtype), system.guess.q, held, tolerance(system.guess.q.dtype)
