@@ -45,12 +45,12 @@ from .system.layout import Layout
 class Scene(eqx.Module):
     """Bodies, joints and forces by name.
 
-    A scene is planar or spatial, never both; its bodies decide. Joints are constraints between positions or
-    velocities, in any order; closed loops and redundant joints are the normal case.
+    A scene is planar or spatial, never both; its bodies decide. Joints are position or velocity constraints, in any
+    order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    among them drivers, rolling, and programs of a `Servo`; `forces`: force elements, the friction of joints, and at
-    most one `Gravity`. `"ground"` names the fixed world.
+    including drivers, rolling and `Servo`; `forces`: force elements, joint friction, and at most one `Gravity`.
+    `"ground"` names the fixed world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
@@ -65,7 +65,7 @@ class Scene(eqx.Module):
         _check_names(self)
 
     def describe(self) -> Description:
-        """Compile, and describe the result; as text and as HTML."""
+        """Compile the scene and describe the result, as text and as HTML."""
         return self.compile().describe()
 
     def compile(self) -> RigidBodySystem:
@@ -135,7 +135,7 @@ def _check_program(servo, space, bodies):
 
 
 def _call(part, name, *arguments):
-    """A method of a part. Bound methods of modules are modules, too many of them for scenes of thousands of parts."""
+    """Call a method through the class: binding it creates a module, too slow for thousands of parts."""
     return getattr(type(part), name)(part, *arguments)
 
 
@@ -145,7 +145,7 @@ def _check_kinds(scene: Scene):
     for body in scene.bodies:
         if not isinstance(body, AbstractBody):
             raise ValueError(
-                f"bodies must hold Body or PointMass, got {body!r}; joints and forces have arguments of their own."
+                f"bodies must hold Body or PointMass, got {body!r}; pass the others as joints= and forces=."
             )
     for part in scene.joints:
         if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
@@ -153,7 +153,7 @@ def _check_kinds(scene: Scene):
     for part in scene.forces:
         # A concrete class: gravity is of no kind but its own, since it acts on every body.
         if not isinstance(part, AbstractForce | AbstractNonIdeal | Gravity):
-            raise ValueError(f"forces must hold force elements, friction of joints, or Gravity, got {part!r}.")
+            raise ValueError(f"forces must hold force elements, joint friction, or Gravity, got {part!r}.")
     if sum(not isinstance(part, AbstractForce | AbstractNonIdeal) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     dimension = scene.bodies[0].dimension
@@ -175,7 +175,7 @@ def _check_names(scene: Scene):
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(part.name)
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
-    # The program of a servo is no joint: nothing slides in it.
+    # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
     joints = dict.fromkeys(part.name for part in scene.joints if isinstance(part, kinds))
     for part in (*scene.joints, *scene.forces):
@@ -192,7 +192,7 @@ def _check_names(scene: Scene):
 
 
 def _check_rotation(part, components, own, layout, poses):
-    """A point mass does not turn: refuse parts that would turn it, or hold on to its angle."""
+    """Refuse parts that act on the rotation of a point mass, which has none."""
     points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
     space = layout.space
     for component in components if points else ():
@@ -206,7 +206,7 @@ def _check_rotation(part, components, own, layout, poses):
 
 @eqx.filter_jit
 def _strength(part, space, poses):
-    """How strongly a part acts on the velocities of its bodies, or holds on to them."""
+    """The size of a part's wrenches, or of its Jacobian, for each velocity of its bodies."""
     if isinstance(part, AbstractForce):
         velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
         return jnp.abs(part.wrenches(space, poses, velocities, jnp.zeros((), poses.dtype)))

@@ -32,13 +32,13 @@ def test_solution_and_its_derivatives(k, r):
     weights = jnp.asarray(rng.normal(size=(k, r)))
     arguments = tuple(map(jnp.asarray, (diagonal, coupling, b)))
     moves = tuple(map(jnp.asarray, moves))
-    solve = lambda diagonal, coupling, b: BlockTridiagonal(diagonal, coupling).factor().solve(b)
+    solve = lambda diagonal, coupling, b: BlockTridiagonal(diagonal, coupling).eliminate().solve(b)
 
     @jax.jit
     def evaluate(arguments, moves):
         x, dx = jax.jvp(solve, arguments, moves)
         gradient = jax.grad(lambda a: jnp.vdot(weights, solve(*a)))(arguments)
-        factor = BlockTridiagonal(*arguments[:2]).factor()
+        factor = BlockTridiagonal(*arguments[:2]).eliminate()
         twice = jax.vmap(lambda b: solve(*arguments[:2], b))(jnp.stack([arguments[2], 2 * arguments[2]]))
         return x, dx, gradient, factor.smallest_pivot(), factor.matrix.product(x), twice
 
@@ -61,12 +61,12 @@ def test_dense_matrices(n):
     root, change = rng.normal(size=(2, n, n))
     T, dT = root @ root.T + n * np.eye(n), change + change.T
     b = rng.normal(size=n)
-    solve = lambda T: DensePositiveDefinite(T).factor().solve(b)
+    solve = lambda T: DensePositiveDefinite(T).eliminate().solve(b)
     x, dx = jax.jvp(solve, (jnp.asarray(T),), (jnp.asarray(dT),))
     np.testing.assert_allclose(x, np.linalg.solve(T, b), rtol=0, atol=1e-13)
     np.testing.assert_allclose(dx, -np.linalg.solve(T, dT @ x), rtol=0, atol=1e-12)
     # The factor of one matrix with the derivatives of another of the same value.
-    borrowed = lambda s: DensePositiveDefinite(T).factor().for_matrix(DensePositiveDefinite(T + s * dT)).solve(b)
+    borrowed = lambda s: DensePositiveDefinite(T).eliminate().for_matrix(DensePositiveDefinite(T + s * dT)).solve(b)
     np.testing.assert_allclose(jax.jacrev(borrowed)(0.0), dx, rtol=0, atol=1e-12)
-    pivot = DensePositiveDefinite(jnp.asarray(T)).factor().smallest_pivot()
+    pivot = DensePositiveDefinite(jnp.asarray(T)).eliminate().smallest_pivot()
     assert pivot == pytest.approx(np.min(1 / (np.diag(np.linalg.inv(T)) * np.diag(T))), rel=1e-12)

@@ -171,7 +171,7 @@ def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, ki
     rng = np.random.default_rng(1)
     poses, velocities = states(rng, space, 3)
     rates = jax.vmap(space.rates)(poses, velocities)
-    places = {} if kind is WheelContact else {"points": jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))}
+    places = {} if kind is WheelContact else {"centres": jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))}
     build = lambda **options: three_wheels(kind, normal=LAWS[law], **places, **options).resolve(space, poses)
     smooth = contact.Coulomb(0.0, transition_speed=1.0)
     elastic, rough = build(friction=smooth, damping=0.0), build(friction=JANOSI, damping=3e3)
@@ -278,7 +278,7 @@ def test_nothing_of_friction_without_friction():
         ({"normal": 8e5}, "normal must be a law from jaxmb.contact"),
         ({"friction": 0.7}, "friction must be a law from jaxmb.contact"),
         ({"radius": (0.1, 0.2)}, r"radius must have shape \(\) or \(3,\)"),
-        ({"points": (0.1, 0.2, 0.3)}, r"points must have shape \(2,\) or \(3, 2\)"),
+        ({"centres": (0.1, 0.2, 0.3)}, r"centres must have shape \(2,\) or \(3, 2\)"),
         ({"radius": -0.1}, "radius must be non-negative"),
         ({"smoothing": 0.0}, "smoothing must be positive"),
         ({"normal": contact.Linear(-1.0)}, "normal.stiffness must be positive"),

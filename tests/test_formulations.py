@@ -119,7 +119,7 @@ def test_singular_mass():
 
 
 def test_forces_that_do_virtual_work():
-    """A rigid body's rotation with one constraint that is not ideal: what it does beyond d'Alembert's principle."""
+    """A rigid body's rotation with one non-ideal constraint."""
     moments, spin = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.5, 0.8])
     force = jnp.asarray(np.array([0.1, 0.2, -0.3]) - np.cross(spin, moments * spin))
     A, gamma = jnp.array([[1.0, 2.0, -1.0]]), jnp.array([0.4])

@@ -1,4 +1,4 @@
-"""Scenes whose joints are not all ideal, and programs that a control force is to satisfy."""
+"""Scenes whose joints are not all ideal, and servo constraints."""
 
 import functools
 
@@ -22,7 +22,7 @@ def sine(t, p):
 
 @functools.cache
 def sledge():
-    """A block on an inclined rail that rubs, starting uphill."""
+    """A block on an inclined rail with friction, starting uphill."""
     slope = (np.cos(0.3), np.sin(0.3))
     block = planar.Body("block", mass=2.0, inertia=1.0, position=(0.0, 0.0), velocity=(3 * slope[0], 3 * slope[1]))
     rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=slope)
@@ -41,7 +41,7 @@ def pendulum():
 
 @functools.cache
 def manipulator():
-    """A double pendulum whose tip is to move along a line, with joints that rub."""
+    """A double pendulum with joint friction and a servo that moves its tip along a line."""
     bodies = [
         planar.Body("upper", mass=2.0, inertia=0.2, position=(0.4, 0.3), angle=0.6),
         planar.Body("lower", mass=1.0, inertia=0.1, position=(1.1, 0.3), angle=-0.7),
@@ -61,7 +61,7 @@ def manipulator():
 
 @functools.cache
 def carriage():
-    """A body in space on a rail that rubs, carrying an arm that is to swing by a program."""
+    """A body in space on a rail with friction, with an arm that a servo swings."""
     bodies = [
         spatial.Body("carriage", mass=3.0, inertia=(0.3, 0.2, 0.4), position=(0.1, 0.0, 0.0)),
         spatial.Body("arm", mass=1.0, inertia=(0.02, 0.2, 0.2), position=(0.5, 0.0, 0.0)),

@@ -29,7 +29,7 @@ def as_array(value: Any, dtype: Any) -> Any:
 
 
 def replaced(array: Array, index: Any, value: Any) -> Array:
-    """The array with other entries at an index."""
+    """A copy of the array with new entries at an index."""
     if is_traced((array, value)):
         return array.at[index].set(value)
     new = np.array(array)

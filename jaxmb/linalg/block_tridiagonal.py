@@ -30,7 +30,7 @@ class BlockTridiagonal(AbstractPositiveDefinite):
         behind = jnp.concatenate([jnp.zeros_like(x[:1]), behind[:-1]])
         return vector_products(self.diagonal, x) + vector_products(self.coupling, ahead) + behind
 
-    def factor(self):
+    def eliminate(self):
         diagonal, coupling = lax.stop_gradient((self.diagonal, self.coupling))
 
         def eliminate(carry, row):
@@ -57,7 +57,7 @@ class BlockTridiagonalFactor(AbstractPositiveFactor):
     def substitute(self, b):
         behind = self.matrix.coupling.swapaxes(1, 2)
         behind = jnp.concatenate([jnp.zeros_like(behind[:1]), behind[:-1]])
-        # y = S⁻¹ (b − Uᵀ y₋): what does not depend on the block before is computed for all blocks at once.
+        # y = S⁻¹ (b − Uᵀ y₋): terms that do not depend on the previous block are computed for all blocks at once.
         factors = -matrix_products(self.inverse, behind)
         forward = lambda y, row: (row[1] + vector_product(row[0], y),) * 2
         backward = lambda x, row: (row[1] - vector_product(row[0], x),) * 2
@@ -70,7 +70,7 @@ class BlockTridiagonalFactor(AbstractPositiveFactor):
 
 
 def _inverse(a):
-    """Of one small positive definite block, by Gauss–Jordan elimination on the diagonal."""
+    """The inverse of a small positive definite block, by Gauss–Jordan elimination on the diagonal."""
     r = a.shape[0]
     if r == 1:
         return 1 / a

@@ -1,6 +1,6 @@
 """Products of stacks of small blocks, written as sums.
 
-XLA fuses a sum of products with what surrounds it; a batched dot of small blocks is a library call.
+XLA fuses a sum of products with the surrounding operations; a batched dot of small blocks is a library call.
 """
 
 import jax.numpy as jnp

@@ -106,7 +106,7 @@ def full_pivot(
     zero = float(eps) ** 0.5 if tol is None else tol
     work = A if scale is None else A * scale[None, :]
     size = jnp.sqrt(jnp.sum(work * work, axis=1))
-    # A row of rounding errors must not be blown up to a row of unit norm.
+    # A row of rounding errors must not be scaled up to unit norm.
     work = (
         work / jnp.maximum(jnp.maximum(size, eps**0.75 * jnp.max(size, initial=0.0)), jnp.finfo(A.dtype).tiny)[:, None]
     )
@@ -161,8 +161,8 @@ def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
     identity = (column == free).astype(A.dtype)
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
-    # Gathers by pairs of indices are one kernel each, in the layout that comes next. The first is in bounds; in the
-    # others the indices of independent columns are clipped, and those values are not used.
+    # Each gather by pairs of indices is one kernel, in the layout that the next operation needs. The first is in
+    # bounds; the others clip the indices of independent columns, whose values are not used.
     swept = gauss_jordan(_gather(A, rows[:, None], order.columns[None, :], "promise_in_bounds"), rank)
     dependent = column < rank
     right_inverse = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
@@ -188,7 +188,7 @@ def _sweep_rotating(B):
 
 @_sweep_rotating.def_vmap
 def _sweep_rotating_batch(size, batched, B):
-    # With the members along the last axis every operation is one long vector, where theirs would be short loops.
+    # With the batch along the last axis, every operation is one long vector operation instead of many short loops.
     del size, batched
     return jnp.moveaxis(_rotate(jnp.moveaxis(B, 0, -1)), -1, 0), True
 
@@ -218,8 +218,8 @@ def _sweep_in_place(B):
     return lax.fori_loop(0, r, step, B)
 
 
-# The members of a batch one after the other: XLA's batched LAPACK kernels have been seen to wait forever for each other
-# in loops (jaxlib 0.10.2, two cores, 64 matrices of 35 rows).
+# The members of a batch are eliminated one after the other: XLA's batched LAPACK kernels have deadlocked in loops
+# (jaxlib 0.10.2, two cores, 64 matrices of 35 rows).
 @jax.custom_batching.sequential_vmap
 def _sweep_blocked(B):
     r = B.shape[0]
@@ -235,7 +235,7 @@ def _sweep_jvp(primals, tangents):
     inverse = swept[:, :r]
     dinverse = -inverse @ dB[:, :r] @ inverse
     if B.shape[1] == r:
-        # No arrays without entries: jaxlib (0.10.2) has lost how LAPACK is called in a program with products of them.
+        # Empty arrays are avoided: jaxlib 0.10.2 has lost its LAPACK calls in programs with products of them.
         return swept, dinverse
     return swept, jnp.concatenate([dinverse, inverse @ (dB[:, r:] - dB[:, :r] @ swept[:, r:])], axis=1)
 
@@ -258,8 +258,8 @@ def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Arr
 def cholesky(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A root L of a symmetric positive definite matrix, `M = L Lᵀ`, lower triangular.
 
-    Any `L U` with orthogonal U is another, and derivatives are those of the root that follows M without being kept
-    triangular: right, to every order, in results that do not depend on the choice.
+    `L U` with an orthogonal U is another root. Derivatives are those of a root that follows M without staying
+    triangular; they are right, to every order, for results that do not depend on the choice of the root.
     """
     n = M.shape[0]
     rows = jnp.arange(n)

@@ -30,7 +30,7 @@ class AbstractInertia(eqx.Module):
 
     @abc.abstractmethod
     def transpose(self) -> "AbstractInertia":
-        """The transpose, which is another matrix only for a root."""
+        """The transpose; it differs from the matrix only for a root."""
 
 
 class DiagonalInertia(AbstractInertia):

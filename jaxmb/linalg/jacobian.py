@@ -1,7 +1,7 @@
 """The Jacobian A of the constraints by its structure: one full matrix, or blocks of joints on bodies.
 
-Both answer the same questions, so that formulations, projections and assembly are written once. Solving with
-`A M⁻¹ Aᵀ` is left to a `MassProjector`, whose elimination follows the structure.
+Both have the same interface, so that formulations, projections and assembly are written once. A `MassProjector` solves
+with `A M⁻¹ Aᵀ` by an elimination that follows the structure.
 """
 
 import abc
@@ -52,9 +52,9 @@ class AbstractJacobian(eqx.Module):
         """The same as one full matrix."""
 
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
-        """The projector in a metric M. `factor`: that of a Gram matrix of the same value, if there is one already."""
+        """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
         gram = self.gram(metric)
-        return MassProjector(self, metric, gram.factor() if factor is None else factor.for_matrix(gram))
+        return MassProjector(self, metric, gram.eliminate() if factor is None else factor.for_matrix(gram))
 
 
 class MassProjector(eqx.Module):
@@ -83,8 +83,8 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, which tells the independent rows, or None where all rows are
-    independent and no pivots were searched for.
+    **Fields:** `matrix` (m × n); its `factor` in a chart, which selects the independent rows, or None where all rows
+    are independent and no pivots were searched for.
     """
 
     matrix: Float[Array, "m n"]
@@ -98,7 +98,7 @@ class DenseJacobian(AbstractJacobian):
     @property
     def pivoted(self) -> Factor:
         """The factor, for formulations that split velocities into dependent and independent ones."""
-        assert self.factor is not None, "a formulation that partitions is given the factor of a chart"
+        assert self.factor is not None, "a partitioning formulation needs the factor of a chart"
         return self.factor
 
     def product(self, v):
@@ -201,7 +201,7 @@ class BlockJacobian(AbstractJacobian):
         diagonal = diagonal + matrix_products(self.after, of_after[order.after])
         padding = order.rows == order.place.size
         if padding.any():
-            # Rows that pad joints out have a one on the diagonal.
+            # Padding rows have a one on the diagonal.
             diagonal = diagonal + jnp.asarray(np.eye(r) * padding[:, :, None], diagonal.dtype)
         return BlockTridiagonal(diagonal, matrix_products(self.after, of_before[order.after]))
 
@@ -210,7 +210,7 @@ class BlockJacobian(AbstractJacobian):
         return DenseJacobian(jax.vmap(self.product, out_axes=1)(unit))
 
     def _of_bodies(self, columns):
-        """Columns (n, c) body by body and zeros for none, (bodies + 1, v, c)."""
+        """Columns (n, c) body by body, followed by zeros, (bodies + 1, v, c)."""
         return unchecked_take(jnp.pad(columns, ((0, 1), (0, 0))), self.order.velocity_index)
 
     def _of_velocities(self, of_bodies):

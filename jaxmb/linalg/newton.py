@@ -1,7 +1,7 @@
-"""Newton's method and its chord variant inside `lax`, and the derivative of what they find.
+"""Newton's method and its chord variant inside `lax`, and the derivative of their solution.
 
 Iterations are not differentiated: the derivative of a root follows from its equation, by the implicit function theorem.
-(The implicit solvers have an iteration of their own, in `solvers/_implicit.py`, which imports nothing of the package.)
+(The iteration of the implicit solvers is in `solvers/_implicit.py`, which imports nothing of the package.)
 """
 
 from collections.abc import Callable
@@ -23,8 +23,9 @@ def newton(
 ) -> tuple[PyTree, Float[Array, ""]]:
     """Correct an iterate until it is close enough.
 
-    **Arguments:** `correct(x)`: the next iterate and the size of the correction; `far(x, size)`: whether to go on from
-    an iterate that a correction of this size has led to; `most`: the largest number of corrections; `dtype` of sizes.
+    **Arguments:** `correct(x)`: the next iterate and the size of the correction; `far(x, size)`: whether to continue
+    from an iterate that was reached by a correction of this size; `most`: the largest number of corrections; `dtype` of
+    sizes.
 
     **Returns:** the last iterate and the size of its correction.
     """
@@ -51,13 +52,13 @@ def chord(
 ) -> tuple[Array, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method with one matrix for all corrections.
 
-    Corrections shrink by a constant factor, so the next one is known: no iteration is spent on verifying it. The
-    iteration ends where the next correction is below `tol`, or at the level of rounding errors, where corrections stop
-    shrinking; it fails where a correction exceeds 1.
+    Corrections shrink by a constant factor, so the size of the next one is known and needs no iteration. The iteration
+    ends where the next correction is below `tol`, or at the level of rounding errors, where corrections stop shrinking;
+    it fails where a correction exceeds 1.
 
     **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
-    first correction is compared with (1: the matrix is as wrong as the first correction is large; 0: nothing is known
-    of it, and a second correction is made); `tol`; `most`: the largest number of corrections.
+    first correction is compared with (1: the error of the matrix is as large as the first correction; 0: unknown, and a
+    second correction is made); `tol`; `most`: the largest number of corrections.
 
     **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
     """
@@ -78,7 +79,7 @@ def chord(
 
 
 def root(residual: Callable[[Array], Array], start: Array, solve: Callable[[Callable, Array], Array]) -> Array:
-    """The root that `solve(residual, start)` finds, with the derivative that its equation gives it."""
+    """The root that `solve(residual, start)` finds, differentiated implicitly."""
     return lax.custom_root(residual, start, solve, solve_linear)
 
 

@@ -1,8 +1,8 @@
-"""Orthonormal bases of the range of a matrix and of its complement, by Householder's reflections inside `lax`.
+"""Orthonormal bases of the range of a matrix and of its complement, by Householder reflections inside `lax`.
 
-Bases are a choice: turned within the space that they span they serve as well. So are their derivatives, and the ones
-here turn as little as they can (parallel transport). Results that do not depend on the choice, such as projections,
-pseudo-inverses and solutions, have their true derivatives of every order; single columns have none.
+A basis is unique only up to a rotation within its span, and so is its derivative; the derivatives here have no such
+rotation (parallel transport). Results that do not depend on the choice, such as projections, pseudo-inverses and
+solutions, have their true derivatives of every order; single columns have none.
 
 Source: G. H. Golub and V. Pereyra, "The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose
 Variables Separate", SIAM J. Numer. Anal. 10(2), 1973.
@@ -45,7 +45,7 @@ def orthogonal_basis(C: Float[Array, "n r"]) -> AdaptedBasis:
     def reflect(k, work):
         column = jnp.where(rows < k, 0.0, work[:, k])
         size = jnp.sqrt(jnp.sum(column * column))
-        # With the sign opposite to the pivot's nothing cancels.
+        # The sign opposite to the pivot's avoids cancellation.
         normal = column + jnp.where(rows == k, jnp.where(column < 0, -size, size), 0.0)
         return work - normal[:, None] * ((normal @ work) / (size * (size + jnp.abs(work[k, k]))))[None, :]
 

@@ -17,14 +17,14 @@ else:
 
 
 class AbstractPositiveDefinite(eqx.Module):
-    """A symmetric positive definite matrix T. Its vectors may have a shape of their own, such as one row per block."""
+    """A symmetric positive definite matrix T. Its vectors may have any shape, such as one row per block."""
 
     @abc.abstractmethod
     def product(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`T x`."""
 
     @abc.abstractmethod
-    def factor(self) -> "AbstractPositiveFactor":
+    def eliminate(self) -> "AbstractPositiveFactor":
         """Eliminate once, for any number of right-hand sides."""
 
 
@@ -39,8 +39,8 @@ class AbstractPositiveFactor(eqx.Module):
 
     @abc.abstractmethod
     def smallest_pivot(self) -> Float[Array, ""]:
-        """The smallest share of a row of a Gram matrix that the rows before it leave over, between 0 (implied by them)
-        and 1 (orthogonal to them).
+        """The smallest pivot of a Gram matrix relative to its diagonal, between 0 (a row implied by those before it)
+        and 1 (a row orthogonal to them).
         """
 
     def solve(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -48,7 +48,7 @@ class AbstractPositiveFactor(eqx.Module):
         return lax.custom_linear_solve(self.matrix.product, b, lambda _, b: self.substitute(b), symmetric=True)
 
     def for_matrix(self, matrix: AbstractPositiveDefinite) -> Any:
-        """The same factor for a matrix of the same value that has derivatives of its own."""
+        """The same factor for a matrix of the same value with other derivatives."""
         return eqx.tree_at(lambda factor: factor.matrix, self, matrix)
 
 
@@ -60,7 +60,7 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
     def product(self, x):
         return self.matrix @ x
 
-    def factor(self):
+    def eliminate(self):
         matrix = lax.stop_gradient(self.matrix)
         inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
         return DensePositiveFactor(self, inverse)

@@ -18,8 +18,8 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import Scalar, VectorLike
 from .arrays import as_array, namespace
 
-# Products of rotation algebra are small constant tensors and one sum each: XLA fuses those, and would make a kernel of
-# every slice and every stack of components.
+# Each product of rotation algebra is one sum with a small constant tensor, which XLA fuses; slices and stacks of
+# components would become separate kernels.
 
 
 def _tables():
@@ -47,7 +47,7 @@ def _constant(table: np.ndarray, like: Array) -> np.ndarray:
 
 def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
     """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
-    # Pairs as one axis: under a few `vmap`s, arrays of rank seven and more are what jaxlib 0.10.2 and 0.11.0 hang on.
+    # Pairs form one axis: under several `vmap`s, arrays of rank seven and more make jaxlib 0.10.2 and 0.11.0 hang.
     pairs = (a[:, None] * b[None, :]).reshape(-1)
     return (_constant(table.reshape(-1, pairs.size), a) * pairs[None, :]).sum(axis=1)
 

@@ -22,7 +22,7 @@ from .observe import Observation
 
 _DATA = Path(__file__).parent / "data"
 
-# How a mechanism with a known Lagrangian is modelled.
+# The models of a mechanism with a known Lagrangian.
 Model = Literal["lagrangian", "rigid_bodies"]
 
 
@@ -78,12 +78,11 @@ class Mechanism:
         None for a system from a Lagrangian.
     - `system`, `state`: the system, and a consistent state at t = 0.
     - `t1`: the end of its usual motion [s].
-    - `references`: reference values, or None for parameters that they do not hold for.
-    - `observe(trajectory)`: quantities by label, arrays with time as their first axis; they include those of the
-        references.
-    - `description`: what the mechanism is and where its data come from.
+    - `references`: reference values, or None if they do not apply to the parameters.
+    - `observe(trajectory)`: quantities by label, arrays with time as axis 0, including the labels of the references.
+    - `description`: the mechanism and the source of its data.
     - `fix`, `rates`: coordinates and rates that the state was assembled with, as in `assemble`.
-    - `start(system, guess)`: computes the state; None if assembly alone gives it.
+    - `start(system, guess)`: computes the state; None if `assemble` does.
     """
 
     name: str
@@ -136,8 +135,8 @@ class Mechanism:
 
 
 def mechanism(*, variants: tuple[str, ...] = ()) -> Callable[[Callable[..., Mechanism]], Callable[..., Mechanism]]:
-    """Decorate a builder of the library: it refuses unknown parameters, and drops the reference values where a
-    parameter does not have its default value.
+    """Decorate a builder of the library: it refuses unknown parameters, and drops the reference values if a parameter
+    differs from its default.
 
     **Arguments:** `variants`: parameters for whose values the builder itself chooses the references.
     """

@@ -1,12 +1,12 @@
-"""What every part of a scene is: a name, the bodies it touches, and a pure residual or law of those bodies alone.
+"""Base classes of the parts of a scene: a name, the bodies that the part acts on, and a pure residual or force law.
 
-A part of one's own is a class derived from one of these, with its fields declared by the helpers of `fields`. It then
-has all that the parts of the library have: it is stacked with others of its type and `vmap`ped, its Jacobian and the
-accelerations that it asks for follow from its residual, its numbers are parameters with names and derivatives, and its
-redundant rows, reactions and pictures are found like those of others.
+A user-defined part derives from one of these classes and declares its fields with the helpers of `fields`. It is then
+treated like the parts of the library: parts of one type are stacked and `vmap`ped, the Jacobian and γ follow from the
+residual, numbers become named, differentiable parameters, and redundant rows, reactions and pictures need no further
+code.
 
-A kernel (`residual`, `wrenches`, `energy`) is written for a single part, and for the poses of its own bodies, shape
-`(len(bodies), pose size)`, which `space` turns into points, directions and wrenches.
+A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes the poses of that part's bodies, shape
+`(len(bodies), pose size)`; `space` converts them to points, directions and wrenches.
 """
 
 import abc
@@ -35,7 +35,7 @@ GROUND = "ground"
 
 
 class AbstractPart(eqx.Module):
-    """Anything with a name in a scene. `dimensions`: of the spaces that it belongs to, 2 for the plane, 3 for space."""
+    """A named element of a scene. `dimensions` lists the spaces that it supports: 2 for the plane, 3 for space."""
 
     name: AbstractVar[str]
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
@@ -45,27 +45,27 @@ class AbstractPart(eqx.Module):
 
     @property
     def label(self) -> str:
-        """What messages call the part."""
+        """The type and name of the part, for error messages."""
         return f"{type(self).__name__} {getattr(self, 'name', '')!r}"
 
     def check(self, dimension: int | None = None) -> None:
-        """Raise a `ValueError` that names the part and the field for numbers that make no sense.
+        """Raise a `ValueError` that names the part and the field if a number is invalid.
 
-        **Arguments:** `dimension` of the scene, default that of the part itself.
+        **Arguments:** `dimension`: that of the scene, default that of the part.
         """
         fields.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
         type(self).validate(self)
 
     def validate(self) -> None:
-        """A hook: raise a `ValueError` for numbers that do not go together. Each by itself has been checked."""
+        """Hook: raise a `ValueError` for inconsistent numbers; each by itself has already been checked."""
 
     def filled(self, **values: Any) -> Self:
-        """The same part with these numbers in fields that have none."""
+        """A copy with these numbers in fields that are None."""
         missing = {name: fields.as_parameter(value) for name, value in values.items() if getattr(self, name) is None}
         return type(self).with_fields(self, **missing) if missing else self
 
     def with_fields(self, **values: Any) -> Self:
-        """The same part with other values in some fields."""
+        """A copy with some fields replaced."""
         out = object.__new__(type(self))
         for field in fields.field_names(type(self)):
             object.__setattr__(out, field, values[field] if field in values else getattr(self, field))
@@ -85,14 +85,14 @@ class AbstractSpatialPart(AbstractPart):
 
 
 class AbstractBody(AbstractPart):
-    """Something with mass. Its frame has its origin in the mass centre.
+    """A body with mass. The origin of its frame is the mass centre.
 
-    Fields declared with `fields.guess` hold the state that it is given with; all other numbers are parameters. `mass`
-    and `inertia` are fields, or properties worked out from other numbers, such as a radius and a density.
+    Fields declared with `fields.guess` hold its initial guess; all other numbers are parameters. `mass` and `inertia`
+    are fields, or properties computed from other fields, such as a radius and a density.
 
     - `mass` [kg] > 0; `inertia` [kg m²] about the mass centre, () in the plane and (3, 3) in body axes in space; zero
         for a body that does not rotate.
-    - `rotates`: whether it has a rotation; a point mass has not.
+    - `rotates`: whether the body has rotational coordinates; a point mass has none.
     """
 
     mass: AbstractVar[Float[Array, ""]]
@@ -106,15 +106,15 @@ class AbstractBody(AbstractPart):
 
     @abc.abstractmethod
     def pose(self) -> Any:
-        """The pose that it is given with, a vector; the position alone for a body that does not rotate."""
+        """The initial guess of the pose, a vector; only the position for a body that does not rotate."""
 
     @abc.abstractmethod
     def velocities(self) -> Any:
-        """The velocity that it is given with, in the same way."""
+        """The initial guess of the velocity, likewise."""
 
 
 class _Bodies:
-    """`part.bodies`: the names in its fields of bodies, in their order. A field called `bodies` takes its place."""
+    """`part.bodies`: the values of the body-name fields, in order; a field named `bodies` overrides it."""
 
     def __get__(self, part: Any, owner: type | None = None) -> Any:
         if part is None:
@@ -124,7 +124,7 @@ class _Bodies:
 
 
 class AbstractLaw(eqx.Module):
-    """A law that a part is given, with numbers of its own, such as a terrain or a law of contact; it has no name."""
+    """A law with parameters that is a field of a part, such as a terrain or a contact law; it has no name."""
 
     def __check_init__(self):
         fields.check_kinds(self, type(self).__name__)
@@ -136,10 +136,8 @@ class AbstractLink(AbstractPart):
     bodies = _Bodies()
 
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
-        """The same part, checked, with every number filled in: world points and axes turned into body-fixed ones at the
-        given poses.
-        """
-        # By the class: a bound method of a module is a module, and too dear for scenes of thousands of parts.
+        """A checked copy with every number filled in; world points and axes become body-fixed at the given poses."""
+        # Methods are called through the class: binding one creates a module, too slow for thousands of parts.
         cls = type(self)
         cls.check(self, space.dimension)
         part = cls.complete(_body_fixed(self, space, poses), space, poses)
@@ -148,7 +146,7 @@ class AbstractLink(AbstractPart):
         return part
 
     def complete(self, space: AbstractSpace, poses: Poses) -> Self:
-        """A hook: the same part with numbers that were left out worked out from the given poses; see `filled`."""
+        """Hook: a copy with omitted numbers computed from the given poses; see `filled`."""
         del space, poses
         return self
 
@@ -169,7 +167,7 @@ class AbstractPair(AbstractLink):
 
 
 class AbstractConstraint(AbstractLink):
-    """A constraint between positions, `residual = 0`.
+    """A position constraint, `residual = 0`.
 
     `rows` is the static number of scalar equations; `rheonomic` says whether the residual depends on time.
     """
@@ -185,8 +183,8 @@ class AbstractConstraint(AbstractLink):
 class AbstractJoint(AbstractPair, AbstractConstraint):
     """A constraint between a point of `body_a` and one of `body_b`.
 
-    The points are given in the bodies' own frames (`point_a`, `point_b`), or both by a world point at the given poses
-    (`point`), [m].
+    The points [m] are given in the body frames (`point_a`, `point_b`), or both by one world point at the given poses
+    (`point`).
     """
 
     point_a: fields.Number = fields.point(body=0, optional=True)
@@ -196,7 +194,7 @@ class AbstractJoint(AbstractPair, AbstractConstraint):
 
 
 class AbstractVelocityConstraint(AbstractLink):
-    """A constraint between velocities that is not the derivative of one between positions, `residual = 0`.
+    """A velocity constraint that is not the derivative of a position constraint, `residual = 0`.
 
     `linear` says whether the residual is linear in the velocities (perhaps with a constant term), `homogeneous`
     whether it vanishes at rest.
@@ -212,11 +210,11 @@ class AbstractVelocityConstraint(AbstractLink):
 
 
 class AbstractCompound(AbstractLink):
-    """A part made of several others under its own name."""
+    """A part that consists of several others under one name."""
 
     @abc.abstractmethod
     def components(self) -> tuple[AbstractLink, ...]:
-        """The parts that it is made of; asked for when its numbers have been filled in."""
+        """The component parts; called after the numbers have been filled in."""
 
 
 class AbstractForce(AbstractLink):
@@ -230,7 +228,7 @@ class AbstractForce(AbstractLink):
 
 
 class AbstractPotentialForce(AbstractForce):
-    """A force law with a potential energy; what power is not taken from it is dissipated or supplied."""
+    """A force law with a potential energy; it may also dissipate or supply power."""
 
     conservative = True
 
@@ -240,23 +238,23 @@ class AbstractPotentialForce(AbstractForce):
 
 
 class AbstractNonIdeal(AbstractPart):
-    """A non-ideal constraint force: one that does work in the motions that its joint allows.
+    """A non-ideal constraint force: it does virtual work.
 
-    `joint` is the joint's name. The force may depend on the joint's own reactions, those that it would exert if all
-    joints were ideal. Components of it along which the joints allow no motion have no effect.
+    `joint` is the joint's name. The force may depend on the reactions that the joint would exert if all joints were
+    ideal. Its components in directions that the joints block have no effect.
     """
 
     joint: AbstractVar[str]
 
     def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
-        """The same part, checked, with every number filled in, from its joint and the poses of the joint's bodies."""
+        """A checked copy with every number filled in, from its joint and the poses of the joint's bodies."""
         self.check(space.dimension)
         part = self.complete(space, joint, poses)
         part.check(space.dimension)
         return part
 
     def complete(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
-        """A hook: the same part with numbers that were left out worked out from its joint; see `filled`."""
+        """Hook: a copy with omitted numbers computed from its joint; see `filled`."""
         del space, joint, poses
         return self
 
@@ -264,11 +262,11 @@ class AbstractNonIdeal(AbstractPart):
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: Scalar
     ) -> Wrenches:
-        """The wrench on each of the joint's bodies; `reactions`: what the ideal joint does to them."""
+        """The wrench on each of the joint's bodies; `reactions`: those of the ideal joint."""
 
 
 def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
-    """The part with body-fixed points and directions in place of those in the world, and unit directions."""
+    """A copy with world points and directions made body-fixed, and directions normalised."""
     declared, values = fields.declarations(type(part)), {}
     for name, own in declared.items():
         value = getattr(part, name)
@@ -289,7 +287,7 @@ def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
 
 
 def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
-    """A point or direction is given in the world or in the bodies' frames."""
+    """Check that a point or direction is given either in the world or in the body frames."""
     given = [name for name in own.gives if getattr(part, name) is not None]
     in_world = getattr(part, world) is not None
     if len(own.gives) == 1:
@@ -308,9 +306,7 @@ def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
 
 
 def rows_of(part: Any, space: AbstractSpace, poses: Poses) -> Array:
-    """Derivative of the rows of a constraint, between positions or velocities, with respect to the velocities of its
-    bodies, (rows, k, velocity size).
-    """
+    """Jacobian of a constraint with respect to the velocities of its bodies, (rows, k, velocity size)."""
     velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
     if isinstance(part, AbstractVelocityConstraint):
         return jax.jacfwd(lambda v: part.residual(space, poses, v, jnp.zeros((), poses.dtype)))(velocities)

@@ -1,7 +1,7 @@
 """Checks of what the kernels of a part return, by abstract evaluation: nothing is computed or compiled."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +18,15 @@ from .space import AbstractSpace
 
 
 def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
-    """Raise a `ValueError` that names the part unless its kernels return arrays of the right shape and dtype, and take
-    nothing from beyond the ends of what they are given.
+    """Raise a `ValueError` that names the part if a kernel returns a wrong shape or dtype, or indexes out of bounds.
 
-    Without this check a wrench of the wrong shape would be added to another body's.
+    Without this check, a wrench of the wrong shape would act on another body.
 
     **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
     """
     dtype = np.dtype(jnp.result_type(float))
-    poses = np.tile(space.prepare(cast(Any, np.asarray(space.ground, dtype))), (bodies, 1))
+    ground: Any = np.asarray(space.ground, dtype)
+    poses = np.tile(space.prepare(ground), (bodies, 1))
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
     if isinstance(part, AbstractConstraint):
@@ -47,7 +47,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
                 check_returns(part.label, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
         elif hasattr(part, "energy"):
             raise ValueError(
-                f"{part.label} has an energy that nothing asks for; derive it from AbstractPotentialForce."
+                f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce."
             )
 
 
@@ -63,13 +63,13 @@ def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callabl
 
 def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     try:
-        # NumPy's arrays refuse an index past their end, which JAX's replace by the last one.
+        # NumPy arrays refuse an out-of-bounds index; JAX arrays clamp it.
         return jax.eval_shape(lambda: _as_array(kernel(*given)))
     except IndexError as error:
         if "out of bounds" in str(error):
-            raise ValueError(f"{label}: {name} takes what is not there: {error}.") from error
+            raise ValueError(f"{label}: {name} indexes out of bounds: {error}.") from error
     except Exception:
-        # What NumPy's arrays cannot do, such as `.at[...]`.
+        # NumPy arrays lack some operations, such as `.at[...]`.
         pass
     try:
         return jax.eval_shape(lambda *given: _as_array(kernel(*given)), *given)

@@ -1,7 +1,7 @@
-"""Compliant contact of bodies with terrain: a law of the normal force, a law of friction, and the force that they make.
+"""Compliant contact of bodies with terrain: normal force laws, friction laws, and the contact force.
 
-A body touches the ground as a disc or a sphere around one of its points, or with the point itself. The ground yields:
-the deeper the body is in it, the harder it pushes, so contact adds no constraint and no event.
+A body touches the ground with a disc, a sphere or a point. The ground is compliant: its force is a function of the
+penetration depth, so contact adds no constraint and no event.
 """
 
 import abc
@@ -23,7 +23,7 @@ Vector = Float[Array, "d"]
 
 
 class AbstractNormalLaw(AbstractLaw):
-    """Normal force as a function of the depth of penetration; the same on the way in and out."""
+    """Normal force as a function of penetration depth, the same for loading and unloading."""
 
     @abc.abstractmethod
     def force(self, depth: Number) -> Number:
@@ -50,9 +50,9 @@ class Linear(AbstractNormalLaw):
 
 
 class Hertz(AbstractNormalLaw):
-    """`stiffness depth^1.5`, of elastic bodies that touch in a point.
+    """Hertzian point contact of elastic bodies, `stiffness depth^1.5`.
 
-    **Arguments:** `stiffness` [N/m^1.5], of a sphere of radius R on a plane `4/3 E √R` with
+    **Arguments:** `stiffness` [N/m^1.5], for a sphere of radius R on a plane `4/3 E √R` with
     `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
     """
 
@@ -66,14 +66,15 @@ class Hertz(AbstractNormalLaw):
 
 
 class Bekker(AbstractNormalLaw):
-    """Bekker's pressure and sinkage of soil, `area (cohesive_modulus / width + frictional_modulus) depth^exponent`.
+    """Bekker's pressure-sinkage relation of soil, `area (cohesive_modulus / width + frictional_modulus)
+    depth^exponent`.
 
     Unloading follows the loading curve; permanent sinkage is not modelled.
 
     Source: M. G. Bekker, "Introduction to Terrain-Vehicle Systems", University of Michigan Press 1969.
 
     **Arguments:** `cohesive_modulus` k_c [N/m^(n+1)] ≥ 0; `frictional_modulus` k_φ [N/m^(n+2)] ≥ 0; `exponent` n > 0;
-    `width` b [m], the smaller side of the patch that presses; `area` [m²] of it.
+    `width` b [m], the smaller side of the contact patch; `area` [m²] of the patch.
     """
 
     cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
@@ -90,7 +91,7 @@ class Bekker(AbstractNormalLaw):
 
 
 class AbstractFrictionLaw(AbstractLaw):
-    """Force along the ground against slip."""
+    """Tangential force that opposes slip."""
 
     @abc.abstractmethod
     def force(self, load: Number, engaged: Number, slip: Vector, travel: Vector) -> Vector:
@@ -102,9 +103,9 @@ class AbstractFrictionLaw(AbstractLaw):
 
 
 class Coulomb(AbstractFrictionLaw):
-    """Coulomb friction, smooth through zero slip: `coefficient load tanh(slip / transition_speed)`.
+    """Coulomb friction, regularised at zero slip: `coefficient load tanh(slip / transition_speed)`.
 
-    A body at rest on a slope creeps, the slower the smaller `transition_speed` is.
+    On a slope a body creeps instead of resting, at a speed proportional to `transition_speed`.
 
     **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
@@ -123,17 +124,17 @@ class Coulomb(AbstractFrictionLaw):
 
 
 class Janosi(AbstractFrictionLaw):
-    """Shear of soil by Janosi and Hanamoto, `τ = (c + p tan φ) (1 − exp(−j/K))`, under a patch along which the shear
-    displacement j grows evenly to slip ratio times length.
+    """Soil shear of Janosi and Hanamoto, `τ = (c + p tan φ) (1 − exp(−j/K))`, under a patch along which the shear
+    displacement j grows linearly to slip ratio times length.
 
-    The slip ratio is slip over the speed of travel or of the turning circumference, whichever is larger; speeds below
-    `transition_speed` are regularised.
+    The slip ratio is the slip divided by the travel speed or the circumferential speed, whichever is larger; speeds
+    below `transition_speed` are regularised.
 
     Source: Z. Janosi and B. Hanamoto, "The analytical determination of drawbar pull as a function of slip for tracked
     vehicles in deformable soils", 1st ISTVS Conference, Torino 1961.
 
-    **Arguments:** `cohesion` c [Pa] ≥ 0; `friction_angle` φ [rad]; `shear_modulus` K [m] > 0, the displacement;
-    `length` [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
+    **Arguments:** `cohesion` c [Pa] ≥ 0; `friction_angle` φ [rad]; `shear_modulus` K [m] > 0, a displacement; `length`
+    [m] > 0 of the patch, and its `area` [m²]; `transition_speed` [m/s] > 0.
     """
 
     cohesion: fields.Number = fields.parameter(unit="Pa", sign="non-negative")
@@ -157,8 +158,8 @@ class Janosi(AbstractFrictionLaw):
 
 
 class AbstractContact(AbstractPotentialForce):
-    """The base of contacts with one terrain: how a body's distance from the ground is measured, and how damping sets
-    in, is left to `distance`, `outward` and `onset`. Its fields are those of `Contact`.
+    """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
+    and the onset of damping (`onset`); the fields are those of `Contact`.
     """
 
     name: str = fields.name()
@@ -169,7 +170,7 @@ class AbstractContact(AbstractPotentialForce):
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
     radius: fields.Number = fields.length(shape=None, sign="non-negative", default=0.0)
-    points: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
+    centres: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
@@ -180,15 +181,15 @@ class AbstractContact(AbstractPotentialForce):
 
     @abc.abstractmethod
     def outward(self, centre: Vector) -> Vector:
-        """Unit vector out of the ground below a point."""
+        """Unit outward normal of the ground below a point."""
 
     @abc.abstractmethod
     def onset(self, depth: Number) -> Number:
-        """The share of the damping, from 0 to 1, at a depth relative to `damping_depth`."""
+        """Fraction of the damping, from 0 to 1, at a depth relative to `damping_depth`."""
 
     def complete(self, space, poses):
-        part, n, d = self.filled(points=np.zeros(space.dimension)), len(self.bodies), space.dimension
-        for field, shapes in {"radius": ((), (n,)), "points": ((d,), (n, d))}.items():
+        part, n, d = self.filled(centres=np.zeros(space.dimension)), len(self.bodies), space.dimension
+        for field, shapes in {"radius": ((), (n,)), "centres": ((d,), (n, d))}.items():
             shape = getattr(part, field).shape
             if shape not in shapes:
                 raise ValueError(f"{self.label}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
@@ -206,8 +207,8 @@ class AbstractContact(AbstractPotentialForce):
     def _each(self, space, single, *of_bodies):
         """`single(…, point, radius)` of every body."""
         n = len(self.bodies)
-        points, radii = jnp.broadcast_to(self.points, (n, space.dimension)), jnp.broadcast_to(self.radius, (n,))
-        return jax.vmap(single)(*of_bodies, points, radii)
+        centres, radii = jnp.broadcast_to(self.centres, (n, space.dimension)), jnp.broadcast_to(self.radius, (n,))
+        return jax.vmap(single)(*of_bodies, centres, radii)
 
     def _depth(self, centre, radius):
         """Depth of the lowest point of a body, smoothed."""
@@ -218,7 +219,7 @@ class AbstractContact(AbstractPotentialForce):
         depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
         load, normal = self.normal.force(depth), self.outward(centre)
         engaged = self.onset(depth / self.damping_depth)
-        # A normal force has the same wrench in the centre as in the lowest point.
+        # A normal force has the same wrench at the centre as at the lowest point.
         resistance = self.damping * engaged * jnp.dot(travel, normal)
         wrench = space.point_force(pose, point, -load * gradient - resistance * normal)
         if self.friction is None:
@@ -233,22 +234,22 @@ class AbstractContact(AbstractPotentialForce):
 class Contact(AbstractContact):
     """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
 
-    The depth δ of a body in the ground is smoothed, `½ (d + √(d² + smoothing²))` for a distance d below it, and has a
-    potential, the energy of `normal`. To its force are added damping against the velocity normal to the ground,
-    `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body leaves.
+    The penetration depth is smoothed, `δ = ½ (d + √(d² + smoothing²))` for a distance d below the ground, and has a
+    potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient
+    `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body separates.
 
     The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the step has two
     continuous derivatives.
 
     **Arguments:**
 
-    - `bodies`: one name or several, with one terrain, one law and so one set of parameters for all of them.
+    - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
     - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
-    - `points` [m], the centres, body-fixed, shape (d,) or (bodies, d), default the mass centres.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth at which it is complete.
-    - `smoothing` [m] > 0. Far above the ground it leaves a depth of `smoothing² / (4 |d|)`.
+    - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the mass centres.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """
 
     def distance(self, centre):

@@ -1,4 +1,4 @@
-"""Declarations of the fields of a part: what each one means, said once, for everything that asks.
+"""Declarations of the fields of a part: the meaning of each field, stated in one place.
 
 A part declares its fields with the helpers of this file, in place of `equinox.field`:
 
@@ -8,10 +8,10 @@ A part declares its fields with the helpers of this file, in place of `equinox.f
         stiffness: Float[Array, ""] = parameter(unit="N/m", sign="positive")
         point: Float[Array, "d"] = point(body=0, default="mass centre")
 
-Numbers become read-only arrays and are the part's parameters, `"name.field"`; everything else is static. A declaration
-knows the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign, its unit, the body that it is fixed in,
-and whether it may be left out. Scenes check it and stack parts by it, `identify` keeps positive what it says is
-positive, and pictures and reactions take from it where a part acts.
+Numbers become read-only arrays and are the part's parameters, `"name.field"`; all other fields are static. A
+declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign and unit, the body that it is
+fixed in, and whether it is optional. Scenes use it to check and stack parts, `identify` to keep parameters positive,
+and pictures and reactions to find where a part acts.
 """
 
 import dataclasses
@@ -27,8 +27,8 @@ from jaxtyping import Array
 
 from ..linalg.arrays import as_array, is_traced
 
-# The types of fields. A number may be given as anything that NumPy makes an array of, and is held as an array; type
-# checkers do not know the converters of these helpers.
+# Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
+# converters of these helpers.
 if TYPE_CHECKING:
     Number = Numbers = Names = Any
 else:
@@ -43,22 +43,22 @@ _UNIT = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
-    """What a field means.
+    """The meaning of a field.
 
     **Fields:**
 
-    - `kind`: `"identity"` for a name that tells a part from its siblings, `"body"` for the name of a body (`"bodies"`
-        for several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with numbers of its own,
-        `"state"` for a number of the initial guess, which is no parameter.
+    - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
+        several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"state"` for
+        a number of the initial guess, which is not a parameter.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
-    - `body`: place among the part's bodies of the one that a point or direction is fixed in; None for the world.
+    - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
-    - `sizes`: whether the number is a length that the scene's size is found from.
-    - `optional`: whether the field may be None, to be worked out from the given poses; `centred`: a point that is the
-        mass centre then.
-    - `gives`: of a point or direction in the world, the body-fixed fields that it stands for; `needed`: whether either
-        must be given.
-    - `of`: of a law, its type; `what` it is, for messages; of a choice, the words.
+    - `sizes`: whether the scene's size is computed from this length.
+    - `optional`: whether the field may be None, and is computed from the given poses; `centred`: whether an omitted
+        point is the mass centre.
+    - `gives`: the body-fixed fields that a world point or direction determines; `needed`: whether one or the other must
+        be given.
+    - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
     """
 
     kind: str
@@ -101,10 +101,9 @@ def field_names(cls: type) -> tuple[str, ...]:
 def as_parameter(value: Any) -> Any:
     """A strongly typed array of floats.
 
-    It is JAX's where anything is traced, and else a read-only one of NumPy's, so that nothing is compiled to build a
-    scene.
+    It is a JAX array if any entry is traced, otherwise a read-only NumPy array: building a scene compiles nothing.
 
-    **Raises:** `ValueError` for anything that is no real number or array of real numbers.
+    **Raises:** `ValueError` for anything but a real number or an array of real numbers.
     """
     if not is_traced(value):
         kind = np.asarray(value).dtype.kind if not isinstance(value, dict) else "O"
@@ -117,7 +116,7 @@ def as_parameter(value: Any) -> Any:
 
 
 def as_jax(value: Any) -> Array:
-    """The same as an array of JAX's, for functions that may index it by what is traced."""
+    """The same as a JAX array, which tracers can index."""
     if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
         return value
     value = as_parameter(value)
@@ -125,7 +124,7 @@ def as_jax(value: Any) -> Array:
 
 
 def _lenient(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The converter of a field. It leaves what it cannot convert as it is: `check_kinds` then names part and field."""
+    """A converter that returns invalid values unchanged: `check_kinds` then names the part and the field."""
 
     def converter(value: Any) -> Any:
         try:
@@ -157,7 +156,7 @@ def _field(declaration: Declaration, **options: Any) -> Any:
 
 
 def name() -> Any:
-    """The part's name; also of another part that it refers to. Stacked parts differ in it."""
+    """The name of the part, or of another part that it refers to; stacked parts may differ in it."""
     return _field(Declaration("identity"))
 
 
@@ -168,7 +167,7 @@ def body_name(*, default: Any = dataclasses.MISSING) -> Any:
 
 
 def body_names() -> Any:
-    """The names of any number of bodies, in a field that must be called `bodies`; one name alone is a tuple of one."""
+    """The names of any number of bodies, in a field that must be named `bodies`; a single name becomes a tuple."""
     return _field(Declaration("bodies"), converter=_NAMES)
 
 
@@ -178,7 +177,7 @@ def choice(*values: str, default: Any = dataclasses.MISSING) -> Any:
 
 
 def function(*, default: Any = dataclasses.MISSING, kw_only: bool = False) -> Any:
-    """A function of the user's; static."""
+    """A user function; static."""
     return eqx.field(static=True, kw_only=kw_only, **({} if default is dataclasses.MISSING else {"default": default}))
 
 
@@ -195,10 +194,10 @@ def parameter(
 ) -> Any:
     """A number or an array of numbers.
 
-    **Arguments:** `shape`, `"d"` in it for the dimension of the space, None for any; `unit`, for people; `sign` of
-    every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`;
-    `optional`: default None, which the part's `complete` replaces; `sizes`: a length that the scene's size is found
-    from; `converter`, before anything is checked.
+    **Arguments:** `shape`, in which `"d"` is the dimension of the space, None for any; `unit`, for information; `sign`
+    of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`;
+    `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from
+    this length; `converter`, applied before the checks.
     """
     declaration = Declaration("number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes)
     default = None if optional else default
@@ -207,7 +206,7 @@ def parameter(
 
 
 def length(**options: Any) -> Any:
-    """A length [m] that tells the size of the scene; arguments as those of `parameter`."""
+    """A length [m] from which the scene's size is computed; arguments as in `parameter`."""
     return parameter(**({"unit": "m", "sizes": True} | options))
 
 
@@ -221,9 +220,9 @@ def point(
 ) -> Any:
     """A point [m], fixed in a body, or in the world with `body=None`.
 
-    **Arguments:** `body`: its place among the part's bodies; `default`: `"mass centre"`, or coordinates; `optional`:
-    default None; `sizes`: whether the scene's size is found from it, among others; `gives`: of a point in the world,
-    the body-fixed points that it stands for at the given poses.
+    **Arguments:** `body`: index among the part's bodies; `default`: `"mass centre"`, or coordinates; `optional`:
+    default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a world point
+    determines at the given poses.
     """
     centred = isinstance(default, str)
     declaration = Declaration(
@@ -249,9 +248,9 @@ def axis(
     gives: tuple[str, ...] = (),
     needed: bool = True,
 ) -> Any:
-    """A unit vector, fixed in a body, or in the world with `body=None`; arguments as those of `point`.
+    """A unit vector, fixed in a body, or in the world with `body=None`; arguments as in `point`.
 
-    `needed=False`: neither it nor what it gives has to be given.
+    `needed=False`: both the world axis and the body-fixed ones may be omitted.
     """
     declaration = Declaration(
         "number",
@@ -274,19 +273,19 @@ def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, stat
 
 
 def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
-    """A number of the state that a body is given with: a guess that `assemble` improves, and no parameter."""
+    """A number of a body's initial guess, which `assemble` improves; not a parameter."""
     return _field(Declaration("state", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
 
 
 def numbers() -> Any:
-    """Numbers by name, the parameters of a function of the user's: parameters `"part.key"`."""
+    """Parameters of a user function by name, `"part.key"`."""
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
 
 
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
-    """A module with numbers of its own, parameters `"part.field.number"`.
+    """A module whose numbers are parameters, `"part.field.number"`.
 
-    **Arguments:** `of`: its abstract type, `X | None` where there may be none; `what` it is, for messages.
+    **Arguments:** `of`: its abstract type, or `X | None`; `what`: a description, for messages.
     """
     return _field(Declaration("law", of=of, what=what), default=default, kw_only=kw_only)
 
@@ -299,7 +298,7 @@ def _optional(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def check_kinds(part: Any, label: str) -> None:
-    """Raise a `ValueError` for a field that holds something of another kind: no number, no name, no choice, no law."""
+    """Raise a `ValueError` if the value of a field is not of the declared kind."""
     for field, declared in declarations(type(part)).items():
         value = getattr(part, field)
         if declared.is_number:
@@ -318,7 +317,7 @@ def check_kinds(part: Any, label: str) -> None:
                 raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")
         elif declared.kind == "numbers":
             if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-                raise ValueError(f"{label}: {field} must be numbers by name, got {value!r}.")
+                raise ValueError(f"{label}: {field} must be a dictionary of numbers, got {value!r}.")
             for key, number in value.items():
                 if not _is_number(number):
                     raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
@@ -327,13 +326,13 @@ def check_kinds(part: Any, label: str) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    # Also what a transformation puts in place of an array.
+    # JAX transformations may put other objects in place of arrays.
     return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
 
 
 def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
-    """Raise a `ValueError` for a number of the wrong shape or sign, one that is not finite, or a direction that is not
-    of unit length; also in the laws of a part.
+    """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
+    vectors, in the part and its laws.
     """
     for field, declared in declarations(type(part)).items():
         value, shown = getattr(part, field), prefix + field
@@ -373,11 +372,11 @@ def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarr
         raise ValueError(f"{label}: {shown} must be a unit vector, got {value.tolist()} of length {size:.6g}; {cure}.")
 
 
-# What others ask
+# Queries
 
 
 def anonymous(part: Any) -> Any:
-    """The part without the names that tell it from its siblings, and without the state that bodies are given with."""
+    """The part without the names that distinguish stacked parts, and without the initial guess of bodies."""
     declared = declarations(type(part))
     out = object.__new__(type(part))
     for field in field_names(type(part)):
@@ -395,8 +394,8 @@ def anonymous(part: Any) -> Any:
 
 
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Sign | None]]:
-    """For every number among a part's parameters: the keys that lead to it, the same keys without the names of
-    dictionaries, as users call it, and its sign.
+    """For every parameter of a part: its path of keys, the same path without the names of dictionaries, as in the
+    parameter's name, and its sign.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
@@ -417,7 +416,7 @@ def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], sign: Sign
 
 
 def entry(value: Any, keys: tuple[str, ...]) -> Any:
-    """What stands at the end of some keys, of attributes and dictionaries."""
+    """The value at a path of attribute names and dictionary keys."""
     for key in keys:
         value = value[key] if isinstance(value, dict) else getattr(value, key)
     return value

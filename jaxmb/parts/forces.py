@@ -1,4 +1,4 @@
-"""Forces that read the same in the plane and in space."""
+"""Forces with the same definition in the plane and in space."""
 
 from typing import Literal
 
@@ -23,10 +23,10 @@ class Gravity(AbstractPart):
 
 
 def generalized_force(space, coordinates, poses, velocities, law):
-    """Wrenches of forces that act along coordinates.
+    """Wrenches of generalized forces along given coordinates.
 
-    `coordinates(poses)` has shape (n,), `law(value, rate)` gives the n forces that do work on them; the wrench on
-    body k is `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
+    `coordinates(poses)` has shape (n,), `law(value, rate)` returns the n conjugate forces; the wrench on body k is
+    `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
     """
     pose_rates = jax.vmap(space.rates)(poses, velocities)
     value, rate = jax.jvp(coordinates, (poses,), (pose_rates,))

@@ -1,4 +1,4 @@
-"""Friction of joints, from their own reactions."""
+"""Joint friction, computed from the joint's reaction."""
 
 import jax
 import jax.numpy as jnp
@@ -10,21 +10,21 @@ from .base import AbstractCompound, AbstractNonIdeal, rows_of
 
 
 class Friction(AbstractNonIdeal):
-    """Coulomb friction in a joint: `coefficient` times the force that the joint bears, against its slip.
+    """Coulomb friction in a joint: `coefficient` times the joint's reaction force, opposing its slip.
 
-    The slip s is the relative velocity of the bodies at the joint's point (of a single body: that against the ground)
-    together with `radius` times their relative angular velocity, so that one law holds for pins, slides and cylinders.
-    The generalized force on it is `−μ N s / √(s·s + smoothing²)`: smooth, and full only where the slip is large
-    against `smoothing`. N is the length of the reaction force that the joint would exert if all joints were ideal; its
-    moments count for nothing.
+    The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
+    ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
+    force conjugate to s is `−μ N s / √(s·s + smoothing²)`, which is smooth and approaches full friction for slip that
+    is large compared with `smoothing`. N is the magnitude of the reaction force that the joint would exert if all
+    joints were ideal; reaction moments do not contribute.
 
     **Arguments:**
 
-    - `joint`: its name. Its force must be determined: no other joint may imply any of its rows.
+    - `joint`: the joint's name. Its reaction must be determinate: no other joint may imply any of its rows.
     - `coefficient` μ ≥ 0.
     - `radius` [m] ≥ 0 of the pin or ball, default zero: sliding only.
-    - `point` [m]: where the bodies slide on one another, fixed in the joint's last body; default the joint's point
-        there, or the mass centre if it has none.
+    - `point` [m]: the point of sliding, fixed in the joint's last body; default the joint's point there, or the mass
+        centre if it has none.
     - `smoothing` [m/s].
 
     Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",
@@ -41,7 +41,7 @@ class Friction(AbstractNonIdeal):
     def complete(self, space, joint, poses):
         k = poses.shape[0] - 1
         if k > 1:
-            raise ValueError(f"{self.label}: {joint.name!r} is between more than two bodies; use NonIdeal.")
+            raise ValueError(f"{self.label}: {joint.name!r} connects more than two bodies; use NonIdeal.")
         anchor = joint.anchor(k)
         part = self.filled(point=np.zeros(space.dimension) if anchor is None else anchor)
         part._check_slip(space, joint, poses)

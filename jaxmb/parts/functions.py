@@ -1,6 +1,4 @@
-"""Parts written by the user as a function: constraints between positions, between velocities, forces, and what joints
-do beyond d'Alembert's principle.
-"""
+"""Parts from user functions: position constraints, velocity constraints, forces and non-ideal constraint forces."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +12,7 @@ from .base import AbstractConstraint, AbstractNonIdeal, AbstractPotentialForce, 
 
 
 def _shaped(part: Any, value: Any, shape: tuple[int, ...], *also: tuple[int, ...]) -> Array:
-    """What a function returned, in the shape that it must have, or in another that means the same."""
+    """The return value of a user function in the required shape; `also` lists equivalent shapes."""
     value = jnp.asarray(value)
     if value.shape not in (shape, *also):
         raise ValueError(f"the function of {part.label} must return shape {shape}, got {value.shape}")
@@ -50,8 +48,8 @@ class VelocityConstraint(AbstractVelocityConstraint):
     """A nonholonomic constraint from a function, `function(poses, velocities, t, parameters) = 0`.
 
     **Arguments:** as `Constraint`; `velocities` has a row per body (plane: ẋ, ẏ, angular rate; space: ṙ in the world,
-    ω′ in the body frame). `linear` says that the function is linear in the velocities up to a constant term
-    (cheaper); `homogeneous` that it also vanishes at rest.
+    ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term (cheaper);
+    `homogeneous`: it also vanishes at rest.
     """
 
     name: str = fields.name()
@@ -101,15 +99,15 @@ class Force(AbstractPotentialForce):
 
 
 class NonIdeal(AbstractNonIdeal):
-    """What a joint does beyond d'Alembert's principle, from a function,
-    `function(poses, velocities, reactions, t, parameters) -> wrenches`.
+    """A non-ideal constraint force (it does virtual work) from a function, `function(poses, velocities, reactions, t,
+    parameters) -> wrenches`.
 
     **Arguments:**
 
-    - `joint`: the name of a joint whose force is determined: no other joint may imply any of its rows.
-    - `function`: takes and returns what that of a `Force` does, with a row for each of the joint's bodies, and
-        `reactions`: the wrenches that the joint would exert on them if all joints were ideal, in the same axes. What
-        its wrenches do in motions that the joints do not allow has no effect.
+    - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
+    - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the wrenches that the joint
+        would exert on them if all joints were ideal, in the same axes. Wrench components in directions that the joints
+        block have no effect.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
 
     Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",

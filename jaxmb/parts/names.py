@@ -1,11 +1,11 @@
-"""Messages about names: the nearest one to a misspelt one."""
+"""Error messages for unknown names, with the nearest known ones."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> ValueError:
-    """An error for a name that is not there, with the nearest names."""
+    """An error for an unknown name, with the nearest known ones."""
     known = list(known)
     near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
     if near:

@@ -1,4 +1,4 @@
-"""Programmed motions: constraints that a control force is to satisfy."""
+"""Servo constraints, enforced by a control force."""
 
 from typing import Any
 
@@ -9,12 +9,12 @@ from .base import AbstractConstraint, AbstractLink
 class Servo(AbstractLink):
     """A desired motion as a constraint: the residual Φ of `program` is brought to zero and kept there.
 
-    The constraint acts on accelerations, `Φ̈ + damping Φ̇ + stiffness Φ = 0`, so the motion may start off it. What it
-    takes to do that, the reaction of this name, is the exact control force: of all that do it the least in the metric
-    of M⁻¹. The program goes by its own name, and its numbers are parameters under it, as are the gains.
+    The constraint acts on accelerations, `Φ̈ + damping Φ̇ + stiffness Φ = 0`, so the motion may start off the program.
+    The reaction of the servo is the exact control force, the smallest one in the metric of M⁻¹. The servo has the name
+    of its program; the numbers of the program and the gains are parameters under that name.
 
-    **Arguments:** `program`: any constraint between positions, such as a `Driver` or a `Constraint`; `damping` [1/s]
-    and `stiffness` [1/s²] ≥ 0, default zero: kept only, once it is met.
+    **Arguments:** `program`: any position constraint, such as a `Driver` or a `Constraint`; `damping` [1/s] and
+    `stiffness` [1/s²] ≥ 0, default zero: the motion stays on the program but is not brought to it.
 
     Source: R. E. Kalaba and F. E. Udwadia, "Equations of motion for nonholonomic, constrained dynamical systems via
     Gauss's principle", J. Appl. Mech. 60, 1993.
@@ -29,7 +29,7 @@ class Servo(AbstractLink):
     def __check_init__(self):
         taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
         if taken:
-            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; call that parameter otherwise.")
+            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; rename that parameter.")
 
     @property
     def name(self):

@@ -9,12 +9,12 @@ from .._types import Scalar
 def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
     """`½ (d + √(d² + width²))`, a smooth and always positive `max(d, 0)`."""
     root = jnp.sqrt(d * d + width * width)
-    # Below zero the same without cancellation, so that powers of it stay finite far away.
+    # Below zero an equivalent form avoids cancellation, so that its powers stay finite far away.
     return jnp.where(d > 0, 0.5 * (d + root), 0.5 * width * width / (root - jnp.where(d > 0, 0.0, d)))
 
 
 def step(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """From 0 at s ≤ 0 to 1 at s ≥ 1 with two continuous derivatives."""
+    """A C² step from 0 at s ≤ 0 to 1 at s ≥ 1."""
     return quintic(jnp.clip(s, 0.0, 1.0))
 
 

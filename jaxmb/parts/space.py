@@ -1,6 +1,6 @@
-"""What the plane and space have in common: poses, velocities and wrenches of one body.
+"""The common interface of the plane and space: poses, velocities and wrenches of one body.
 
-A `pose` is what positions a body, a `velocity` what moves it, a `wrench` what does work on a velocity:
+A `pose` places a body, a `velocity` is its rate of motion, and a `wrench` does work on a velocity:
 
 | | pose | velocity | wrench |
 |---|---|---|---|
@@ -21,7 +21,7 @@ Point = Float[Array, "d"]
 
 
 class AbstractSpace(abc.ABC):
-    """Kinematics of one rigid body in the plane or in space; without data, so that all of a kind are equal."""
+    """Kinematics of one rigid body in the plane or in space; instances of one class are equal."""
 
     dimension: ClassVar[int]
     pose_size: ClassVar[int]
@@ -60,7 +60,7 @@ class AbstractSpace(abc.ABC):
 
     @abc.abstractmethod
     def prepare(self, pose: Pose) -> Pose:
-        """The pose with what all parts on a body would work out again (cosines), for their common use."""
+        """The pose with quantities that all parts on a body share (cosines), computed once."""
 
     @abc.abstractmethod
     def rates(self, pose: Pose, velocity: Velocity) -> Pose:
@@ -75,7 +75,7 @@ class AbstractSpace(abc.ABC):
         """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""
 
 
-# What parts between two points share. `part` has `point_a` and `point_b` [m], fixed in the first and the second body.
+# Shared by parts between two points: `part` has `point_a` and `point_b` [m], fixed in the first and the second body.
 
 
 def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Point:

@@ -1,7 +1,7 @@
-"""Terrains: heights as smooth functions of the place, for contacts with the ground.
+"""Terrains: height as a smooth function of the place, for contact with the ground.
 
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
-where z is up. A profile along x is constant across it, so that it can be used in both.
+where z is up. A profile along x is constant along y, so it serves in both.
 """
 
 import abc
@@ -21,9 +21,7 @@ Place = Float[Array, "h"]
 
 
 class AbstractTerrain(AbstractLaw):
-    """Ground whose height is a function of the place; its numbers are parameters of the contact that it belongs to,
-    `"contact.terrain.field"`.
-    """
+    """Ground whose height is a function of the place; its numbers are parameters, `"contact.terrain.field"`."""
 
     def __check_init__(self):
         if not is_traced(self):
@@ -104,10 +102,11 @@ class Ramp(AbstractTerrain):
 
 
 class Spline(AbstractTerrain):
-    """A profile through measured points; C², and local: a height depends on the four nearest points only.
+    """A profile through measured points; C² and local: a height depends on the four nearest points only.
 
-    Between two points a polynomial of degree five, whose slopes and curvatures at the points are those of the parabolas
-    through a point and its two neighbours. Beyond the first and the last point it goes on straight.
+    Between two points the profile is a polynomial of degree five, whose slope and curvature at each point are those of
+    the parabola through the point and its two neighbours. Beyond the first and the last point it continues as a
+    straight line.
 
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """
@@ -122,7 +121,7 @@ class Spline(AbstractTerrain):
                 f"{self.heights.shape}."
             )
         if not isinstance(self.x, Tracer) and np.any(np.diff(self.x) <= 0):
-            raise ValueError("Spline: x must ascend; sort the points, and leave out repeated ones.")
+            raise ValueError("Spline: x must ascend; sort the points and remove repeated ones.")
 
     def height(self, place):
         n = self.x.shape[0]

@@ -1,7 +1,7 @@
-"""Evaluations of a term, alike for a plain vector field and for one on a manifold.
+"""Evaluations of a term, for a vector field and for one on a manifold.
 
-diffrax hands its terms to a solver wrapped, so that time always increases. What is returned here is the derivative with
-respect to that time. States are raveled: one vector of all components.
+diffrax wraps the terms of a solver so that time always increases; derivatives here are with respect to that time.
+States are raveled: one vector of all components.
 """
 
 from typing import Any, NamedTuple
@@ -18,13 +18,13 @@ from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation
 
 
 class Evaluation(NamedTuple):
-    """A state, the derivative there, the chart, and whether that failed; `near` is the same as the manifold gave it."""
+    """A state, its derivative, the chart, whether the evaluation failed, and the evaluation by the manifold."""
 
     y: Array
     f: Array
     chart: Chart | None
     failed: Any
-    near: ManifoldEvaluation | None
+    of_manifold: ManifoldEvaluation | None
 
 
 def check_term(term: Any) -> None:
@@ -86,15 +86,15 @@ def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart |
     return _raveled(term, out, flat.dtype)
 
 
-def restore(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluation, args: Args) -> Evaluation:
-    """Restore a corrected state to the manifold, if there is one, and evaluate the vector field there.
+def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluation, args: Args) -> Evaluation:
+    """Project a corrected state on the manifold, if there is one, and evaluate the vector field there.
 
     `before` is the evaluation of the prediction, at the same time.
     """
     manifold = _manifold(term)
-    if manifold is None or before.near is None:
+    if manifold is None or before.of_manifold is None:
         return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.project_near(t * term.direction, unravel_like(like, flat), before.near, args)
+    out = manifold.project_near(t * term.direction, unravel_like(like, flat), before.of_manifold, args)
     return _raveled(term, out, flat.dtype)
 
 

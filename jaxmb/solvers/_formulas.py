@@ -1,7 +1,7 @@
 """The second-derivative formulas, for steps of any size, from Newton's form of Hermite's interpolation polynomial.
 
 A formula advances `y' = f`, whose second derivative is `g`. It interpolates a quantity z at the end of the step, with
-its slope, and at points of the past, and asks one thing of the polynomial:
+its slope, and at points of the past, and imposes one condition on the polynomial:
 
     family   z   points of the past     the polynomial                                order
     E        f   k                      integrated over the step gives the change     k + 2
@@ -9,12 +9,12 @@ its slope, and at points of the past, and asks one thing of the polynomial:
     B        y   k                      has the second derivative g at the end        k + 1
     Y        y   k, with their slopes   the same                                      2k + 1
 
-A point with its slope is a double node. So all of them are one formula on `m` nodes of the past, `m = k` or `2k`, and
-come out of one table of divided differences. With the Newton basis of these nodes and `s = (t - t_{n+1}) / h`,
+A point with its slope is a double node, so all families are one formula on `m` nodes of the past, `m = k` or `2k`, and
+follow from one table of divided differences. With the Newton basis of these nodes and `s = (t - t_{n+1}) / h`,
 
     p(t) = sum_{i<m} differences[i] basis_i(t) + (a + b s) basis_m(t) / basis_m(t_{n+1}),
 
-and asking that the formula be exact for every term gives its coefficients.
+and exactness of the formula for every term determines its coefficients.
 
 Sources: W. H. Enright, SIAM J. Numer. Anal. 11(2), 1974 (E); E. Hairer and G. Wanner, Solving Ordinary Differential
 Equations II, Springer, 1996, section V.3 (E and B).
@@ -34,11 +34,11 @@ class Family(NamedTuple):
     """**Fields:**
 
     - `integrated`: whether z is f, and the polynomial is integrated; otherwise z is y.
-    - `multiplicity`: conditions at each point of the past, 2 where its slope is one.
-    - `highest`: the largest number k of points that is of use.
+    - `multiplicity`: conditions at each point of the past, 2 if the slope is used.
+    - `highest`: the largest useful number k of points.
     - `stable`: the largest k of an A-stable formula.
-    - `growth`: by how much every step may be longer than the one before, with 1, 2, ... points, and the formula stay
-        zero-stable; see `largest_growth` of `jaxmb.solvers.stability`.
+    - `growth`: the ratio by which every step may exceed the previous one, with 1, 2, ... points, without loss of
+        zero-stability; see `largest_growth` of `jaxmb.solvers.stability`.
     """
 
     integrated: bool
@@ -49,7 +49,7 @@ class Family(NamedTuple):
 
     @property
     def length(self) -> int:
-        """How many differences are kept: enough for the error of the formula with the most points."""
+        """The number of differences that are kept: enough for the error of the formula with the most points."""
         return self.multiplicity * (self.highest + 1) + 1
 
     def order(self, k: Any) -> Any:
@@ -59,7 +59,7 @@ class Family(NamedTuple):
 
 _ANY = float("inf")
 # Beyond the highest number of points E and B are stable in no useful sector (A(α) below 13 degrees), and Y in none; H
-# is A-stable with one point only, the rest is there for comparison.
+# is A-stable with one point only; the others are for comparison.
 FAMILIES = {
     "E": Family(True, 1, 7, 2, (_ANY,) * 7),
     "B": Family(False, 1, 8, 3, (_ANY, 3.84, 2.14, 1.57, 1.32, 1.19, 1.11, 1.06)),
@@ -115,7 +115,7 @@ def start(family: Family, t: Any, z: Float[Array, " n"], slope: Float[Array, " n
 
 
 def double(history: History, slope: Float[Array, " n"]) -> History:
-    """The history with its latest point double, by the slope of z there; as it is if that point is double already."""
+    """The history with its latest point doubled by the slope of z there; unchanged if that point is double already."""
     mesh, dtype = history.mesh, history.differences.dtype
     length = mesh.shape[0]
     own = spans(mesh)[0]

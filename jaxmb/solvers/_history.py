@@ -6,8 +6,8 @@ derivatives is
     P(t) = sum_i differences[i] * basis_i(t),    basis_i(t) = prod_{j<i} (t - t_{n-j}) / (t_n - t_{n-j-1}),
 
 where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by.
-All entries have the units of `f`, so nothing over- or underflows however small the steps are, and moving on by one step
-needs only `basis_i` at the new mesh point: there are no loops over the order.
+All entries have the units of `f`, so no step size causes overflow or underflow, and advancing by one step needs only
+`basis_i` at the new mesh point: there are no loops over the order.
 """
 
 from typing import Any
@@ -33,7 +33,7 @@ class History(eqx.Module):
 
     - `differences`: scaled divided differences of the raveled derivative, one row each; zero from row `known` on.
     - `mesh`: `t_n, t_{n-1}, ...`, latest first. Entries from `known` on are placeholders that keep the spans nonzero.
-    - `known`: how many mesh points have been visited since the start (or the last restart), at most `LENGTH`.
+    - `known`: the number of mesh points since the start (or the last restart), at most `LENGTH`.
     """
 
     differences: Float[Array, "length n"]
@@ -50,7 +50,7 @@ def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
 
 
 def spans(mesh: Float[Array, " length"]) -> Float[Array, " length-1"]:
-    """What the factors of the basis are divided by. Where the latest point is double, its own span is the next one."""
+    """The divisors of the factors of the basis. If the latest point is double, its own span is the next one."""
     out = mesh[0] - mesh[1:]
     return jnp.where(out > 0, out, jnp.append(out[1:], out[-1:]))
 
@@ -59,7 +59,7 @@ def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Ar
     """The Newton basis of a mesh at some times."""
     length = mesh.shape[0]
     factors = (t[None, :] - mesh[:-1, None]) / spans(mesh)[:, None]
-    # A product over a mask: XLA makes one kernel of it, where a cumulative product becomes a dozen.
+    # A product over a mask is one kernel in XLA, a cumulative product a dozen.
     factors_of = np.tril(np.ones((length, length - 1), dtype=bool), -1)
     return jnp.prod(jnp.where(factors_of[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
 
@@ -70,7 +70,7 @@ def basis_means(
     """`(means, values)`: the mean over `[a, b]`, and the value at `b`, of the Newton basis of a mesh."""
     dtype = mesh.dtype
     table = basis(mesh, a + (b - a) * jnp.asarray(np.append(NODES, 1.0), dtype))
-    # Written out: in a batch XLA's sum over so short an axis is ten times as expensive.
+    # Written as a sum of terms: in a batch, XLA's reduction over a short axis is ten times as expensive.
     means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(WEIGHTS))
     return jnp.asarray(means), table[:, -1]
 
@@ -81,18 +81,18 @@ def before_each(length: int) -> np.ndarray:
 
 
 def step_end(history: History, t: Any) -> Any:
-    """`t`, or some later time where the step has no length.
+    """`t`, or a later time if the step has zero length.
 
-    Such steps are made, and thrown away, by members of a batch that are done before the others. Without a length they
-    would divide by zero, and spoil reverse-mode derivatives.
+    Members of a batch that finish early make and discard such steps. With zero length they would divide by zero and
+    spoil reverse-mode derivatives.
     """
     latest = history.mesh[0]
     return jnp.where(t > latest, t, latest + spans(history.mesh)[0])
 
 
 def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float[Array, "length n"]) -> History:
-    """The history with one mesh point more; `partial_sums` are the polynomials of all orders, evaluated there."""
-    # Rows that would mix in the placeholders are kept at zero: they are never used, but would grow without bound.
+    """The history with one more mesh point; `partial_sums` are the polynomials of all orders, evaluated there."""
+    # Rows that involve placeholders are kept at zero: they are never used but would grow without bound.
     length = history.mesh.shape[0]
     known = history.known >= np.arange(length, dtype=np.int32)
     zero = jnp.zeros((), z.dtype)

@@ -20,25 +20,25 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 from ._damping import eigenvalues
 from ._lanes import cond_of_any_lane
 
-# `(t, y) -> ((y on the manifold, f), anything else)`, for raveled y: a pytree, so that it can carry parameters.
+# `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
 
 _MAX_ITERATIONS = 10
-# A matrix is made anew after a step whose corrections shrank by less than this factor from one to the next.
+# The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
 _SLOW = 0.2
-# After a matrix has failed that was made for another step, so many steps make their own.
+# If a matrix of an earlier step has failed, this number of steps compute their own.
 _DISTRUST = 10
-# Where a correction is larger than this part of the state and its change, the matrix tells nothing about its end.
+# If a correction is larger than this fraction of the state and its change, the matrix is not reliable at its end.
 _FAR = 0.1
-# How many matrices Newton's method may use for a step; and what stands for success.
+# The largest number of matrices for a step; and the code for success.
 _ATTEMPTS, _DONE = 4, 9
 # The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps: with
-# longer ones the stiffness in what is left out slows Newton's method, with shorter ones the rounding in what is there.
+# longer differences the truncation error, which is stiff, slows Newton's method, with shorter ones the rounding error.
 _AHEAD = 0.4
 
 
 class Derivatives(NamedTuple):
-    """A state with its first and second derivative in time; `rest` is what else the field returned."""
+    """A state with its first and second derivative in time; `rest`: the other outputs of the field."""
 
     y: Float[Array, " n"]
     f: Float[Array, " n"]
@@ -53,7 +53,7 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 
 
 def probed_derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
-    """The same; with a warning if differences of f to a state nearby contradict its derivative."""
+    """The same, with a warning if differences of f contradict its derivative."""
     eps = jnp.finfo(y.dtype).eps
     size = jnp.abs(y) + jnp.mean(jnp.abs(y))
     signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
@@ -78,8 +78,8 @@ def probed_derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivativ
 
 def _warn():
     warnings.warn(
-        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and would be wrong "
-        "without a sign: look for `stop_gradient`, for rounding, and for integers on the way from the state.",
+        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its "
+        "results would be wrong: look for `stop_gradient`, rounding and integers in the vector field.",
         stacklevel=2,
     )
 
@@ -88,7 +88,8 @@ class Linearization(eqx.Module):
     """How a state and its derivatives in time change with the free components.
 
     **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held; `spectrum`:
-    the eigenvalues of J, the free rows of `rate`; `renewals`: how many steps are still to make a matrix of their own.
+    the eigenvalues of J, the free rows of `rate`; `renewals`: the number of next steps that must compute their own
+    matrix.
     """
 
     state: Float[Array, "n free"]
@@ -106,10 +107,10 @@ def linearize(
     h: Any,
     free: Int[Array, " free"],
 ) -> Linearization:
-    """The derivatives of a field with respect to the free components, for a step h and a `rate` that is held.
+    """The derivatives of a field with respect to the free components, for a step h and a held `rate`.
 
-    That of g is the derivative of the Jacobian along the motion. A difference is exact enough for Newton's method, and
-    third derivatives of all that the field consists of would take longer to compile than the rest.
+    That of g is the derivative of the Jacobian along the motion. A difference is accurate enough for Newton's method;
+    third derivatives of the field would dominate compile time.
     """
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
 
@@ -131,39 +132,39 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """What solves `(P - c) x = r`, with `P = 1 - a J - b J²`, and c the b of the derivative of g at a held rate.
+    """Inverses for `(P - C) x = r`, with `P = 1 - a J - b J²` and `C = b K`, K the derivative of g at a held rate.
 
-    **Fields:** `square`: the inverse of P; `rate`: `P⁻¹ (a + b J)`; `beyond`: by what the b of J² in P is less than the
-    one asked for; `rest`: what is to be applied after P⁻¹, for that and for c. Where the rate is wrong it can be so
-    small as to hide errors: what decides about a step is measured by P⁻¹ alone.
+    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + b J)`; `missing`: how much less than b the factor of J² in P is; `c`:
+    `(1 - P⁻¹ (C + missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate `c` can be so small that it hides errors:
+    errors of a step are measured by P⁻¹ alone.
     """
 
-    square: Float[Array, "free free"]
-    rate: Float[Array, "free free"]
-    beyond: Float[Array, ""]
-    rest: Float[Array, "free free"]
+    p: Float[Array, "free free"]
+    p_rate: Float[Array, "free free"]
+    missing: Float[Array, ""]
+    c: Float[Array, "free free"]
 
 
 def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
-    """The inverses that Newton's method needs, each as accurate as if it were one with a single J; `held` is the
-    derivative of g at a held rate.
+    """The inverses of Newton's method, each as accurate as one of a matrix with a single J; `held` is the derivative of
+    g at a held rate.
     """
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
-    # complex for all formulas with equal steps; should they become real, those of the nearest complex ones do.
+    # complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
     product, least = -b - a**2 / 4, a**2 / 1000
     real, imaginary = a / 2, jnp.sqrt(jnp.maximum(product, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
-    rate = a * along + (real**2 - imaginary**2) * across
-    square = along + real * across
-    beyond = jnp.maximum(least - product, jnp.zeros_like(product))
-    rest = inverse(identity - square @ (b * held + beyond * jacobian @ jacobian))
-    return Inverses(square, rate, beyond, rest)
+    p_rate = a * along + (real**2 - imaginary**2) * across
+    p = along + real * across
+    missing = jnp.maximum(least - product, jnp.zeros_like(product))
+    c = inverse(identity - p @ (b * held + missing * jacobian @ jacobian))
+    return Inverses(p, p_rate, missing, c)
 
 
-# One member of a batch after the other; see `jaxmb.elimination`.
+# Members of a batch are treated one after the other; see `jaxmb.linalg`.
 @jax.custom_batching.sequential_vmap
 def _lapack_inverse(matrix):
     return jnp.linalg.inv(matrix)
@@ -183,7 +184,7 @@ def _inverse_jvp(primals, tangents):
 
 class Solved(NamedTuple):
     """The end of a step, without derivatives; whether Newton's method `converged`; its last matrix, with the inverses;
-    and its `work`: evaluations of f and g, and matrices made.
+    and its `work`: numbers of evaluations of f and g, and of matrices.
     """
 
     end: Derivatives
@@ -194,8 +195,8 @@ class Solved(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """`change` is the correction that comes next, `size` its norm, with or without the derivative of g at a held rate,
-    whichever is larger, and `rate` that over the one before.
+    """`change` is the next correction, `size` its norm (the larger of those with and without the derivative of g at a
+    held rate), and `rate` the ratio of `size` to the previous one.
     """
 
     end: Derivatives
@@ -221,23 +222,23 @@ def solve(
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 
-    The iteration starts from the `predicted` y and rate, with the current iteration matrix (modified Newton). Where
-    iterations with it would cost more than a new matrix, a new one is made at the nearest y so far, for the rate there.
-    The prediction is not near enough where the direction of a stiff spring turns: a rate that is off by the stiffness
-    changes the matrix considerably.
+    The iteration starts from the `predicted` y and rate, with the current iteration matrix (modified Newton). If
+    iterations with it would cost more than a new matrix, one is computed at the best y so far, for the rate there. The
+    prediction is not good enough where the direction of a stiff spring turns: the error of its rate is multiplied by
+    the stiffness and changes the matrix considerably.
 
     **Arguments:** `before`: the state before the step and its rate, where Newton's method restarts if the field was not
     finite; `matrix`: the current one; `size`: the norm of a correction in units of the tolerance, and `tol`: the norm
-    of the last correction, which is not applied to y, and to f and g only by the current matrix: its remainder would be
-    multiplied by the stiffness in them, and spoil predictions; `renew`: makes a matrix at a state, for a rate.
+    of the last correction, which is not applied to y, and to f and g only through the current matrix, since stiffness
+    would multiply its error there and spoil predictions; `renew`: computes a matrix at a state, for a rate.
 
-    g is taken along the rate that was predicted, then along the f that each correction leads to. In f itself the error
-    of y is multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the
-    square of the step: Newton's method would converge only from nearby, and on Robertson's reaction only inside a basin
-    smaller than round-off.
+    g is evaluated along the predicted rate, then along the f after each correction. In f itself the error of y is
+    multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the square of
+    the step: Newton's method would converge only from nearby, and on Robertson's reaction only inside a basin smaller
+    than round-off.
 
-    After a prediction that is as wrong as the state is large, as at the end of a fast transient, the matrix there may
-    be so much too large that the second correction seems to be nothing, far from any solution. It is not asked for one.
+    If the error of the prediction is as large as the state, as at the end of a fast transient, the matrix there may be
+    so large that the second correction appears negligible far from any solution; it is not computed.
     """
 
     shapes = eqx.filter_eval_shape(derivatives, field, t, predicted[0])
@@ -249,16 +250,16 @@ def solve(
         (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
         along = carry.end.f
         g = push(jnp.ones_like(t), along)[1]
-        # The stiffest part of g is taken together with f: of their own, both are large and nearly cancel.
+        # The stiffest part of g is combined with f: both are large and nearly cancel.
         mismatch = g[free] - matrix.rate[free] @ along[free]
-        without = inverses.square @ ((y - past)[free] - b * mismatch) - inverses.rate @ f[free]
-        change = inverses.rest @ without
+        without = inverses.p @ ((y - past)[free] - b * mismatch) - inverses.p_rate @ f[free]
+        change = inverses.c @ without
         corrected = f - matrix.rate @ change
         g = g + matrix.rate @ (corrected - along)[free] - matrix.acceleration @ change
         now = jnp.maximum(size(matrix.state @ change), size(matrix.state @ without))
         return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
-    # A new matrix costs about as much as half an iteration for each column, and two or three follow.
+    # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
     patience = 2 + free.size // 2
     far = jnp.maximum(_FAR * (size(before[0]) + size(a * before[1])), 1.0)
 
@@ -281,7 +282,7 @@ def solve(
         renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
         renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
         matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
-        # A matrix is not made for the same place again.
+        # A matrix is not computed for the same state again.
         farther = jnp.where(anew, last.end.y, start)
         nearest = jnp.where(last.rate < 1, last.end.y - matrix.state @ last.change, farther)
         finite = jnp.isfinite(last.size)
@@ -289,8 +290,8 @@ def solve(
         work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
         return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
-    square = jnp.zeros((free.size, free.size), past.dtype)
-    inverses = Inverses(square, square, square[0, 0], square)
+    zeros = jnp.zeros((free.size, free.size), past.dtype)
+    inverses = Inverses(zeros, zeros, zeros[0, 0], zeros)
     carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
     k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)
@@ -319,7 +320,7 @@ def _differentiable_jvp(primals, tangents):
     values, structure = eqx.partition(field, eqx.is_inexact_array)
 
     def at(values, t, change):
-        # What g is for a rate that is held: the other part of its change is J times that of the rate.
+        # g for a held rate: the other part of its change is J times that of the rate.
         (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, y.at[free].add(change), has_aux=True)
         return state, rate, push(jnp.ones_like(t), f)[1]
 
@@ -335,10 +336,10 @@ def _differentiable_jvp(primals, tangents):
     load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + b * moved[2])[free]
 
     def correction(change):
-        # What is large is kept together as in `solve`, and nothing rests on the last digits of an inverse.
+        # Large terms are combined as in `solve`, so the result does not depend on the last digits of an inverse.
         rate = moved[1][free] + jacobian @ change
-        mismatch = change - load - b * held @ change - inverses.beyond * jacobian @ rate
-        return inverses.rest @ (inverses.square @ mismatch - inverses.rate @ rate), rate
+        mismatch = change - load - b * held @ change - inverses.missing * jacobian @ rate
+        return inverses.c @ (inverses.p @ mismatch - inverses.p_rate @ rate), rate
 
     change = -correction(still)[0]
     left, rate = correction(change)

@@ -12,7 +12,7 @@ from ._history import basis, basis_means, spans
 
 
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
-    """A polynomial through what a method remembers, in Newton's form on its mesh, of the `order` used in a step."""
+    """The polynomial through a method's history, in Newton's form on its mesh, of the `order` used in a step."""
 
     t0: Any
     t1: Any
@@ -36,8 +36,8 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
 class RateInterpolation(MultistepInterpolation):
     """The integral of a polynomial through the derivatives at the end of a step and before.
 
-    The evaluation that ends a step moves this polynomial a little, so its integral no longer meets the value that the
-    step began with, by `mismatch`. A cubic that is flat at both ends makes up for it: the solution is continuously
+    The evaluation at the end of a step changes this polynomial slightly, so its integral misses the initial value of
+    the step by `mismatch`. A cubic that is flat at both ends compensates for it: the solution is continuously
     differentiable from step to step, and its derivative at mesh points is the vector field.
     """
 

@@ -10,6 +10,6 @@ from jax import lax
 
 
 def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
-    """`lax.cond` that stays a branch under `vmap`: taken if any lane wants it, kept only by those that do."""
+    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, and used only by those that do."""
     new = lax.cond(eqxi.unvmap_any(pred), true_fn, false_fn, operand)
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))

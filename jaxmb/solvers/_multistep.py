@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# A step whose constraints or implicit equation were not solved; it only counts if the steps are fixed, otherwise its
-# error is infinite.
+# Result of a step whose constraints or implicit equation were not solved; it matters only for fixed steps, otherwise
+# the error is infinite.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
@@ -37,7 +37,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     tolerances: AbstractVar[Tolerances]
     solves_implicitly: AbstractVar[bool]
 
-    # The place from which diffrax fills in the tolerances of a step size controller. There is no root to find.
+    # diffrax fills in the tolerances of a step size controller here; there is no root finder.
     @property
     def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerances
@@ -55,7 +55,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         check_real(y0)
         return self._initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
-    # Nested jit: a step is traced once, not anew in each loop and each transformation around it.
+    # Nested jit: a step is traced once, and not for each loop and transformation around it.
     @eqx.filter_jit
     def step(
         self,
@@ -87,11 +87,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
     @abc.abstractmethod
     def _initial_state(self, terms, t0, t1, y0, args, chart: Chart | None, before: Any) -> Any:
-        """The solver state at a start; `before`: that before a jump, None at the first start."""
+        """The initial solver state; `before`: the state before a jump, None at the first start."""
 
     @abc.abstractmethod
     def _advance(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
-        """A step: what `step` returns, but whether it failed instead of the result."""
+        """A step: the outputs of `step`, with a failure flag instead of the result."""
 
     def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
         """The weighted norm of an error."""
@@ -99,7 +99,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
 
 def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], Any]) -> Tolerances:
-    """Tolerances of a solver's own, or those of the step size controller if there are none."""
+    """The tolerances of a solver, by default those of the step size controller."""
     if (rtol is None) != (atol is None):
         raise ValueError(
             f"`{solver}` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
@@ -110,12 +110,12 @@ def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], An
 
 
 def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
-    """The state of a solver after a jump, made anew, or else the same."""
+    """The state of a solver, restarted after a jump and otherwise unchanged."""
     if made_jump is False:
         return state
 
     def restarted():
         return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart(), state)
 
-    # In a batch the evaluation is spent if any of its members has made a jump.
+    # In a batch the restart is evaluated if any member has made a jump.
     return lax.cond(eqxi.unvmap_any(made_jump), restarted, lambda: state)

@@ -9,11 +9,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-# The constants come from measuring evaluations against true error, on Kepler's problem, the Pleiades and Arenstorf's
-# orbit. They matter little over wide ranges; a strong preference for low orders or for an unchanged step costs 10-20%.
-# How the step of the order below, and of the order above, counts against that of the present order.
+# The constants were chosen by measuring evaluations against true error on Kepler's problem, the Pleiades and
+# Arenstorf's orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs
+# 10-20%.
+# Weights of the steps of the lower and of the higher order relative to that of the present order.
 LOWER, _UPPER = 0.98, 0.95
-# How much of the deviation from the target the next step is to make up for.
+# The fraction of the deviation from the target that the next step corrects.
 GAIN = 0.85
 
 
@@ -23,12 +24,12 @@ class StepEstimate(eqx.Module):
     **Fields:**
 
     - `error`: the weighted norm of the local error; below one the step is good.
-    - `growth`: the factor by which steps may grow, all of them, with the order that the solver has chosen for the next.
+    - `growth`: the factor by which all steps may grow, with the order chosen for the next step.
     - `retry`: the same for the order just used; zero if there is no usable estimate.
-    - `response`: the power of these factors by which to change the next step, when those before are what they are.
+    - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
-    - `work`: what the step took: evaluations of the vector field, and matrices made. Not integers, which diffrax does
-        not expect in an error.
+    - `work`: evaluations of the vector field, and matrices computed. Not integers, which diffrax does not expect in an
+        error.
     """
 
     error: Float[Array, ""]
@@ -40,7 +41,7 @@ class StepEstimate(eqx.Module):
 
 
 def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:
-    """By what factors steps may grow for the errors to be what is aimed at; zero if they are not finite."""
+    """Factors by which steps may grow to reach the target error; zero where the error is not finite."""
     errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, errors.dtype))
     return (target / jnp.maximum(errors, jnp.finfo(errors.dtype).tiny)) ** (1 / powers.astype(errors.dtype))
 
@@ -62,15 +63,15 @@ def choose_order(
 
     **Arguments:**
 
-    - `errors`: weighted norms of the local errors that the lower, the present and the higher formula would have made in
-        the step. Infinite or not a number if the step went wrong. Those of formulas that are not allowed are ignored.
-    - `powers`: of the steps that these errors fall with.
+    - `errors`: weighted norms of the local errors of the lower, the present and the higher formula in the step,
+        infinite or NaN if the step failed. Those of formulas that are not allowed are ignored.
+    - `powers`: the powers of the step that these errors are proportional to.
     - `response`: as in `StepEstimate`.
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
-    - `known`: whether there are points enough for the error of the higher formula.
+    - `known`: whether there are enough points for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
     - `work`, `limit`: as in `StepEstimate`.
-    - `bounded`: makes factors by which steps may grow, for the three formulas, those that stability allows.
+    - `bounded`: limits the growth factors of the three formulas to those that stability allows.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
     """
@@ -83,7 +84,7 @@ def choose_order(
     lower = jnp.where(may_fall, LOWER * factors[0], zero)
     same = factors[1]
     higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
-    # With every point since the start in use there is no estimate for the next order, but it is better as a rule.
+    # While every point since the start is in use there is no estimate for the next order, but it is usually better.
     opening = may_rise & ~known & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))
     fall = ~rise & (lower > same)

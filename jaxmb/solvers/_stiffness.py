@@ -1,13 +1,13 @@
 """Whether stability, instead of accuracy, limits the steps of Adams' method.
 
-A step is counted as stiff when two things come together. The Jacobian, as the corrector shows it, is so large that the
-step is near the bound of stability; and along the solution the vector field changes much less than that, in proportion
-to the state, or the state by less than the corrector does: errors of stability, not the motion, keep the step short.
-Measured on steps of motions that are not stiff it is so in less than one of ten, where stability limits the steps in
-four of ten to all (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
+A step is counted as stiff if two conditions hold. The Jacobian, estimated from the corrector, is so large that the step
+is near the stability bound; and along the solution the vector field changes much less than that, relative to the state,
+or the state changes less than in the corrector: stability errors, not the motion, keep the step short. By measurement,
+this holds for fewer than one in ten steps of non-stiff motions, and for four in ten to all steps where stability limits
+them (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
 
-Source of the first: E. Hairer, S. P. Nørsett and G. Wanner, Solving Ordinary Differential Equations I, Springer, 1993,
-for Runge-Kutta methods (DOPRI5's test).
+Source of the first condition: E. Hairer, S. P. Nørsett and G. Wanner, Solving Ordinary Differential Equations I,
+Springer, 1993, for Runge-Kutta methods (DOPRI5's test).
 """
 
 import functools
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from ._history import HIGHEST_ORDER
 from .stability import adams, spectral_radius
 
-# Parts of the bound of stability, and of the changes along the solution, from where on a step is stiff.
+# A step is stiff above these fractions of the stability bound and of the changes along the solution.
 _NEAR, _FASTER, _SMALLER = 0.3, 10.0, 3.0
-# What a stiff step adds, and another takes away, and the sum from where on the motion is.
+# The increment for a stiff step, the decrement for any other, and the sum from which on the motion is stiff.
 _UP, _DOWN, _STIFF = 3, 1, 150
 
 
 class Stiffness(eqx.Module):
-    """**Fields:** `steps`: stiff steps so far; `level`: of the evidence, which fades with steps that are not."""
+    """**Fields:** `steps`: number of stiff steps; `level`: the evidence, which decreases with other steps."""
 
     steps: Int[Array, ""]
     level: Int[Array, ""]
@@ -50,16 +50,16 @@ def observed(
     correction: tuple[Float[Array, ""], Float[Array, ""]],
     change: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Stiffness:
-    """What one more step shows, from the sizes of what the corrector changes, in y and in f, and of what the step does.
+    """The evidence after one more step, from the changes of y and f by the corrector and by the step.
 
-    Sizes that are zero, or not finite, show nothing.
+    Sizes that are zero or not finite are no evidence.
     """
-    # |df| / |dy| of the corrector, against the same along the solution, without division.
+    # |df| / |dy| of the corrector compared with that along the solution, without division.
     near = h * correction[1] > _NEAR * jnp.asarray(_bounds(), h.dtype)[order] * correction[0]
     faster = correction[1] * change[0] > _FASTER * change[1] * correction[0]
     smaller = change[0] < _SMALLER * correction[0]
     stiff = (near & (faster | smaller)).astype(jnp.int32)
-    # Once found it stays.
+    # Once found, stiffness remains found.
     level = jnp.where(stiff > 0, before.level + _UP, before.level - _DOWN)
     level = jnp.where(before.found, before.level, jnp.maximum(level, 0))
     return Stiffness(before.steps + stiff, level.astype(jnp.int32))

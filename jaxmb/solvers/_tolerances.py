@@ -1,4 +1,4 @@
-"""How a solver that chooses its own order learns the tolerances, and what it measures errors with."""
+"""Tolerances and norms of solvers that choose their own order."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from ._evaluation import unravel_like
 
 
 def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> Any:
-    """The norm of a raveled quantity, given to it in the structure of `like`, but in one precision."""
+    """The norm of a raveled quantity, evaluated in the structure of `like` but in one precision."""
     return norm(unravel_like(jax.tree.map(lambda leaf: leaf.astype(flat.dtype), like), flat))
 
 
@@ -26,7 +26,7 @@ class MultistepNorm(eqx.Module):
 
 
 class Tolerances(eqx.Module):
-    """Tolerances and norm, in the place and under the names where diffrax looks for those of a root finder.
+    """Tolerances and norm, under the names that diffrax expects of a root finder.
 
     Made by `diffrax.with_stepsize_controller_tols(Tolerances)()`, they are filled in from the step size controller;
     otherwise they are `fixed`, for steps that no error estimate controls.
@@ -38,8 +38,8 @@ class Tolerances(eqx.Module):
     fixed: bool = eqx.field(static=True, default=False)
 
     def check(self, solver: str) -> None:
-        """Raise a `ValueError` if they come from a controller that cannot read the estimates of a multistep method."""
-        # A concrete class: the norm comes from the controller, and only that of `MultistepController` is of it.
+        """Raise a `ValueError` for a controller that cannot read the estimates of a multistep method."""
+        # A concrete class, since only `MultistepController` has a norm of this class.
         if not self.fixed and not isinstance(self.norm, MultistepNorm):
             raise ValueError(
                 f"`{solver}` chooses its order together with its step, which only `MultistepController` understands. "
@@ -49,7 +49,7 @@ class Tolerances(eqx.Module):
 
     def scale(self, y0: Array, y1: Array) -> Array:
         """The error tolerated in each component over a step from `y0` to `y1`."""
-        # A step to where the vector field is undefined is judged by where it came from.
+        # A step that ends where the vector field is undefined is measured at its start.
         y1 = jnp.where(jnp.isnan(y1), y0, y1)
         with jax.numpy_dtype_promotion("standard"):
             scale = self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))

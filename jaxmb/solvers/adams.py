@@ -11,7 +11,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import controlled_components, evaluate, next_chart, ravel, restore, unravel_like
+from ._evaluation import controlled_components, evaluate, next_chart, project_near, ravel, unravel_like
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
 from ._interpolation import RateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
@@ -20,12 +20,12 @@ from ._stiffness import Stiffness, none_found, observed
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Chart
 
-# The error that a step aims at, in units of the tolerance.
+# The target error of a step, in units of the tolerance.
 _TARGET = 0.2
-# Evaluations and matrices of a step.
+# Numbers of evaluations and matrices in a step.
 _WORK = np.array([2, 0], np.int32)
-# The local error of order k falls with the power k + 1 of the steps if all of them change, but with the power
-# 1 + sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
+# The local error of order k is proportional to the power k + 1 of the steps if all of them change, but to the power 1 +
+# sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
 _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
@@ -39,9 +39,9 @@ class AdamsState(eqx.Module):
     - `order`: the order of the next step.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
         accepted steps of order `k`. The number of evaluations of the vector field, rejected steps included, is
-        `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more if the first step was not given as `dt0`.
+        `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more without a given `dt0`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
-    - `stiffness`: what the accepted steps show of it, if that was asked for, otherwise `None`.
+    - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     """
 
     history: History
@@ -107,10 +107,10 @@ class Adams(AbstractMultistep):
     ):
         """**Arguments:**
 
-        - `min_order`, `max_order`: bounds of the order; equal values fix it, once enough steps have been made from
-            order one on.
-        - `stiffness`: whether to count the steps that stability limits instead of accuracy, in `AdamsState.stiffness`,
-            and to stop, with `diffrax.RESULTS.nonlinear_divergence`, when a motion is found stiff by that.
+        - `min_order`, `max_order`: bounds of the order; equal values fix it, after a start from order one.
+        - `stiffness`: whether to count the steps that are limited by stability instead of accuracy, in
+            `AdamsState.stiffness`, and whether to stop, with `diffrax.RESULTS.nonlinear_divergence`, when a motion is
+            found stiff.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
 
@@ -174,7 +174,7 @@ class Adams(AbstractMultistep):
         predicted = before + h * mean
         first = evaluate(terms, t1, predicted, y0, chart, args)
 
-        # What the new derivative adds to these polynomials, and its integral.
+        # The contribution of the new derivative to these polynomials, and its integral.
         defects = first.f[None] - neighbours
         integrals = means / values
         last = integrals[order]
@@ -182,7 +182,7 @@ class Adams(AbstractMultistep):
         differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
         errors = h * differences[:, None] * defects
         corrected = predicted + h * last * defects[1]
-        second = restore(terms, t1, corrected, y0, first, args)
+        second = project_near(terms, t1, corrected, y0, first, args)
         after, f = second.y, second.f
 
         failed = first.failed | second.failed

@@ -20,13 +20,13 @@ from .manifold_term import Args, Y
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
 _WITHOUT_ESTIMATE = 0.25
-# Repeated rejections mean that errors do not fall as the order promises, as at a kink or a jump: bounds of the factor
-# after the first, second, and every further rejection.
+# Repeated rejections mean that errors do not decrease according to the order, as at a kink or a jump: upper bounds of
+# the factor after the first, second, and every further rejection.
 _REPEATED = (0.95, 0.5, 0.1)
-# A step cut short by somebody else is forgotten at most by this factor; beyond it differences would be rounding errors.
+# The recovery from a step shortened by a wrapper is at most this factor; beyond it differences are rounding errors.
 _RECOVERY = 100.0
-# After a step that gave no estimate, so many steps grow by at most this factor: the longest step that can be solved is
-# not tried for every time.
+# After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
+# be solved are not tried again and again.
 _CAUTION, _CAUTIOUS = 4, 1.4
 
 
@@ -35,10 +35,10 @@ class ControllerState(eqx.Module):
 
     **Fields:**
 
-    - `intended`: the step that was last asked for.
-    - `rejections`: how often it has been rejected since the last good one.
-    - `caution`: for how many more steps growth is kept small.
-    - `wasted`: evaluations of the vector field, and matrices made, in all rejected steps.
+    - `intended`: the last step size that was requested.
+    - `rejections`: the number of rejections since the last accepted step.
+    - `caution`: the number of next steps with limited growth.
+    - `wasted`: evaluations of the vector field, and matrices computed, in all rejected steps.
     """
 
     intended: Float[Array, ""]
@@ -48,14 +48,14 @@ class ControllerState(eqx.Module):
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
-    """Steps as long as the error estimates of a multistep method allow, with the order that allows the longest.
+    """The longest steps that the error estimates of a multistep method allow, at the order that allows the longest.
 
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one in the given norm. For
-    [`jaxmb.solvers.Adams`][]; to step exactly to some times, or over jumps, wrap it in
+    [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
 
-    If no acceptable step is found down to `dtmin`, or down to what the floating-point time can resolve, the solve ends
-    with `diffrax.RESULTS.dt_min_reached`.
+    If no acceptable step is found down to `dtmin`, or to the resolution of the floating-point time, the solve ends with
+    `diffrax.RESULTS.dt_min_reached`.
     """
 
     rtol: Any
@@ -87,9 +87,9 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             raveled state.
         - `norm`: the norm of the weighted error.
         - `dtmin`, `dtmax`: bounds of the step.
-        - `force_dtmin`: if true, steps of size `dtmin` are accepted whatever their error, and the solve goes on.
+        - `force_dtmin`: if true, steps of size `dtmin` are accepted with any error, and the solve continues.
         - `safety`: multiplies every step that the error estimates allow.
-        - `factormin`, `factormax`: by how much a step may shrink at once after a rejection, and grow after success.
+        - `factormin`, `factormax`: the smallest factor after a rejection, and the largest after an accepted step.
 
         **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state
         can resolve, and for inconsistent bounds.
@@ -156,7 +156,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         controller_state: ControllerState,
     ) -> tuple[Any, Any, Any, bool, ControllerState, diffrax.RESULTS]:
         del y0, y1_candidate, args, error_order
-        # A concrete class: other solvers return an error of another type, which this controller cannot read.
+        # A concrete class, since other solvers return an error that this controller cannot read.
         if not isinstance(y_error, StepEstimate):
             raise ValueError(
                 "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams` or "
@@ -174,7 +174,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
         caution = controller_state.caution
         growth = jnp.where(caution > 0, jnp.minimum(growth, scalar(_CAUTIOUS)), growth)
-        # The last step of a stretch may be short only because the stretch ended there.
+        # The last step before a stop may be short only because of the stop.
         recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
         shrink = (scalar(self.safety) * y_error.retry) ** y_error.response
@@ -225,7 +225,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
 
         def trial(carry, _):
-            # At the start, then where the first derivative leads: a loop, so that the vector field is compiled once.
+            # At the start, then after a step along the first derivative; in a loop, so that the vector field is
+            # compiled once.
             t, y = carry
             f = ravel(func(terms, t, unravel_like(y0, y), args), flat.dtype)
             # Within this time the state changes by its own size, or at least by the tolerance.

@@ -25,9 +25,9 @@ from ._tolerances import Tolerances
 from .controller import ControllerState
 from .manifold_term import Chart
 
-# Newton's method ends when its correction would be smaller than this, in units of the tolerance.
+# Newton's method ends when the next correction is below this, in units of the tolerance.
 _NEWTON = 0.01
-# The error that a step aims at, in units of the tolerance.
+# The target error of a step, in units of the tolerance.
 _TARGET = 0.05
 
 
@@ -37,13 +37,13 @@ class HermiteState(eqx.Module):
     **Fields:**
 
     - `history`: the mesh, and scaled divided differences: of f and y in the families that integrate, otherwise of y.
-    - `slope`: the time derivatives of the same at the latest point.
+    - `slope`: their time derivatives at the latest point.
     - `order_index`: k, the number of points of the past in the formula of the next step.
-    - `matrix`: what Newton's method works with.
+    - `matrix`: the linearisation for Newton's method.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
         accepted steps with k points.
-    - `work`: evaluations of f with g, and matrices made, in accepted steps; the first evaluation after a start is in
-        `step_counts`, those of rejected steps are in `ControllerState`.
+    - `work`: evaluations of f with g, and matrices computed, in accepted steps; the first evaluation after a start is
+        in `step_counts`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     """
 
@@ -67,23 +67,23 @@ class Hermite(AbstractMultistep):
     - `"B"`, order $k + 1$, $k \le 8$: backward differentiation of $y$ with the second derivative at the new point.
         A-stable for $k \le 3$; steps may only grow slowly at high orders.
     - `"H"`, order $2k + 2$, $k \le 3$: as E, with $f'$ at every point. A-stable, without damping at infinity, for
-        $k = 1$; of no use for stiff problems beyond.
+        $k = 1$; unsuitable for stiff problems otherwise.
     - `"Y"`, order $2k + 1$, $k \le 3$: as B, with $y'$ at every point. A-stable for $k = 1$.
 
-    Formulas that are not A-stable make lightly damped vibrations grow when a step covers a few radians of them. They
-    are only chosen for steps with which no eigenvalue of the Jacobian does that, as computed whenever Newton's method
-    needs a new one; unless `past_points` leaves no A-stable formula to choose instead. In large steps implicit
-    formulas damp what should grow: none covers more than two e-foldings of it.
+    Formulas that are not A-stable amplify lightly damped vibrations when a step covers a few radians of them. They are
+    chosen only for steps at which no eigenvalue of the Jacobian (computed whenever Newton's method needs a new one)
+    causes that, unless `past_points` has no A-stable alternative. With large steps, implicit formulas damp components
+    that should grow: no step covers more than two e-foldings of them.
 
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
-    events, jumps, backward time, adjoints and derivatives are as there. Derivatives go through the implicit equation
-    by the implicit function theorem, with its exact Jacobian. Problems that are not stiff are solved as accurately,
-    but slower than by `Adams`.
+    events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
+    implicit function theorem, with the exact Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but
+    more slowly.
 
-    Where a solution jumps from one slow motion to another, as relaxation oscillations do, give reverse mode a
-    checkpoint for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer it makes steps
-    a second time, rounding then makes them a little longer or shorter, and jumps come too early or too late (van der
-    Pol's equation with μ = 100 over a jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
+    If a solution jumps from one slow motion to another, as in relaxation oscillations, give reverse mode a checkpoint
+    for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer it repeats steps, rounding
+    changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation with μ = 100 over a
+    jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
 
     ??? cite "Reference"
 
@@ -115,16 +115,16 @@ class Hermite(AbstractMultistep):
     ):
         """**Arguments:**
 
-        - `family`: of formulas.
-        - `past_points`: the numbers $k$ of points of the past to choose from, increasing; default all that are of use.
-            A pair, as `(2, 4)`, is a method of two formulas, which changes between them as their errors demand; a
-            single one fixes the order. The first of them is approached from $k = 1$.
+        - `family`: the family of formulas.
+        - `past_points`: the numbers $k$ of points of the past to choose from, increasing; default all useful ones. A
+            pair such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes
+            the order. The method starts with $k = 1$.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
             leave them out.
 
-        **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that do not
-        increase, and if only one tolerance is given.
+        **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that are not
+        increasing, and if only one tolerance is given.
         """
         if family not in FAMILIES:
             raise ValueError(f"`Hermite` has the families {', '.join(FAMILIES)}; got `family={family!r}`.")
@@ -149,7 +149,7 @@ class Hermite(AbstractMultistep):
         return FAMILIES[self.family].order(self.past_points[-1])
 
     def statistics(self, solver_state: HermiteState, controller_state, stats):
-        # A concrete class: the controller's own state may stand within that of a `diffrax.ClipStepSizeController`.
+        # A concrete class, since the state may be nested in that of a `diffrax.ClipStepSizeController`.
         is_own = lambda leaf: isinstance(leaf, ControllerState)
         own = filter(is_own, jax.tree.leaves(controller_state, is_leaf=is_own))
         work = solver_state.work + sum(controller.wasted for controller in own)
@@ -188,9 +188,9 @@ class Hermite(AbstractMultistep):
         nodes = family.multiplicity * k
         index = np.arange(family.length, dtype=np.int32)
 
-        # The prediction extrapolates y, not f: what Newton's method leaves of stiff components is large in f. It is of
-        # the order of the formula, if there are points enough: Newton's method converges from near by only. Its slope
-        # comes from the logarithmic derivatives of the basis.
+        # The prediction extrapolates y, not f: the remaining error of stiff components is large in f. It has the order
+        # of the formula, if there are enough points, since Newton's method converges only from nearby. Its slope
+        # follows from the logarithmic derivatives of the basis.
         end = step_end(history, t1)
         h = (end - history.mesh[0]).astype(dtype)
         values = basis(history.mesh, end[None])[:, 0].astype(dtype)
@@ -240,7 +240,7 @@ class Hermite(AbstractMultistep):
         )
         order_index = around[1 + change]
         if self._stable is not None:
-            # Between here and there may be formulas for which this step is of just the wrong length.
+            # For this step length the formulas in between may be unstable.
             growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
             better = (k > self._stable) & (growth > estimate.growth)
             order_index = jnp.where(better, candidates[3], order_index)
@@ -283,23 +283,24 @@ class Hermite(AbstractMultistep):
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.
 
-        A formula's error in the equation is what the next one would change; Newton's matrix makes it one of y.
+        The error of a formula is the change by the next formula; Newton's matrix converts this residual to an error of
+        y.
         """
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = changes[:, free] @ (matrix.state @ inverses.square).T
+        errors = changes[:, free] @ (matrix.state @ inverses.p).T
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     @property
     def _stable(self) -> int | None:
-        """The A-stable formula with the most points, if others may be chosen instead of it."""
+        """The A-stable formula with the most points, if formulas with more points may be chosen."""
         stable = [k for k in self.past_points if k <= FAMILIES[self.family].stable]
         return stable[-1] if stable and stable[-1] < self.past_points[-1] else None
 
     def _bounded(self, points, h, spectrum, factors) -> Float[Array, " formulas"]:
-        """The factors by which steps may grow, where those of that length damp what should be damped."""
-        # A step is not cut by more, nor grows by more, at once.
+        """The factors by which steps may grow such that the longer steps damp all decaying components."""
+        # One change of a step is not larger than this.
         steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
         then, now = jax.vmap(lambda steps: are_damped(self.family, points, steps, spectrum))(steps)
         zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)
@@ -313,7 +314,7 @@ class Hermite(AbstractMultistep):
 
 
 def _ladder(past_points: tuple[int, ...]) -> np.ndarray:
-    """For each number of points the one below in order, itself, and the one above."""
+    """For each number of points: the next lower, itself, and the next higher."""
     steps = [*range(1, past_points[0]), *past_points]
     out = np.zeros((past_points[-1] + 1, 3), np.int32)
     for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
@@ -322,7 +323,7 @@ def _ladder(past_points: tuple[int, ...]) -> np.ndarray:
 
 
 def _responses(family: Family) -> np.ndarray:
-    # As in Adams' method: the error is a product of a power of the step and of its distances from all nodes.
+    # As in Adams' method, the error is a product of a power of the step and its distances from all nodes.
     k = np.arange(1, family.highest + 1)
     last = (3 if family.integrated else 2) + family.multiplicity * np.cumsum(1 / k)
     return np.append(1.0, GAIN * (family.order(k) + 1) / last)

@@ -1,9 +1,9 @@
-"""The interface between the multistep solvers and a term that also knows a manifold.
+"""The interface between the multistep solvers and a term on a manifold.
 
 A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` is the same equation together with
-invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart).
-The solver keeps its history for *all* components of `y`; the chart only says which of them are integrated and
-which are solved for (`project_near`), so a change of chart costs neither history nor order.
+invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart). The
+solver keeps its history for *all* components of `y`; the chart only says which of them are integrated and which are
+solved for (`project_near`), so a change of chart preserves history and order.
 """
 
 import abc
@@ -23,11 +23,12 @@ class ManifoldEvaluation(NamedTuple):
 
     **Fields:**
 
-    - `y`: the state, on the manifold if that was asked for.
+    - `y`: the state, on the manifold if a projection was requested.
     - `f`: the vector field there.
-    - `chart`: the chart with the same index sets; it may carry what makes the next evaluation cheaper, and counters.
+    - `chart`: the chart with the same index sets; it may carry counters, and data that make the next evaluation
+        cheaper.
     - `failed`: true where the state could not be evaluated or projected; the step is then retried with a smaller one.
-    - `factors`: factors that make the projection of a state nearby at the same time cheaper; any pytree of arrays, or
+    - `factors`: data that make the projection of a nearby state at the same time cheaper; any pytree of arrays, or
         None.
     """
 
@@ -71,7 +72,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     def project_cold(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
         """`project_near` where no state nearby has been evaluated yet; `y` is a first guess.
 
-        A manifold that can do so with a single evaluation, of the projected state, has a method of its own.
+        A manifold that needs only one evaluation, at the projected state, overrides this method.
         """
         # The state that is linearised at does not matter to the derivative.
         manifold, *at = jax.tree.map(stop, (self, t, y, args))
@@ -91,7 +92,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     def update_chart(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
         """Keep the chart or choose a better one at a state on the manifold.
 
-        Its result only counts if the step that led there is accepted. It is also asked before a restart after a jump.
+        The result is used only if the step to this state is accepted. It is also called before a restart after a jump.
         """
 
 

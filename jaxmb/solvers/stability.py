@@ -5,8 +5,8 @@ Its solutions are powers of the roots ζ of the characteristic polynomial
 
     Π(ζ, μ) = sum_j (a_j - μ b_j - μ² c_j) ζ^(k - j),
 
-and it is stable where all of these remain bounded. A predictor and corrector, put into each other, is such a recurrence
-too, so what is here applies to Adams' method as well.
+and it is stable where all of these remain bounded. A predictor-corrector method is such a recurrence too, so this
+module also applies to Adams' method.
 
 Sources: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, Springer, 1996, sections V.1 and V.3;
 W. H. Enright, SIAM J. Numer. Anal. 11(2), 1974 (family E).
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 
 Rationals: TypeAlias = tuple[Fraction, ...]
 
-# Roots this much outside the unit circle are on it, and points of the locus this near the imaginary axis, relative to
-# their size, are on that.
+# Tolerances: roots this far outside the unit circle count as on it, and points of the locus this near the imaginary
+# axis, relative to their size, as on the axis.
 _OUTSIDE = 1e-7
 _LEFT = 1e-9
 
-# Arguments of ζ for the boundary locus. Next to zero there is only rounding.
+# Arguments of ζ for the boundary locus. Close to zero rounding errors dominate.
 _THETA = np.linspace(1e-3, np.pi, 10_000)
 
-# Rays in the sector of stability, as parts of its angle, and sizes of μ on them, where the roots are tested.
+# Rays in the sector of stability, as fractions of its angle, and sizes of μ on them at which the roots are tested.
 _RAYS = np.array([0.0, 0.3, 0.7, 0.97, 0.995])
 _SIZES = np.logspace(-3, 6, 400)
 
-# Ratios of steps are tried in parts of one, to keep the numbers short.
+# Ratios of steps are tried as fractions with this denominator, to keep the rational numbers short.
 _PARTS = 100_000
 
 
@@ -75,7 +75,7 @@ def formula(family: str, k: int) -> Formula:
     - `family`: "E" (the interpolant of f, with its slope at the end, is integrated over the step), "H" (with its slope
         at every point), "B" (the interpolant of y, with its slope at the end, has the second derivative g there), or
         "Y" (with its slope at every point).
-    - `k`: the number of points of the past, at least 1. Also those that are of no use in practice may be asked for.
+    - `k`: the number of points of the past, at least 1, also those without practical use.
 
     **Returns:** a [`jaxmb.solvers.stability.Formula`][].
 
@@ -86,14 +86,14 @@ def formula(family: str, k: int) -> Formula:
 
 
 def adams(k: int) -> Formula:
-    """Adams' predictor and corrector of order k with local extrapolation (PECE), as it is on the test equation.
+    """Adams' predictor and corrector of order k with local extrapolation (PECE), on the test equation.
 
     The formula of Adams and Bashforth of order k predicts, that of Adams and Moulton of order k + 1 corrects, and the
     derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
 
         y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
 
-    where `λ f = g`. The `error_constant` also is that for the test equation.
+    where `λ f = g`. The `error_constant` is also for the test equation.
 
     **Arguments:** `k`: the order of the predictor, at least 1.
 
@@ -117,8 +117,8 @@ def characteristic_roots(formula: Formula, mu: ArrayLike) -> NDArray[np.complex1
 
     **Arguments:** `mu`: `h λ`, complex, of any shape.
 
-    **Returns:** k roots for each, along a new last axis, in no order. Where the leading coefficient vanishes, one of
-    them is infinite; it comes out as very large.
+    **Returns:** k roots for each, along a new last axis, in no order. Where the leading coefficient vanishes, one root
+    is infinite; it is returned as a very large number.
     """
     a, b, c = _floats(formula)
     mu = np.asarray(mu, complex)[..., None]
@@ -133,7 +133,7 @@ def characteristic_roots(formula: Formula, mu: ArrayLike) -> NDArray[np.complex1
 
 
 def spectral_radius(formula: Formula, mu: ArrayLike) -> NDArray[np.float64]:
-    """The largest modulus of the roots: by that much the error grows in a step.
+    """The largest modulus of the roots, the growth factor of the error in a step.
 
     **Arguments:** `mu`: `h λ`, complex, of any shape.
 
@@ -155,7 +155,7 @@ def boundary_locus(formula: Formula, theta: ArrayLike) -> NDArray[np.complex128]
     powers = np.exp(-1j * np.asarray(theta, float)[..., None] * np.arange(len(formula.a)))
     a, b, c = (powers @ coefficients for coefficients in _floats(formula))
     root = np.sqrt(b**2 + 4 * a * c)
-    # Of the two signs the one without cancellation; the other solution follows from their product -a / c.
+    # The sign without cancellation gives one solution; the other follows from their product -a / c.
     numerator = -(b + np.where((np.conj(b) * root).real < 0, -root, root)) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack([-a / numerator, np.where(c == 0, np.inf, numerator / c)])
@@ -164,7 +164,7 @@ def boundary_locus(formula: Formula, theta: ArrayLike) -> NDArray[np.complex128]
 def stability_angle(formula: Formula) -> float:
     """The angle α of A(α)-stability: stable for all μ within α of the negative real axis.
 
-    The sector without points of the boundary locus, in which roots are then computed on rays.
+    Computed from the sector without points of the boundary locus; roots are then tested on rays in it.
 
     **Returns:** α [degrees] to 1e-3, 90 for an A-stable formula and 0 for one that is stable in no sector.
     """
@@ -178,7 +178,7 @@ def stability_angle(formula: Formula) -> float:
 def stiff_abscissa(formula: Formula) -> float:
     """The abscissa D of stiff stability: the smallest `D >= 0` such that the formula is stable for `Re μ <= -D`.
 
-    It says nothing of small μ: also a formula that is not zero-stable may have one.
+    It does not describe small μ: a formula that is not zero-stable may have one, too.
 
     **Returns:** D to 1e-4; infinite for a formula that is stable in no such half-plane.
     """
@@ -191,7 +191,7 @@ def stiff_abscissa(formula: Formula) -> float:
 
 def damping_at_infinity(formula: Formula) -> float:
     """`|R(∞)|`: the largest modulus of the roots as `μ -> -∞`, 0 if the stiffest components are damped at once."""
-    # An explicit formula loses its leading coefficient, and with it a root to infinity.
+    # The leading coefficient of an explicit formula vanishes, so one root is infinite.
     return _largest(np.roots(_floats(formula)[2])) if formula.c[0] else math.inf
 
 
@@ -211,8 +211,8 @@ def largest_growth(family: str, k: int) -> float:
 
     **Arguments:** `family`, `k`: as for [`jaxmb.solvers.stability.formula`][].
 
-    **Returns:** the ratio of a step and the one before, to 1e-5; infinite if any steps will do. It is below one
-    for a formula that is not zero-stable when the steps are equal.
+    **Returns:** the ratio of a step and the one before, to 1e-5; infinite if every ratio is stable. It is below one for
+    a formula that is not zero-stable when the steps are equal.
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
@@ -234,7 +234,7 @@ def largest_growth(family: str, k: int) -> float:
 def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figure":
     """Draw the regions of stability of some formulas in the plane of μ, shaded.
 
-    **Arguments:** `formulas`: what to draw; `ax`: the matplotlib axes to draw in, otherwise those of a new figure.
+    **Arguments:** `formulas`: the formulas; `ax`: the matplotlib axes, default those of a new figure.
 
     **Returns:** the matplotlib `Figure`.
 
@@ -274,7 +274,7 @@ def _window(formulas: Sequence[Formula], points: int = 161) -> tuple[NDArray[np.
         locus = locus[np.isfinite(locus)]
         boundary = locus[spectral_radius(each, locus) <= 1 + _OUTSIDE]
         locus = boundary if len(boundary) else locus
-        # Some go to infinity.
+        # Some boundaries extend to infinity.
         extents.append(locus[np.abs(locus) <= 3 * np.median(np.abs(locus))])
     around: NDArray[np.complex128] = np.concatenate(extents)
     margin = 0.15 * np.max(np.abs(around))
@@ -297,7 +297,7 @@ def _coefficients(family: str, nodes: Sequence[Fraction]) -> tuple[Rationals, Ra
     # Coefficients are named by the derivative that they multiply, and by the point.
     lowest = 1 if integrated else 0
     unknown = [(1, 0), (2, 0), *((d, j) for d in range(lowest, lowest + multiplicity) for j in points[1:])]
-    # Where a is given it sums to zero, and constants are solutions already.
+    # A given a sums to zero, so constants are solutions already.
     degrees = range(lowest, lowest + len(unknown))
     matrix = [[_residual(nodes[j], d, q) for d, j in unknown] for q in degrees]
     right = [sum((-x * _residual(nodes[j], d, q) for (d, j), x in given.items()), Fraction(0)) for q in degrees]
@@ -307,7 +307,7 @@ def _coefficients(family: str, nodes: Sequence[Fraction]) -> tuple[Rationals, Ra
 
 
 def _residual(node: Fraction, derivative: int, degree: int) -> Fraction:
-    """What a coefficient of one adds to the difference of the two sides, for `y = s^degree`."""
+    """The contribution of a unit coefficient to the difference of the two sides, for `y = s^degree`."""
     power = node ** (degree - derivative) if degree >= derivative else Fraction(0)
     return math.perm(degree, derivative) * (power if derivative == 0 else -power)
 

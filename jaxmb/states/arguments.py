@@ -1,4 +1,4 @@
-"""Checks of what a user gives to `assemble` and `equilibrium`."""
+"""Checks of the arguments of `assemble` and `equilibrium`."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def check_system(function: str, system: Any) -> None:
 
 
 def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
-    """The guess as arrays, or the system's own where none is given."""
+    """The guess as arrays, default the guess of the system."""
     if guess is None:
         return system.guess
     if not isinstance(guess, State):

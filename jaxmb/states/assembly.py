@@ -1,7 +1,8 @@
 """Consistent initial states: the closest configuration and velocities that satisfy every constraint.
 
-First the configuration closest to the guess that satisfies `Φ(t, q) = 0` and the coordinates fixed by name, then the
-velocities closest to the guess that satisfy `ψ(t, q, u) = 0` and the rates fixed by name; see `states/closest.py`.
+The first step finds the configuration closest to the guess that satisfies `Φ(t, q) = 0` and the coordinates fixed by
+name, the second the velocities closest to the guess that satisfy `ψ(t, q, u) = 0` and the rates fixed by name; see
+`states/closest.py`.
 """
 
 from collections.abc import Mapping
@@ -37,7 +38,7 @@ def assemble(
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}`.
     - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"`
-        (body frame) and `"body.velocity"`; of a `LagrangianSystem` names of coordinates, or `u0`, `u1`, ….
+        (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of coordinates, or `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
         that one member of a batch does not spoil the others.
@@ -45,8 +46,8 @@ def assemble(
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
 
     **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
-    coordinates that cannot be fixed together, or rates that contradict each other; rates that agree may be more than
-    the degrees of freedom. Under `jit` the same as a run-time error without the names.
+    coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the
+    degrees of freedom. Under `jit`, a run-time error without the names.
     """
     check_system("assemble", system)
     guess = checked_guess("assemble", system, guess)
@@ -59,7 +60,7 @@ def assemble(
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else closest_velocities(system, t, q, u, tuple(fixed_rates.tolist()))
-    # Under a trace the results of known numbers are traced as well.
+    # Under a trace, results of concrete numbers are traced as well.
     if throw and not is_traced((ok, ok_rates)):
         if not ok_rates:
             raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))

@@ -4,10 +4,10 @@ The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, 
 velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0`, with some rates held. Derivatives are
 those of the minimisers, by the implicit function theorem.
 
-Where the system has an order of elimination and very many rows, nothing dense is made: the minimiser satisfies
+If the system has an order of elimination and very many rows, no dense matrix is formed. The minimiser satisfies
 `q = q_guess − S² Aᵀ(q) μ`, `Φ(q) = 0` (S: scales, zero where coordinates are held). With the constraints linearised at
-the last iterate μ follows from one elimination by blocks; repeated, that converges to the minimiser, at once where the
-guess is on the constraints. It asks for a better guess than Newton's method on the optimality conditions does.
+the last iterate μ follows from one elimination by blocks. This iteration converges to the minimiser, in one step if the
+guess is on the constraints. It needs a better guess than Newton's method on the optimality conditions.
 """
 
 import equinox as eqx
@@ -27,18 +27,18 @@ from ..system import AbstractSystem
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
 MANY_ROWS = 300
 
-# Smallest pivot of block elimination, the square of a distance between rows of unit norm, that counts as independent.
+# Rows are independent if every pivot of block elimination (a squared distance between rows of unit norm) exceeds this.
 INDEPENDENT = 1e-5
 
-# Gauss–Newton steps to the constraints at most.
+# Largest number of Gauss–Newton steps to the constraints.
 _ITERATIONS = 100
 
-# Newton's method on the optimality conditions, which starts near their solution: size of its last step, and how many at
-# most.
+# Newton's method on the optimality conditions, started near their solution: size of its last step, and largest number
+# of steps.
 _REFINED = 1e-10
 _REFINEMENTS = 16
 
-# Linearisations by blocks at most.
+# Largest number of linearisations by blocks.
 _LINEARIZATIONS = 30
 
 
@@ -68,7 +68,7 @@ def closest_configuration(
     q, jacobian = lax.stop_gradient(meet_constraints(frozen, lax.stop_gradient(t), start, scale))
     ok = residual_size(frozen, t, q, jacobian) <= tolerance(q.dtype)
 
-    # The minimiser, exactly: Newton's method on the optimality conditions with the independent rows.
+    # Newton's method on the optimality conditions of the independent rows makes the minimiser exact.
     pivots = full_pivot(jacobian, scale=scale)
     ok = ok & (pivots.rank == rank)
     rows = pivots.order.rows[:rank]
@@ -127,7 +127,7 @@ def closest_velocities(
         if not fixed.any():
             ok = ok & (pivots.rank == rank)
         rows = pivots.order.rows[:rank]
-        # Rows without a pivot have no free column left: the rates that are held satisfy them, or nothing does.
+        # Rows without a pivot have no free column: only the held rates can satisfy them.
         bound = jnp.arange(rank) >= pivots.rank
         selected = jnp.where(bound[:, None], 0.0, jacobian[rows] * scale[None, :])
         gram = selected @ selected.T + jnp.diag(bound.astype(u.dtype))
@@ -144,7 +144,7 @@ def meet_constraints(
 
     Implied rows are allowed: the normal equations are regularised at rounding level.
 
-    **Returns:** the configuration, and the Jacobian that its last correction was made with.
+    **Returns:** the configuration, and the Jacobian of its last correction.
     """
 
     def squares(q):
@@ -215,7 +215,7 @@ def configuration_by_blocks(
 
     def tangent_solve(linear, b):
         # x = b + (1 − L) x: the linear map is near the identity where the guess is near the constraints. As many
-        # iterations as found the root give its derivative as exactly.
+        # iterations as for the root give its derivative to the same accuracy.
         return lax.fori_loop(0, _LINEARIZATIONS, lambda _, x: b + (x - linear(x)), b)
 
     q = lax.custom_root(lambda q: q - improved(q), lax.stop_gradient(guess), solve, tangent_solve)

@@ -1,9 +1,9 @@
-"""Static equilibrium: a configuration from which nothing starts to move.
+"""Static equilibrium of constrained systems.
 
-At rest the applied forces and those of the constraints balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search
-follows the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and
-bounded steps, so that a conservative system is taken to a minimum of its potential and not to a maximum.
-Derivatives are those of the balance, by the implicit function theorem.
+At rest the applied forces and the constraint forces balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search follows
+the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and bounded
+steps, so that a conservative system reaches a minimum of its potential and not a maximum. Derivatives are those of the
+balance, by the implicit function theorem.
 """
 
 from collections.abc import Mapping
@@ -27,10 +27,10 @@ from .closest import tolerance
 
 _ITERATIONS = 200
 
-# Half the longest step at first, and the longest of all, in the system's size and radians.
+# Half the initial bound of steps, and the largest bound, in units of the system's size and radians.
 _FIRST, _LONGEST = 0.025, 0.5
 
-# Singular values and curvatures below this share of the largest are rounding errors.
+# Singular values and curvatures below this fraction of the largest are rounding errors.
 _NEGLIGIBLE = 1e-12
 
 
@@ -50,9 +50,9 @@ def equilibrium(
 
     **Arguments:**
 
-    - `system`: a compiled scene, or another system; its forces at rest must not need velocities to balance.
+    - `system`: a compiled scene, or another system; its forces must be able to balance at zero velocity.
     - `guess`: where to start, default the poses given with the bodies; assembled first.
-    - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription bears a force.
+    - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription may exert a force.
     - `t`: the time, for forces and drivers that depend on it [s].
     - `throw`: whether a failed search is an error. With `False` the state is NaN instead, so that one member of a
         batch does not spoil the others.
@@ -66,7 +66,7 @@ def equilibrium(
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
         raise ValueError(
-            "equilibrium needs ideal constraints that bind positions or velocities; leave friction and servos out."
+            "equilibrium needs ideal constraints that bind positions or velocities; remove friction and servos."
         )
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)
@@ -100,9 +100,7 @@ def _still(system, t, q, u):
 
 
 class _Balance(eqx.Module):
-    """The balance of a system in the scales of its velocities; its rows are those of the constraints and of the
-    coordinates that are held.
-    """
+    """The equilibrium equations in scaled velocities; rows are those of the constraints and of held coordinates."""
 
     system: AbstractSystem
     t: Array
@@ -111,7 +109,7 @@ class _Balance(eqx.Module):
 
     @property
     def rank(self) -> int:
-        """Of the rows at the most, without those implied."""
+        """The largest possible rank of the rows, without implied ones."""
         return self.system.velocity_rank + len(self.held)
 
     @property
@@ -123,7 +121,7 @@ class _Balance(eqx.Module):
         return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
 
     def force(self, q, multipliers):
-        """Applied forces with those of the rows."""
+        """The sum of applied forces and forces of the rows."""
         rows = self.system.velocity_rows
         force = self.system.force(self.t, q, self.rest)
         force += self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
@@ -136,7 +134,7 @@ class _Balance(eqx.Module):
         return rows * self.system.velocity_scale()[None, :]
 
     def residual(self, q, jacobian, z):
-        """Residuals of the rows; those between velocities depend on the displacement alone."""
+        """Residuals of the rows; those of velocity constraints depend on the displacement alone."""
         constraints = slice(self.system.position_rows, self.system.velocity_rows)
         rolled = jacobian[constraints] @ z
         return jnp.concatenate(
@@ -173,7 +171,7 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     sizes = norm(jacobian)
     sizes = jnp.where(sizes > 0, sizes, 1.0)
     left, values, right = jnp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
-    # Rows that are implied on the constraints are only nearly so off them: the rank tells how many to leave out.
+    # Rows that are implied on the constraints are only nearly implied off them: the rank tells how many to drop.
     kept = (jnp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * jnp.max(values, initial=0.0))
     left, right = jnp.where(kept[None, :], left, 0.0), jnp.where(kept[:, None], right, 0.0)
     inverse = right.T @ (left / jnp.where(kept, values, 1.0)[None, :]).T
@@ -207,7 +205,7 @@ def _step(local: _Linearised) -> Float[Array, "n"]:
     noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
     quiet = local.loose & (jnp.abs(along) <= noise)
     size = jnp.abs(local.curvatures)
-    # Quiet directions count as stiff, so that rounding errors of the others do not move along them.
+    # Directions without force count as stiff, so that rounding errors cause no motion along them.
     size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
     stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
     return jnp.linalg.solve(stiffness, local.directions @ jnp.where(quiet, 0.0, along))
@@ -233,7 +231,7 @@ def _balanced(
         force = balance.force(there, multipliers) - stiff * (loose @ z)
         rows = balance.residual(there, jacobian, z) / local.sizes
         rows += local.implied @ (local.sizes * multipliers) / stiff
-        # Where there is no equilibrium, equations with a solution, so that their derivatives stay finite.
+        # Without an equilibrium the equations are replaced by ones with a solution, so that derivatives stay finite.
         return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
 
     known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])

@@ -22,12 +22,12 @@ from .closest import (
     tolerance,
 )
 
-# Smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first they do move, and
-# between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1 mm out of place:
-# 6e-5.)
+# Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
+# bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
+# mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# Dense matrices of more rows than this are too large.
+# Dense matrices with more rows are too large.
 _DENSE = 3000
 
 
@@ -76,7 +76,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 
 @eqx.filter_jit
 def _independent_by_blocks(system):
-    """Whether the scene can be assembled by blocks, and none of its rows is near to being redundant."""
+    """Whether the scene can be assembled by blocks, and none of its rows is nearly redundant."""
     held = np.zeros(system.nq, bool)
     _, ok, pivot = configuration_by_blocks(
         system, jnp.zeros((), system.guess.q.dtype), system.guess.q, held, tolerance(system.guess.q.dtype)
@@ -114,8 +114,7 @@ def _analyse(system):
     if system.servos:
         out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.drift_free):
-        # Implied rows must be consistent with the rows that imply them; a residual of least squares is a
-        # contradiction.
+        # Implied rows must be consistent with the rows that imply them: a least-squares residual is a contradiction.
         if system.velocity_rows:
             asked = system.velocity_residual(t, q, u)
             change, left = _least_squares(jacobian, scale, asked)
@@ -168,9 +167,9 @@ def _check_locked(system, jacobian):
 
 
 def _connected(system):
-    """Sets of bodies that joints connect without the ground, with their rows; sets with a driver are left out."""
+    """Sets of bodies that joints connect without the ground, with their rows, except sets with a driver."""
     ground, row = system.layout.bodies, 0
-    # A union-find forest: the root of a body's tree stands for all that are connected with it.
+    # A union-find forest: the root of a tree represents all bodies connected to it.
     parent = list(range(ground))
 
     def root(body):
@@ -198,19 +197,19 @@ def _connected(system):
 
 
 def _check_determined(system, implied):
-    """Refuse friction laws of joints whose force is not determined."""
+    """Refuse friction laws of joints whose reaction is indeterminate."""
     for g in system.nonideal:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
             if others:
                 raise ValueError(
                     f"{type(g.group.part).__name__} {name!r} needs the force of {joint!r}, which is not determined: "
-                    f"rows of {', '.join(sorted(others))} imply one another. Leave the redundant ones out."
+                    f"rows of {', '.join(sorted(others))} imply one another. Remove the redundant ones."
                 )
 
 
 def _implied(system, jacobian, order, rank):
-    """Express each dropped row by the kept ones; joints with a share in it imply it."""
+    """Express each dropped row by the kept ones; the joints that contribute imply it."""
     kept, dropped = order[:rank], order[rank:]
     out = []
     for row in dropped:

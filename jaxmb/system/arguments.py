@@ -8,7 +8,7 @@ from ..linalg.arrays import as_array, is_traced
 
 
 def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> None:
-    """Raise a `ValueError` unless an argument is of a class."""
+    """Raise a `ValueError` unless an argument is an instance of a class."""
     if isinstance(value, kind):
         return
     given = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
@@ -18,9 +18,9 @@ def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> N
 
 
 def real_array(name: str, value: Any, dtype: Any, shapes: tuple[tuple[int, ...], ...] | None = ((),)) -> Any:
-    """An argument as an array of a type, a NumPy array unless it is traced.
+    """An argument as an array of the given dtype, a NumPy array unless it is traced.
 
-    **Arguments:** `shapes`: those that it may have, default that of a number; None for any.
+    **Arguments:** `shapes`: the allowed shapes, default that of a number; None for any.
 
     **Raises:** `ValueError` for anything but real numbers, another shape, and NaN.
     """

@@ -1,4 +1,4 @@
-"""Views of a motion by the names of bodies: their motion, the quantities measured of it, and their outlines."""
+"""Views of a motion by body name: the motion of bodies, measurable quantities, and outlines."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from .quantities import BodyMotion, Quantity
 def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
     """The motion of one body."""
     d = layout.space.dimension
-    # Entries of a body follow one another.
+    # The entries of a body are contiguous.
     i, j = int(layout.pose_index[body][0]), int(layout.velocity_index[body][0])
     position, velocity = ys.q[:, i : i + d], ys.u[:, j : j + d]
     if not layout.rotates[body]:
@@ -40,9 +40,7 @@ def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]
 
 
 def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
-    """For every body the body-fixed points [m] of the parts in some groups that act on it, each once, shape
-    (points, d).
-    """
+    """For every body, the distinct body-fixed points [m] at which parts of some groups act on it, shape (points, d)."""
     points: list[dict[tuple, np.ndarray]] = [{} for _ in range(bodies)]
     for group in groups:
         stacked = group.group

@@ -1,4 +1,4 @@
-"""Coordinates and rates by name: which entries of q and u a name such as `"crank.angle"` stands for."""
+"""Coordinates and rates by name: the entries of q and u that a name such as `"crank.angle"` denotes."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""The parts of a system in words: parts, rows, degrees of freedom, redundancy, and what is specialised away."""
+"""A system in words: parts, rows, degrees of freedom, redundancy, and computations that are specialised away."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -40,7 +40,7 @@ def specialised_constraints(system: AbstractSystem) -> list[str]:
 
 
 def shorten(names: Iterable[str]) -> str:
-    """Names in a line; of many the first and the last."""
+    """Names in one line, abbreviated if there are many."""
     names = list(names)
     return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:4])}, … {names[-1]} ({len(names)})"
 
@@ -59,7 +59,7 @@ def describe_scene(
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well.
 
     **Arguments:** `bodies`: names by kind; `joints`: groups of constraints, with a note on each kind; `forces`, `laws`:
-    groups of force elements and of laws that are not ideal; `gravity`: its name, or None; `implied`: redundant rows.
+    groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows.
     """
     count = sum(map(len, bodies.values()))
     grubler = system.nu - system.velocity_rows

@@ -9,7 +9,8 @@ class Description:
     """Tables of a system; prints as text, shows as HTML in a notebook.
 
     **Fields:** `facts`: (name, value) pairs; `tables`: rows of (type, names or count, remark) by title, of bodies,
-    joints, forces, or constraints; `remarks`: sentences by title, on redundant rows and on what is specialised away.
+    joints, forces, or constraints; `remarks`: sentences by title, on redundant rows and on computations that are
+    specialised away.
     """
 
     facts: tuple[tuple[str, str], ...]

@@ -1,13 +1,13 @@
-"""The one equation that every model in the package is a case of.
+"""The equation of motion of every model in the package.
 
     kinematics    q̇ = K(t, q, u)
     inertia       M(t, q, u) u̇ = F(t, q, u) + Aᵀ λ + C(t, q, u, λ)
     constraints   Φ(t, q) = 0,   ψ(t, q, u) = 0   →   A u̇ = γ(t, q, u)
 
-`Φ` holds the constraints between positions; `ψ` their time derivatives followed by the nonholonomic rows; the first
-rows of A are ∂ψ/∂u, and those of constraints that bind accelerations only may follow. Coordinates may have invariants
-of their own (unit Euler parameters): `coordinate_residual` is `Φ` followed by those. `C` holds the forces of
-constraints that do virtual work; M depends on u only where velocities are nonlinear in q̇.
+`Φ` holds the position constraints; `ψ` their time derivatives, followed by the nonholonomic rows. The first rows of A
+are ∂ψ/∂u; rows of constraints on accelerations alone may follow. Coordinates may have invariants (unit Euler
+parameters), which follow `Φ` in `coordinate_residual`. `C` holds the non-ideal constraint forces, which do virtual
+work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
@@ -37,7 +37,7 @@ ParameterPath = tuple[Callable[[Any], Array], int | None]
 
 
 class Ranks(eqx.Module):
-    """Numbers of independent rows; static. Of Φ along velocities, of `coordinate_residual`, of ψ, and of A."""
+    """Numbers of independent rows of Φ along velocities, of `coordinate_residual`, of ψ and of A; static."""
 
     position: int = eqx.field(static=True)
     coordinate: int = eqx.field(static=True)
@@ -48,21 +48,21 @@ class Ranks(eqx.Module):
 class AbstractSystem(eqx.Module):
     """A constrained mechanical system; a pytree with every number a leaf and every choice static.
 
-    Ranks are structural: found once on concrete numbers and static since, so that index sets have static shapes.
+    Ranks are found once, on concrete numbers, and are static, so that index sets have static shapes.
 
     - `nq`, `nu`: numbers of coordinates and of velocities.
     - `position_rows`, `position_rank`: rows of Φ and the number of independent ones.
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
     - `acceleration_rows`, `acceleration_rank`: rows of A and the number of independent ones.
-    - `ideal`: whether C is zero; `positive_definite_mass`: whether M is positive definite, for motions against
-        constraints as well.
+    - `ideal`: whether C is zero; `positive_definite_mass`: whether M is positive definite for all velocities, also
+        those that violate constraints.
     - `rates_are_velocities`: whether q̇ = u.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
-    - `has_bodies`: whether the system is made of bodies, and `Trajectory[...]` gives the motion of a body by its name;
-        otherwise it gives that of a coordinate.
-    - `guess`: a state to begin an assembly with; `length` [m]: the size that residuals of positions are relative to.
-    - `rows`: name of the part, and number within it, of every row of A.
+    - `has_bodies`: whether the system has bodies; `Trajectory[name]` is the motion of a body if so, otherwise of a
+        coordinate.
+    - `guess`: the default guess of `assemble`; `length` [m]: the scale of position residuals.
+    - `rows`: for every row of A, the name of its part and its number within the part.
     - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
     """
 
@@ -86,11 +86,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:
-        """Indices in q of every name of a coordinate, or of several."""
+        """Indices in q by name; one name may denote several coordinates."""
 
     @abc.abstractmethod
     def rate_names(self) -> dict[str, list[int]]:
-        """Indices in u of every name of a rate, or of several."""
+        """Indices in u by name; one name may denote several rates."""
 
     @abc.abstractmethod
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
@@ -102,7 +102,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def describe(self) -> Description:
-        """Parts, rows, degrees of freedom, redundant rows, and what is specialised away, as text and as HTML."""
+        """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
 
     # A motion, with time as axis 0: `ts` of shape (times,), `ys` a `State`, `multipliers` of shape (times, rows).
 
@@ -176,8 +176,8 @@ class AbstractSystem(eqx.Module):
     def nonideal_force(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
-        """`C`, from the multipliers that the constraints would have if they were ideal; only what it does in the
-        displacements that the constraints allow counts.
+        """`C`, from the multipliers of the ideal constraints; components that do no work in admissible displacements
+        have no effect.
         """
 
     @abc.abstractmethod
@@ -192,9 +192,9 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def normalize_fixed(self, q: Float[Array, "nq"], fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
-        """Coordinates whose invariants between fixed entries alone are satisfied, and the number of those invariants.
+        """Coordinates that satisfy the invariants of fixed entries alone, and the number of these invariants.
 
-        No free coordinate is left to satisfy them with.
+        Such invariants have no free coordinate that could satisfy them.
         """
 
     @abc.abstractmethod
@@ -283,7 +283,7 @@ class AbstractSystem(eqx.Module):
     def generalized_constraint_force(
         self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"]
     ) -> Float[Array, "times nu"]:
-        """The share of one constraint in `Aᵀ λ`, along a motion."""
+        """The contribution of one constraint to `Aᵀ λ`, along a motion."""
         own = jnp.array([row == name for row, _ in self.rows])
         multipliers = jnp.where(own[None, :], multipliers, jnp.zeros_like(multipliers))
         return jax.vmap(lambda t, y, own: self.constraint_force(t, y.q, y.u, own))(ts, ys, multipliers)

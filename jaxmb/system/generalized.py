@@ -1,4 +1,4 @@
-"""Systems in generalized coordinates, without bodies: views of a motion by the names of the coordinates."""
+"""Systems in generalized coordinates, without bodies: views of a motion by coordinate name."""
 
 from typing import ClassVar
 
@@ -8,8 +8,8 @@ from .quantities import Quantity
 
 
 class AbstractGeneralizedSystem(AbstractSystem):
-    """A system whose motion is that of its coordinates. Measured are coordinates, their rates q̇, and the generalized
-    forces of constraints: `"theta"`, `"theta.rate"`, `"A.force"`.
+    """A system whose motion is that of its coordinates. Measurable quantities are the coordinates, their rates q̇, and
+    generalized constraint forces: `"theta"`, `"theta.rate"`, `"A.force"`.
     """
 
     elimination: ClassVar[None] = None
@@ -49,19 +49,19 @@ class AbstractGeneralizedSystem(AbstractSystem):
     # There are no bodies to act on.
 
     def joint_names(self):
-        raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
+        raise ValueError("reactions are defined for joints between bodies; this system has constraint_forces.")
 
     def reaction(self, name, ts, ys, multipliers):
-        raise ValueError("reactions are of joints between bodies; this system has constraint_forces.")
+        raise ValueError("reactions are defined for joints between bodies; this system has constraint_forces.")
 
     def force_names(self):
-        raise ValueError("forces are of parts that act on bodies; this system has none.")
+        raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
     def applied_wrenches(self, name, ts, ys):
-        raise ValueError("forces are of parts that act on bodies; this system has none.")
+        raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
     def linear_momentum(self, q, u):
-        raise ValueError("Momentum is that of bodies; this system has none. Work it out from its coordinates.")
+        raise ValueError("Momentum is that of bodies; this system has none. Compute it from the coordinates.")
 
     def angular_momentum(self, q, u):
-        raise ValueError("Momentum is that of bodies; this system has none. Work it out from its coordinates.")
+        raise ValueError("Momentum is that of bodies; this system has none. Compute it from the coordinates.")

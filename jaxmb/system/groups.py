@@ -1,4 +1,4 @@
-"""Parts of one type, stacked: one kernel and one `vmap` for all of them, whatever their number."""
+"""Parts of one type, stacked: one kernel and one `vmap` serve any number of them."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.fields import anonymous
 from ..parts.space import AbstractSpace
-from .layout import Layout, pick
+from .layout import Layout
 
 
 class Group(eqx.Module):
@@ -35,9 +36,9 @@ class Group(eqx.Module):
     def rows(self) -> int:
         return self.part.rows
 
-    def own(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
-        """What each part's bodies have, from poses or velocities of all bodies and the ground."""
-        return pick(of_bodies, self.body_index)
+    def gather(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
+        """Rows of each part's bodies, from those of all bodies and the ground."""
+        return unchecked_take(of_bodies, self.body_index)
 
 
 def stack(
@@ -59,7 +60,7 @@ def stack(
         groups.setdefault(key, []).append((leaves, part.name, bodies))
     out = []
     for (structure, _, _), members in groups.items():
-        # By NumPy: thousands of operands make a program of their own for XLA.
+        # NumPy, since XLA would compile a program for thousands of operands.
         columns = zip(*(member[0] for member in members), strict=True)
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
@@ -92,7 +93,7 @@ class AbstractConstraintGroup(eqx.Module):
     def velocity(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts rows"]:
-        """Residuals between velocities."""
+        """Residuals of the velocity constraints, or rates of the position constraints."""
 
     @abc.abstractmethod
     def jacobian(
@@ -108,7 +109,7 @@ class AbstractConstraintGroup(eqx.Module):
         velocities: Float[Array, "b_ground v"],
         multipliers: Float[Array, "parts rows"],
     ) -> Float[Array, "parts k v"]:
-        """What the constraints do to their bodies, `Aᵀ λ` body by body."""
+        """Wrenches of the constraints on their bodies, `Aᵀ λ` body by body."""
 
     @abc.abstractmethod
     def acceleration(
@@ -118,7 +119,7 @@ class AbstractConstraintGroup(eqx.Module):
         velocities: Float[Array, "b_ground v"],
         accelerations: Float[Array, "b_ground v"],
     ) -> Float[Array, "parts rows"]:
-        """The time derivative of the residuals between velocities."""
+        """The time derivative of `velocity`."""
 
     @property
     def rows(self) -> int:
@@ -129,12 +130,12 @@ class AbstractConstraintGroup(eqx.Module):
         return self.group.layout.space
 
     def _map(self, single, *of_bodies, more=()):
-        """`single(part, …)` of every part, with what its own bodies have and `more` of the parts themselves."""
-        return jax.vmap(single)(self.group.part, *map(self.group.own, of_bodies), *more)
+        """`single(part, …)` of every part, with the rows of its bodies, and with `more` per part."""
+        return jax.vmap(single)(self.group.part, *map(self.group.gather, of_bodies), *more)
 
 
 class ConstraintGroup(AbstractConstraintGroup):
-    """Kernels of stacked constraints between positions."""
+    """Kernels of stacked position constraints."""
 
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
         return self._map(lambda part, x: part.residual(self._space, x, t), poses)
@@ -186,14 +187,14 @@ class ConstraintGroup(AbstractConstraintGroup):
         return jax.vmap(self._space.rates)(poses, velocities)
 
     def _rate(self, part, t, x, xdot):
-        """Residuals of one part between the rates of its bodies' poses."""
+        """Velocity residuals of one part, from the rates of its bodies' poses."""
         if part.rheonomic:
             return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, x), (jnp.ones_like(t), xdot))[1]
         return jax.jvp(lambda x: part.residual(self._space, x, t), (x,), (xdot,))[1]
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
-    """Kernels of stacked constraints between velocities."""
+    """Kernels of stacked velocity constraints."""
 
     def velocity(self, t, poses, velocities):
         return self._map(lambda part, x, v: part.residual(self._space, x, v, t), poses, velocities)
@@ -226,17 +227,17 @@ class ForceGroup(eqx.Module):
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts k v"]:
         single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
-        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities))
+        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities))
 
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
         single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
-        return jnp.sum(jax.vmap(single)(self.group.part, self.group.own(poses)))
+        return jnp.sum(jax.vmap(single)(self.group.part, self.group.gather(poses)))
 
 
 class ServoGroup(AbstractConstraintGroup):
-    """Kernels of stacked programs that act on accelerations; `group` is of the programs, the gains are one for each."""
+    """Kernels of stacked servos, which act on accelerations; `group` holds their programs."""
 
     damping: Float[Array, "parts"]
     stiffness: Float[Array, "parts"]
@@ -268,7 +269,7 @@ def servo_group(group: Group) -> ServoGroup:
 
 
 class NonIdealGroup(eqx.Module):
-    """Kernels of stacked laws of joints that are not ideal; `joints`: the name of the joint of each."""
+    """Kernels of stacked non-ideal laws; `joints`: the joint's name for each."""
 
     group: Group
     joints: tuple[str, ...] = eqx.field(static=True)
@@ -280,6 +281,6 @@ class NonIdealGroup(eqx.Module):
         velocities: Float[Array, "b_ground v"],
         reactions: Float[Array, "parts k v"],
     ) -> Float[Array, "parts k v"]:
-        """What the laws do to the bodies of their joints; `reactions`: what the ideal joints do."""
+        """Wrenches of the laws on the bodies of their joints; `reactions`: those of the ideal joints."""
         single = lambda part, x, v, own: part.wrenches(self.group.layout.space, x, v, own, t)
-        return jax.vmap(single)(self.group.part, self.group.own(poses), self.group.own(velocities), reactions)
+        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities), reactions)

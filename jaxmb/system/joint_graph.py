@@ -1,7 +1,7 @@
 """The joint graph of a scene, and the order in which its joints are eliminated.
 
-Bodies are the nodes of the graph and joints its edges; the ground is no node, since joints with the ground alone do not
-act on each other. In a chain every body has at most two joints, and joint i of the elimination shares bodies with
+Bodies are the nodes of the graph and joints its edges; the ground is not a node, since joints that share only the
+ground do not interact. In a chain every body has at most two joints, and joint i of the elimination shares bodies with
 joints i − 1 and i + 1 only. Chains are the only graphs that have an order so far; others are eliminated as one dense
 matrix.
 """
@@ -22,11 +22,11 @@ _LEAST_ROWS = 30
 
 
 def elimination_order(system: RigidBodySystem) -> EliminationOrder | None:
-    """The order in which block elimination of a scene's joints pays; None where a dense matrix serves better, or where
-    the graph has no order.
+    """The order of block elimination of a scene's joints; None where a dense matrix is faster, or where the graph has
+    no order.
 
-    It pays for many ideal holonomic rows in the plane, if all of them are independent; that is for the caller to find
-    out.
+    Block elimination is faster for many ideal holonomic rows in the plane, if all of them are independent, which the
+    caller must check.
     """
     rows = system.velocity_rows
     if (

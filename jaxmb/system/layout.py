@@ -1,17 +1,11 @@
-"""Where the numbers of each body stand in the vectors of coordinates and velocities; static index arithmetic."""
+"""Indices of each body's entries in the vectors of coordinates and velocities; static."""
 
 import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from ..parts.space import AbstractSpace
-
-
-def pick(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
-    """`values[index]` for indices that are known to be right: a gather and nothing else."""
-    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +41,7 @@ class Layout:
 
     @functools.cached_property
     def velocity_place(self) -> np.ndarray:
-        """Where each velocity stands among all bodies' velocities, body by body, shape (nu,)."""
+        """Index of each velocity among all bodies' velocities, body by body, shape (nu,)."""
         return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu)
 
     @property
@@ -67,7 +61,7 @@ class Layout:
         return np.array([*index, constant])
 
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
-        """Where each entry of an assembled Jacobian comes from.
+        """Source of each entry of an assembled Jacobian.
 
         **Arguments:** `groups`: for each group of parts its bodies (parts, k) and its rows; `of_poses`: columns are
         coordinates rather than velocities.
@@ -111,7 +105,7 @@ class Layout:
         """Which wrench entries add up to the reactions of some joints: shape (names, largest count, k, velocity size).
 
         **Arguments:** `joints`: for each group of constraints the names of its parts and their bodies (parts, k);
-        `names`: of the joints asked for, all between as many bodies. Indices are as in `force_source`.
+        `names`: of these joints, all between the same number of bodies. Indices are as in `force_source`.
         """
         size, start = self.space.velocity_size, 0
         found: dict[str, list[np.ndarray]] = {name: [] for name in names}

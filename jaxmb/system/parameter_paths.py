@@ -1,5 +1,5 @@
 """Paths from the name of a parameter of a compiled scene to the array that holds it: `"part.field"`, and
-`"part.field.field"` for fields that are made of several numbers.
+`"part.field.field"` for fields with several numbers.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +15,7 @@ def parameter_paths(
     """Paths to every parameter of a scene.
 
     **Arguments:** `gravity`: its name, or None; `groups` of stacked parts, by the name of the system's field that holds
-    them; `servos`: those of servos, which have gains besides.
+    them; `servos`: groups of servos, which also have gains.
     """
     out: dict[str, list[ParameterPath]] = {}
     for kind, of_kind in groups.items():

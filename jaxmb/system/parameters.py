@@ -1,4 +1,4 @@
-"""The numbers of a system by name, `"part.field"`."""
+"""The parameters of a system by name, `"part.field"`."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -34,7 +34,7 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
 def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
 
-    Ranks and index sets are kept: a change that makes rows independent that were implied needs a new `compile`.
+    Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew.
 
     **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones.
 

@@ -36,8 +36,8 @@ class BodyMotion(NamedTuple):
 class Reaction(NamedTuple):
     """The force that a joint exerts on the last of its bodies that is not the ground.
 
-    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where
-    the joint has none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body gets the
+    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where the
+    joint has none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body receives the
     opposite.
     """
 

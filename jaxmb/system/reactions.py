@@ -20,7 +20,7 @@ def applied_wrenches(
     poses: Float[Array, "b_ground p"],
     velocities: Float[Array, "b_ground v"],
 ) -> Float[Array, "bodies v"]:
-    """Wrenches of one force element on its bodies, those of its components added up."""
+    """Wrenches of one force element on its bodies, summed over its components."""
     own = [
         g.wrenches(t, poses, velocities)[k] for g in forces for k, other in enumerate(g.group.names) if other == name
     ]
@@ -53,7 +53,7 @@ def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Arra
     layout = group.layout
     bodies = group.bodies[k]
     last = max(i for i, body in enumerate(bodies) if body < layout.bodies)
-    pose, wrench = group.own(poses)[k, last], wrenches[last]
+    pose, wrench = group.gather(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)
     point = part.anchor(last)
     if layout.space.dimension == 2:

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.arrays import unchecked_take
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian, EliminationOrder, block_jacobian
 from ..linalg.rotations import cross, normalize, rotate
@@ -26,7 +27,7 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
-from .layout import Layout, pick
+from .layout import Layout
 from .parameter_paths import parameter_paths, positive_parameters
 from .quantities import Quantity
 from .reactions import applied_wrenches, reaction
@@ -230,16 +231,16 @@ class RigidBodySystem(AbstractSystem):
         return self._in_order([g.inertia for g in self.bodies])
 
     def _in_order(self, of_groups):
-        """What bodies have, group by group, in the order of the bodies."""
+        """Per-body values of all groups, in the order of the bodies."""
         if len(of_groups) == 1:
             return of_groups[0]
         order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
-        return pick(jnp.concatenate(of_groups), order)
+        return unchecked_take(jnp.concatenate(of_groups), order)
 
     # Kinematics
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
-        """Poses of the bodies and of the ground, as parts take them."""
+        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
         return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
@@ -253,13 +254,13 @@ class RigidBodySystem(AbstractSystem):
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
-        return pick(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
+        return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
     def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
         """Velocities of the bodies."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
-        return pick(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
+        return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
 
     def rates(self, t, q, u):
         if self.rates_are_velocities:
@@ -287,7 +288,7 @@ class RigidBodySystem(AbstractSystem):
         sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
         return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
 
-    # Constraints. Each kernel is a compiled function, so that it is traced once for all its places in a program.
+    # Constraints. Each kernel is a compiled function, so that it is traced once for all its uses in a program.
 
     @eqx.filter_jit
     def position_residual(self, t, q):
@@ -362,7 +363,7 @@ class RigidBodySystem(AbstractSystem):
         wrenches = []
         for g in self.nonideal:
             # A joint may be made of several constraints, all between the same bodies.
-            own = pick(reactions, self.layout.reaction_source(joints, g.joints))
+            own = unchecked_take(reactions, self.layout.reaction_source(joints, g.joints))
             wrenches.append(g.wrenches(t, poses, velocities, jnp.sum(own, axis=1)))
         return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
 
@@ -374,7 +375,7 @@ class RigidBodySystem(AbstractSystem):
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
-        return pick(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
+        return unchecked_take(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
 
     # Dynamics
 
@@ -383,7 +384,7 @@ class RigidBodySystem(AbstractSystem):
             return BlockInertia(self.mass, self.moments_of_inertia)
         if self.spatial:
             points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            # Any moment of inertia serves a point mass; one makes the matrix regular.
+            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular.
             moments = self.moments_of_inertia
             moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
             return _MixedInertia(BlockInertia(self.mass, moments), self.layout)
@@ -409,7 +410,7 @@ class RigidBodySystem(AbstractSystem):
         if not wrenches:
             return jnp.zeros(self.nu, dtype)
         source = self.layout.force_source(bodies)
-        return jnp.sum(pick(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
+        return jnp.sum(unchecked_take(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
 
     def _own_wrenches(self, u):
         """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
@@ -474,7 +475,7 @@ class RigidBodySystem(AbstractSystem):
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies and point masses together. `blocks` has some for the rotations of point masses, too."""
+    """Spatial bodies and point masses together. `blocks` has unit blocks for the rotations of point masses."""
 
     blocks: BlockInertia
     layout: Layout = eqx.field(static=True)

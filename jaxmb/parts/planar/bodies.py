@@ -1,4 +1,4 @@
-"""Bodies of the plane, and moments of inertia of common shapes."""
+"""Planar bodies, and moments of inertia of common shapes."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from ..base import AbstractBody, AbstractPlanarPart
 
 
 class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
-    """A rigid body of the plane: the state that it is given with, for classes that know its mass and inertia.
+    """A planar rigid body with its initial guess; subclasses define mass and inertia.
 
     **Arguments:** `position` [m], shape (2,), of the mass centre, and `angle` [rad], a guess that `assemble` improves;
     `velocity` [m/s], shape (2,), and `angular_velocity` [rad/s] likewise.

@@ -19,20 +19,21 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     $$(S_0\,p(x) + k\,r(x))\,(\frac{1 + \eta}{2} + \frac{1 - \eta}{2} \tanh\frac{\dot x}{v_0})
       + k_s\,r(x - x_\text{max}) + c\,p(x)\,\dot x$$
 
-    so that a loading gear follows the spring and an unloading one η times it: a cycle to the stroke δ dissipates
-    `(1 − η)(½ k δ² + S₀ δ)`. The step p and the ramp r, its integral, are 0 and x⁺ but for |x| < `smoothing`/2, where
-    polynomials join them with three continuous derivatives of the ramp. Without slack, preload and friction the force
-    is exactly `k s`. Friction and damper only ever dissipate.
+    A loading gear follows the spring, an unloading one η times the spring: a cycle to the stroke δ dissipates
+    `(1 − η)(½ k δ² + S₀ δ)`. The ramp r is x⁺ and the step p its derivative, except for |x| < `smoothing`/2, where
+    polynomials give the ramp three continuous derivatives. Without slack, preload and friction the force is exactly
+    `k s`. Friction and damping always dissipate.
 
     At zero length the direction is undefined and the force is taken as zero; `free_length` should exceed slack and
     stroke.
 
     **Arguments:**
 
-    - `stiffness` k [N/m] ≥ 0 when loading; `unloading` η, between 0 and 1, the share that is left when unloading.
+    - `stiffness` k [N/m] ≥ 0 when loading; `unloading` η, between 0 and 1, the fraction of the force that remains when
+        unloading.
     - `preload` S₀ [N] ≥ 0; `slack` [m] ≥ 0, to either side.
     - `travel` x_max [m] > 0, the stroke at which the stop is reached, and its `stop_stiffness` k_s [N/m] ≥ 0.
-    - `damping` c [N s/m] ≥ 0, where there is no slack.
+    - `damping` c [N s/m] ≥ 0, acting outside the slack.
     - `transition` v₀ [m/s] > 0, the speed at which friction has reached three quarters of its value; `smoothing` [m]
         > 0. The smaller they are, the shorter the steps.
     - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the mass
@@ -55,8 +56,8 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     def validate(self):
         if self.unloading > 1:
             raise ValueError(
-                f"{self.label}: unloading is the share of the force that is left, at most 1, got {self.unloading}; "
-                "a gear must not give back more than it took."
+                f"{self.label}: unloading is the fraction of the force that remains, at most 1, got {self.unloading}; "
+                "a larger value would create energy."
             )
 
     def complete(self, space, poses):
@@ -67,7 +68,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         return self._against(extension - self.slack, rate) - self._against(-extension - self.slack, -rate)
 
     def stored(self, extension: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The energy [J] of the springs: that of the mean of loading and unloading, from which friction only takes."""
+        """Energy [J] of the springs, from the mean of loading and unloading force; friction only dissipates."""
         return self._stored(extension - self.slack) + self._stored(-extension - self.slack)
 
     def wrenches(self, space, poses, velocities, t):

@@ -20,8 +20,8 @@ class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     **Arguments:**
 
     - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
-    - `quantity`: `"angle"` [rad], `angle_b − angle_a`; `"x"` or `"y"` [m], a coordinate of point B less that of point
-        A along the axes of `body_a`; `"distance"` [m], between the points.
+    - `quantity`: `"angle"` [rad], `angle_b − angle_a`; `"x"` or `"y"` [m], a coordinate of point B relative to point A
+        in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
     - `point_a`, `point_b` [m], body-fixed, default the mass centres.
@@ -37,7 +37,7 @@ class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
     def validate(self):
         if self.quantity == "angle" and not (self.point_a is None and self.point_b is None):
-            raise ValueError(f"{self.label}: quantity='angle' has no points; leave out point_a and point_b.")
+            raise ValueError(f"{self.label}: quantity='angle' has no points; remove point_a and point_b.")
 
     def complete(self, space, poses):
         return self if self.quantity == "angle" else self.filled(point_a=np.zeros(2), point_b=np.zeros(2))

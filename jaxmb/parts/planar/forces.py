@@ -1,4 +1,4 @@
-"""Forces of the plane that have no counterpart of the same shape in space."""
+"""Planar forces that have no spatial counterpart of the same shape."""
 
 import jax
 import jax.numpy as jnp
@@ -57,8 +57,8 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """Progressive stops of a relative angle on both sides, `angle = angle_b − angle_a`.
 
     Beyond a limit the potential is `stiffness δ^(exponent + 1) / (exponent + 1)` of a smoothed depth
-    `δ = ½ (d + √(d² + smoothing²))`, d = lower − angle or angle − upper: a moment on B of nearly `stiffness d^exponent`
-    back.
+    `δ = ½ (d + √(d² + smoothing²))`, d = lower − angle or angle − upper: the restoring moment on B is nearly
+    `stiffness d^exponent`.
 
     **Arguments:** `stiffness` [N m/rad^exponent] ≥ 0; `lower` < `upper` [rad], the limits; `exponent` > 0; `smoothing`
     [rad] > 0.

@@ -1,9 +1,8 @@
-"""Joints of the plane.
+"""Planar joints.
 
 Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the bodies' own frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the bodies' given
-poses (`point`, `axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of
-the axis.
+the body frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the given poses (`point`,
+`axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
 """
 
 from collections.abc import Callable
@@ -135,8 +134,8 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A pair of gears on a carrier. Rows 1: `(angle_b − angle_c) = ratio (angle_a − angle_c) + offset`.
 
-    **Arguments:** `ratio`, negative for gears that mesh outside (−radius_a / radius_b); `carrier`, the body that
-    holds both axles, default ground; `offset` [rad], default that of the given poses.
+    **Arguments:** `ratio`, negative for an external mesh (−radius_a / radius_b); `carrier`, the body that holds both
+    axles, default ground; `offset` [rad], default that of the given poses.
     """
 
     ratio: fields.Number = fields.parameter(sign="nonzero")

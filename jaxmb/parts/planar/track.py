@@ -19,21 +19,21 @@ from ..forces import generalized_force
 class Track(AbstractPlanarPart, AbstractPotentialForce):
     """A closed elastic track or belt without mass around points of any number of bodies.
 
-    Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential
-    `pretension (length − free_length) + ½ stiffness (length − free_length)²`. Without `radii` the track is a polygon
-    through the points; with them it runs around circles, straight between their tangents, and slips on them without
-    friction, so it turns none. Either is taken to touch every wheel, also one that has risen above the line between its
-    neighbours.
+    Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential `pretension
+    (length − free_length) + ½ stiffness (length − free_length)²`. Without `radii` the track is a polygon through the
+    points. With `radii` it wraps circles, joined by their common tangents, and slides on them without friction, so it
+    drives no wheel. In both cases it is assumed to touch every wheel, even one that has risen above the line between
+    its neighbours.
 
     **Arguments:**
 
     - `path`: pairs (body, point), in the order of the track, at least 3 of them; points [m] are body-fixed, shape (2,).
-        A body may come several times.
+        A body may occur several times.
     - `pretension` [N] ≥ 0, at the free length; `stiffness` [N/m] ≥ 0.
     - `free_length` [m], default that of the given poses.
     - `radii` [m] ≥ 0, shape (points,), of circles around the points, inside a track whose path is counter-clockwise.
 
-    **Fields:** `bodies`, each once; `owners`, for each point the place of its body among them; `points`.
+    **Fields:** `bodies`, each once; `owners`, for each point the index of its body among them; `points`.
     """
 
     name: str = fields.name()
@@ -70,13 +70,13 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
                 f"points of shape {self.points.shape[1:]}."
             )
         if self.radii is not None and self.radii.shape != (n,):
-            raise ValueError(f"{self.label}: radii must have shape ({n},), one each point, got {self.radii.shape}.")
+            raise ValueError(f"{self.label}: radii must have shape ({n},), one per point, got {self.radii.shape}.")
 
     def complete(self, space, poses):
         if self.radii is not None:
             distance, more = norm(self._lines(space, poses)), jnp.roll(self.radii, -1) - self.radii
             if jnp.any(distance <= jnp.abs(more)):
-                raise ValueError(f"{self.label}: a circle lies in its neighbour; leave it out, or make it smaller.")
+                raise ValueError(f"{self.label}: a circle lies in its neighbour; remove it or make it smaller.")
         return self.filled(free_length=self.length(space, poses))
 
     def _lines(self, space, poses):
@@ -97,7 +97,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
         into = jnp.roll(along, 1, axis=0)
         turn = jnp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], jnp.sum(into * along, axis=1))
-        # A track turns back at its ends, by half a turn or more, and never as much as a quarter the other way.
+        # At its ends a track turns by half a turn or more; elsewhere it turns back by less than a quarter.
         turn = jnp.where(turn < -0.5 * jnp.pi, turn + 2 * jnp.pi, turn)
         return jnp.sum(straight) + jnp.dot(self.radii, turn)
 

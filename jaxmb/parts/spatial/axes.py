@@ -1,4 +1,4 @@
-"""Directions and relative attitudes that joints, drivers and forces in space share.
+"""Directions and relative attitudes, shared by spatial joints, drivers and forces.
 
 Quantities "in A" are components in the axes of the first body of the part.
 """
@@ -16,9 +16,9 @@ Vector3 = Float[Array, "3"]
 def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     """Two directions that make a right-handed orthogonal triad `(u, v, axis)`, u of unit length.
 
-    They are worked out from `axis` wherever they are needed, so that derivatives with respect to `axis` are right.
+    They are recomputed from `axis` at every use, so that derivatives with respect to `axis` are right.
     """
-    # The coordinate axis least parallel to `axis` (no single one serves them all): a choice without derivative.
+    # The coordinate axis least parallel to `axis` (no fixed one serves all): a choice without derivative.
     xp = namespace(axis)
     k = xp.argmin(abs(axis if xp is np else jax.lax.stop_gradient(axis)))
     skew = rot.skew(axis)
@@ -43,7 +43,7 @@ def relative_orientation(poses: Float[Array, "k p"]) -> Float[Array, "4"]:
 
 
 def rotation_error(part, poses: Float[Array, "k p"]) -> Vector3:
-    """Twice the vector part of the turn from `part.orientation` to the relative attitude [rad, for small turns]."""
+    """Twice the vector part of the rotation from `part.orientation` to the relative attitude [rad, for small turns]."""
     return 2.0 * rot.multiply(rot.conjugate(part.orientation), relative_orientation(poses))[1:]
 
 
@@ -66,9 +66,7 @@ def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
 
 
 def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
-    """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if they were left
-    out.
-    """
+    """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if None."""
     if (part.x_a is None) != (part.x_b is None):
         raise ValueError(
             f"{part.label}: give both x_a and x_b (body-fixed), or neither to measure from the given poses."
@@ -82,5 +80,5 @@ def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
 
 
 def with_given_orientation(part, poses: Float[Array, "k p"]):
-    """Fill `orientation`, Euler parameters of B relative to A, with that of the given poses, if it was left out."""
+    """Fill `orientation`, Euler parameters of B relative to A, with that of the given poses, if it is None."""
     return part if part.orientation is not None else part.filled(orientation=rot.normalize(relative_orientation(poses)))

@@ -1,4 +1,4 @@
-"""Bodies of space, and moments of inertia of common shapes."""
+"""Spatial bodies, and moments of inertia of common shapes."""
 
 from typing import Any, ClassVar, Literal, get_args
 
@@ -15,13 +15,13 @@ Axis = Literal["x", "y", "z"]
 
 
 def inertia_matrix(value: Any) -> Array:
-    """An inertia matrix from itself or from its diagonal."""
+    """An inertia matrix from a full matrix or from its diagonal."""
     value = as_parameter(value)
     return namespace(value).diag(value) if value.shape == (3,) else value
 
 
 class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
-    """A rigid body of space: the state that it is given with, for classes that know its mass and inertia.
+    """A spatial rigid body with its initial guess; subclasses define mass and inertia.
 
     **Arguments:** `position` [m], shape (3,), of the mass centre, and `orientation`, shape (4,), unit Euler parameters
     (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,), of the mass
@@ -74,7 +74,7 @@ def _check_inertia(body: AbstractRigidBody) -> None:
     if not np.allclose(inertia, inertia.T, rtol=0.0, atol=1e-9 * np.max(np.abs(inertia))):
         raise ValueError(f"{body.label}: inertia must be symmetric, got {inertia.tolist()}; use (J + J.T) / 2.")
     moments = np.linalg.eigvalsh(inertia)
-    # Moments this far below the largest are rounding of a zero, not a thin body.
+    # Moments this far below the largest are rounding errors, not a thin body.
     if moments[0] <= 1e-14 * np.max(np.abs(moments)):
         raise ValueError(
             f"{body.label}: inertia must be positive definite, got principal moments {moments.tolist()} kg m²; a "
@@ -124,7 +124,7 @@ def rod(mass: float, length: float, axis: Axis = "x", *, radius: float = 0.0) ->
     """Inertia [kg m²] of a uniform round rod along `axis` about its centre; `m l² / 12` across and zero along for a
     thin one.
 
-    A thin rod has no inertia about its own axis, and so cannot be a `Body`: give it a `radius`.
+    A thin rod has no inertia about its axis and cannot be a `Body`: give it a `radius`.
     """
     return cylinder(mass, radius, length, axis)
 

@@ -17,21 +17,21 @@ from .axes import angle, cosine_sine, measured_from_given_poses, offset_in_a
 class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
-    An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, so that any
-    number of turns passes without a branch. It should be that of a joint which lets B turn about the axis only;
-    otherwise it is the angle of the projections across the axis.
+    An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, which holds for
+    any number of turns. The joint should let B turn about the axis only; otherwise the angle is that of the projections
+    perpendicular to the axis.
 
     **Arguments:**
 
     - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
     - `quantity`: `"angle"` [rad], from `x_a` to `x_b` about `axis_a`; `"x"`, `"y"` or `"z"` [m], a coordinate of point
-        B less that of point A along the axes of `body_a`; `"distance"` [m], between the points.
+        B relative to point A in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
     - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres: for a coordinate or distance only.
     - `axis_a`, unit, shape (3,), fixed in `body_a`, or `axis` in the world: for an angle only.
-    - `x_a`, `x_b`, unit, shape (3,), body-fixed and across the axis, between which an angle is measured; default such
-        that it is zero at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis: an angle is measured between them; by
+        default it is zero at the given poses.
     """
 
     quantity: Literal["angle", "x", "y", "z", "distance"] = fields.choice("angle", "x", "y", "z", "distance")
@@ -50,7 +50,7 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         turn, length = ("axis_a", "axis", "x_a", "x_b"), ("point_a", "point_b")
         for field in length if self.quantity == "angle" else turn:
             if getattr(self, field) is not None and self.quantity in ("angle", "x", "y", "z", "distance"):
-                raise ValueError(f"{self.label}: {field} has no meaning for quantity={self.quantity!r}; leave it out.")
+                raise ValueError(f"{self.label}: {field} has no meaning for quantity={self.quantity!r}; remove it.")
 
     def validate(self):
         if self.quantity == "angle" and self.axis is None and self.axis_a is None:

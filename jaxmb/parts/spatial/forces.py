@@ -1,4 +1,4 @@
-"""Forces of space that have no counterpart of the same shape in the plane."""
+"""Spatial forces that have no planar counterpart of the same shape."""
 
 from typing import Literal
 
@@ -32,13 +32,13 @@ class Torque(AbstractSpatialPart, AbstractForce):
 class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A linear spring and damper on an angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
 
-    The angle is that from `x_a` to `x_b` about `axis_a`, in (−π, π]: it jumps half a turn away from `x_a`, so it suits
-    joints that turn less than that to either side. It should be that of a joint which lets B turn about the axis only;
-    otherwise it is the angle of the projections across the axis, and the moment its gradient.
+    The angle from `x_a` to `x_b` about `axis_a` is in (−π, π] and jumps half a turn away from `x_a`, so the joint
+    should turn by less than that to either side. It should let B turn about the axis only; otherwise the angle is that
+    of the projections perpendicular to the axis, and the moment is its gradient.
 
     **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `axis_a`, unit, shape (3,), fixed in `body_a`,
-    or `axis` in the world; `x_a`, `x_b`, unit, shape (3,), body-fixed and across the axis, default such that the angle
-    is zero at the given poses; `free_angle` [rad], default that of the given poses.
+    or `axis` in the world; `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis, by default with
+    zero angle at the given poses; `free_angle` [rad], default that of the given poses.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N m/rad", sign="non-negative")
@@ -66,7 +66,7 @@ class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
 
     The motions are the position of B's point relative to A's point in the axes of `body_a` (3) [m], and twice the
     vector part of the Euler parameters from `orientation` to the relative attitude, in the axes of `body_b` (3): the
-    rotation vector [rad] when small, `2 sin(angle/2)` along the axis of the turn in general, so the moment of an
+    rotation vector [rad] when small, `2 sin(angle/2)` along the axis of rotation in general, so the moment of an
     isotropic spring is `stiffness sin(angle)`. Both signs of the bodies' Euler parameters give the same wrench and
     energy.
 

@@ -1,10 +1,9 @@
-"""Joints of space.
+"""Spatial joints.
 
 Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the bodies' own frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a world point and axis at the
-bodies' given poses (`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two
-points, `d = B − A`, `a` and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`;
-all rows are Φ = 0.
+the body frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a world point and axis at the given poses
+(`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two points, `d = B − A`, `a`
+and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 """
 
 from typing import ClassVar
@@ -29,7 +28,7 @@ from .axes import (
 
 
 def _across(axis_a, w):
-    """The components `u·w`, `v·w` of a vector in A across the axis: zero where it is parallel to the axis."""
+    """The components `u·w`, `v·w` of a vector in A; both are zero if it is parallel to the axis."""
     return jnp.sum(perpendiculars(axis_a) * w[None, :], axis=1)
 
 
@@ -92,7 +91,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
 
 
 class Cylindrical(AbstractSpatialPart, AbstractJoint):
-    """A turning slide: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
+    """A pin that turns and slides: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
 
     **Arguments:** as in `Revolute`.
     """
@@ -108,16 +107,17 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
 
 
 class Screw(AbstractSpatialPart, AbstractJoint):
-    """A screw: two axes stay on one line and a turn advances B. Rows 5: those of `Cylindrical`, and the thread.
+    """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
 
-    With the angle θ from `x_a` to `x_b` about the axis and the shift s = a·d, the last row is `pitch/2π · sin(θ − 2π (s
-    − offset)/pitch) = 0`, written with products of direction components: it is periodic in θ and in s as the screw
-    itself is, so any number of turns passes without a branch, and there its value is the axial error [m]. (The sine has
-    a second family of zeros half a turn away, which a solution that is followed continuously never meets.)
+    With the angle θ from `x_a` to `x_b` about the axis and the shift s = a·d, the last row is
+    `pitch/2π · sin(θ − 2π (s − offset)/pitch) = 0`, written with products of direction components: it is periodic in θ
+    and in s, as the screw is, and so holds for any number of turns; near zero its value is the axial error [m]. (The
+    sine has a second family of zeros half a turn away, which a solution that is followed continuously never meets.)
 
-    **Arguments:** points and axes as in `Revolute`; `pitch` [m], advance of B along the axis a turn, positive for a
+    **Arguments:** points and axes as in `Revolute`; `pitch` [m], advance of B along the axis per turn, positive for a
     right-handed screw, not zero; `offset` [m], the shift at θ = 0, default that of the given poses; `x_a`, `x_b`, unit,
-    shape (3,), body-fixed and across the axis, between which θ is measured, default zero angle at the given poses.
+    shape (3,), body-fixed and perpendicular to the axis: θ is measured between them; by default it is zero at the given
+    poses.
     """
 
     pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
@@ -144,10 +144,10 @@ class Screw(AbstractSpatialPart, AbstractJoint):
 
 
 class Prismatic(AbstractSpatialPart, AbstractJoint):
-    """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the turn (3).
+    """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
 
-    The turn is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the rotation
-    vector [rad] when small, and zero only there, whichever sign the bodies' Euler parameters have.
+    The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
+    rotation vector [rad] when small, and zero only where they agree, for either sign of the bodies' Euler parameters.
 
     **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slide fixed in `body_a`, or
     `axis` in the world; `orientation`, shape (4,), unit Euler parameters of B relative to A, default those of the given
@@ -183,7 +183,7 @@ class Planar(AbstractSpatialPart, AbstractJoint):
 
 
 class Fixed(AbstractSpatialPart, AbstractJoint):
-    """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the turn (3) as in `Prismatic`.
+    """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the rotation (3) as in `Prismatic`.
 
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """

@@ -1,4 +1,4 @@
-"""Constraints between velocities in space: blades, and wheels and balls that roll on a plane.
+"""Spatial velocity constraints: blades, and wheels and balls that roll on a plane.
 
 The plane is fixed in the world, given by a point and its normal `e`, which points to the side of the body.
 """
@@ -16,8 +16,8 @@ from .axes import perpendiculars
 class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
     """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`.
 
-    Here v is the velocity of the contact point and h the direction of the blade. It does not hold the body
-    on the plane; a `Planar` or `PointOnPlane` joint does.
+    Here v is the velocity of the contact point and h the direction of the blade. The constraint does not hold the body
+    on the plane; add a `Planar` or `PointOnPlane` joint.
 
     **Arguments:** `point` [m], shape (3,), contact point fixed in the body; `axis`, unit, shape (3,), direction of the
     blade fixed in the body; `normal`, unit, shape (3,), of the plane in the world.
@@ -38,7 +38,7 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
 
 
 class AbstractDisk(AbstractSpatialPart):
-    """What `RollingDisk` and its components share."""
+    """Fields of `RollingDisk` and its components."""
 
     name: str = fields.name()
     body: str = fields.body_name()
@@ -68,7 +68,7 @@ class RollingDisk(AbstractDisk, AbstractCompound):
     """A thin disk that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, n the
-    axle. A disk must not come to lie flat.
+    axle. The disk must never lie flat.
 
     **Arguments:** `radius` [m] > 0; `axis`, unit, shape (3,), the axle fixed in the body; `center` [m], shape (3,), of
     the disk, fixed in the body, default the mass centre; `point` [m] and `normal` (unit), shape (3,), of the plane in
@@ -107,7 +107,7 @@ class DiskRolling(AbstractDisk, AbstractVelocityConstraint):
 
 
 class AbstractBall(AbstractSpatialPart):
-    """What `RollingSphere` and its components share."""
+    """Fields of `RollingSphere` and its components."""
 
     name: str = fields.name()
     body: str = fields.body_name()
@@ -136,7 +136,7 @@ class RollingSphere(AbstractBall, AbstractCompound):
 
 
 class SphereContact(AbstractBall, AbstractConstraint):
-    """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C its centre; else as in `RollingSphere`."""
+    """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C the centre; arguments of `RollingSphere`."""
 
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
