@@ -193,7 +193,7 @@ class AbstractContact(AbstractPotentialForce):
             shape = getattr(part, field).shape
             if shape not in shapes:
                 raise ValueError(f"{self.label}: {field} must have shape {shapes[0]} or {shapes[1]}, got {shape}.")
-        place = np.zeros(d - 1, part.points.dtype)
+        place = np.zeros(d - 1, part.centres.dtype)
         check_returns(self.label, "terrain.height", (), self.terrain.height, place)
         return part
 

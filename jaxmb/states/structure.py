@@ -11,7 +11,8 @@ import numpy as np
 from ..linalg.elimination import full_pivot
 from ..system.equation import Ranks
 from ..system.joint_graph import elimination_order
-from ..system.rigid_bodies import Implied, RigidBodySystem
+from ..system.bodies import Implied
+from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
 from .closest import (
     INDEPENDENT,

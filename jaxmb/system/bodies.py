@@ -1,0 +1,287 @@
+"""Systems of bodies: sizes, kinematics, names, and views of a motion, for a scene whose parts are stacked."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import State
+from ..linalg.arrays import unchecked_take
+from ..linalg.jacobian import EliminationOrder
+from ..linalg.rotations import normalize
+from .body_motion import attachments, body_motion, body_quantities, outline
+from .coordinates import coordinate_names, rate_names
+from .describe import describe_scene
+from .equation import AbstractSystem, Ranks
+from .groups import (
+    AbstractConstraintGroup,
+    BodyGroup,
+    ConstraintGroup,
+    ForceGroup,
+    NonIdealGroup,
+    ServoGroup,
+    VelocityConstraintGroup,
+)
+from .layout import Layout
+from .parameter_paths import parameter_paths, positive_parameters
+from .quantities import Quantity
+from .reactions import applied_wrenches, reaction
+
+
+class Implied(NamedTuple):
+    """A row that other joints imply: `row` of part `name` follows from the joints `by`."""
+
+    name: str
+    row: int
+    by: tuple[str, ...]
+
+
+class AbstractBodySystem(AbstractSystem):
+    """The bodies, parts and names of a compiled scene, for a class that knows the equations of their motion.
+
+    **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
+    bodies; `length` [m], the scene's size; `body_names`; `elimination`, the order in which the joints are
+    eliminated, or None.
+    """
+
+    bodies: tuple[BodyGroup, ...]
+    gravity: Float[Array, "d"] | None
+    constraints: tuple[ConstraintGroup, ...]
+    velocity_constraints: tuple[VelocityConstraintGroup, ...]
+    servos: tuple[ServoGroup, ...]
+    nonideal: tuple[NonIdealGroup, ...]
+    forces: tuple[ForceGroup, ...]
+    guess: State
+    length: Float[Array, ""]
+    layout: Layout = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)
+    gravity_name: str = eqx.field(static=True)
+    ranks: Ranks
+    implied: tuple[Implied, ...] = eqx.field(static=True)
+    elimination: EliminationOrder | None = eqx.field(static=True)
+
+    # Sizes
+
+    @property
+    def nq(self) -> int:
+        return self.layout.nq
+
+    @property
+    def nu(self) -> int:
+        return self.layout.nu
+
+    @property
+    def spatial(self) -> bool:
+        return self.layout.space.dimension == 3
+
+    @property
+    def position_rows(self) -> int:
+        return sum(len(g.group.names) * g.rows for g in self.constraints)
+
+    @property
+    def coordinate_rows(self) -> int:
+        return self.position_rows + (sum(self.layout.rotates) if self.spatial else 0)
+
+    @property
+    def velocity_rows(self) -> int:
+        return self.position_rows + sum(len(g.group.names) * g.rows for g in self.velocity_constraints)
+
+    @property
+    def acceleration_rows(self) -> int:
+        return self.velocity_rows + sum(len(g.group.names) * g.rows for g in self.servos)
+
+    @property
+    def joints(self) -> tuple[AbstractConstraintGroup, ...]:
+        """All groups of constraints, in the order of the rows of A."""
+        return (*self.constraints, *self.velocity_constraints, *self.servos)
+
+    @property
+    def has_bodies(self) -> bool:
+        return True
+
+    @property
+    def ideal(self) -> bool:
+        return not self.nonideal
+
+    @property
+    def positive_definite_mass(self) -> bool:
+        return True
+
+    @property
+    def rates_are_velocities(self) -> bool:
+        return not self.spatial
+
+    @property
+    def linear(self) -> bool:
+        return all(g.group.part.linear for g in self.velocity_constraints)
+
+    @property
+    def drift_free(self) -> bool:
+        return not any(g.group.part.rheonomic for g in self.constraints) and all(
+            g.group.part.homogeneous for g in self.velocity_constraints
+        )
+
+    @property
+    def rows(self) -> tuple[tuple[str, int], ...]:
+        """Name and number within its part of every row of A."""
+        return tuple((name, k) for g in self.joints for name in g.group.names for k in range(g.rows))
+
+    def coordinate_names(self):
+        return coordinate_names(self.layout, self.body_names)
+
+    def rate_names(self):
+        return rate_names(self.layout, self.body_names)
+
+    def parameter_paths(self):
+        return parameter_paths(self._gravity_name, self._groups, self.servos)
+
+    def positive_parameters(self):
+        return frozenset(positive_parameters(self._groups))
+
+    @property
+    def _groups(self):
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal")
+        return {kind: getattr(self, kind) for kind in kinds}
+
+    @property
+    def _gravity_name(self):
+        return None if self.gravity is None else self.gravity_name
+
+    def describe(self):
+        kinds: dict[str, list[str]] = {}
+        for g in self.bodies:
+            kinds.setdefault(type(g.group.part).__name__, []).extend(g.group.names)
+        return describe_scene(
+            self,
+            spatial=self.spatial,
+            bodies=kinds,
+            joints=[
+                (self.constraints, ""),
+                (self.velocity_constraints, ", between velocities"),
+                (self.servos, ", a program of a Servo"),
+            ],
+            forces=self.forces,
+            laws=self.nonideal,
+            gravity=self._gravity_name,
+            implied=self.implied,
+        )
+
+    # Views of a motion
+
+    def motion_names(self):
+        return self.body_names
+
+    def motion(self, name, ys):
+        return body_motion(self.layout, self.body_names.index(name), ys)
+
+    def quantities(self):
+        out = body_quantities(self.layout, self.body_names)
+        d = self.layout.space.dimension
+        for name in self.joint_names():
+            for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
+                value = lambda *along, name=name, field=field: getattr(self.reaction(name, *along), field)
+                out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
+        return out
+
+    def position_quantities(self):
+        return tuple(f"{name}.position" for name in self.body_names)
+
+    def joint_names(self):
+        return self.constraint_names()
+
+    @eqx.filter_jit
+    def reaction(self, name, ts, ys, multipliers):
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            return reaction(self.joints, name, t, poses, velocities, own)
+
+        return jax.vmap(single)(ts, ys, multipliers)
+
+    def force_names(self):
+        return tuple(dict.fromkeys(name for g in self.forces for name in g.group.names))
+
+    @eqx.filter_jit
+    def applied_wrenches(self, name, ts, ys):
+        def single(t, y):
+            return applied_wrenches(self.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
+
+        return jax.vmap(single)(ts, ys)
+
+    def outline(self, ys):
+        groups = (*self.constraints, *self.velocity_constraints, *self.forces)
+        points = attachments(groups, self.layout.bodies)
+        poses = jax.vmap(self.poses)(ys.q)
+        return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
+
+    # Bodies
+
+    @property
+    def mass(self) -> Float[Array, "b"]:
+        """Masses [kg] of the bodies."""
+        return self._in_order([g.mass for g in self.bodies])
+
+    @property
+    def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
+        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
+        return self._in_order([g.inertia for g in self.bodies])
+
+    def _in_order(self, of_groups):
+        """Per-body values of all groups, in the order of the bodies."""
+        if len(of_groups) == 1:
+            return of_groups[0]
+        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
+        return unchecked_take(jnp.concatenate(of_groups), order)
+
+    # Kinematics
+
+    def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
+        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
+        prepare = self.layout.space.prepare
+        ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
+        return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
+
+    def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
+        """Velocities of the bodies and of the ground."""
+        return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
+
+    def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
+        """Poses of the bodies."""
+        if self.layout.uniform:
+            return q.reshape(self.layout.bodies, -1)
+        ground = jnp.asarray(self.layout.space.ground, q.dtype)
+        return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
+
+    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+        """Velocities of the bodies."""
+        if self.layout.uniform:
+            return u.reshape(self.layout.bodies, -1)
+        return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
+
+    def rates(self, t, q, u):
+        if self.rates_are_velocities:
+            return u
+        return self._pack(jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u)))
+
+    def normalize(self, q):
+        if self.rates_are_velocities:
+            return q
+        return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
+
+    def normalize_fixed(self, q, fixed):
+        whole = [
+            row[3:]
+            for row in self.layout.pose_index[:-1]
+            if self.spatial and row[-1] < self.nq and fixed[row[3:]].all()
+        ]
+        for index in whole:
+            q = q.at[index].set(normalize(q[index]))
+        return q, len(whole)
+
+    def _pack(self, poses):
+        if self.layout.uniform:
+            return poses.reshape(-1)
+        sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
+        return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
