@@ -194,19 +194,19 @@ def test_prescribed_values_are_real_numbers(pendulum, value):
 @pytest.mark.parametrize("function", [mb.assemble, mb.equilibrium])
 def test_arguments_of_wrong_types(pendulum, function):
     scene = mb.Scene([bar()], joints=[pin()])
-    for system, message in ((scene, r"got a Scene; compile the scene first, scene.compile\(\)"), (None, "got None")):
+    for system, message in ((scene, r"got .*; compile the scene first, scene.compile\(\)"), (None, "got None")):
         with pytest.raises(ValueError, match=f"{function.__name__}: system must be a compiled scene.*{message}"):
             function(system)
     for guess, message in (
         ("here", r"guess must be a State\(q, u\), got 'here'"),
         (mb.State(jnp.zeros(2), jnp.zeros(3)), r"guess.q must have shape \(3,\), got \(2,\)"),
-        (mb.State(jnp.zeros(3), None), "guess.u must be a real number or an array of them, got None"),
+        (mb.State(jnp.zeros(3), None), "guess.u must be an array of real numbers, got None"),
     ):
         with pytest.raises(ValueError, match=message):
             function(pendulum, guess)
     with pytest.raises(ValueError, match=r"prescribed by name.*got \['bar.angle'\]"):
         function(pendulum, fix=["bar.angle"])
-    with pytest.raises(ValueError, match="t must be one number"):
+    with pytest.raises(ValueError, match="t must be a real number"):
         function(pendulum, t=(0.0, 1.0))
 
 
@@ -330,7 +330,7 @@ ARGUMENTS = {
     "no tolerance": ({"rtol": None}, "rtol must be a real number, got None"),
     "tolerances of the wrong number": (
         {"atol": [1e-6, 1e-6]},
-        r"atol must be .* an array of shape \(6,\)",
+        r"atol must have shape \(\) or \(6,\), got \(2,\)",
     ),
     "negative tolerance": ({"atol": -1e-6}, "atol must be between 0 and 1"),
     "times in words": ({"saveat": "all"}, "saveat must be an array of real numbers, got 'all'"),

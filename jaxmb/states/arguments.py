@@ -1,31 +1,27 @@
-"""Checks of the arguments of `assemble` and `equilibrium`."""
+"""Checks of what a user gives to `assemble` and `equilibrium`."""
 
 from typing import Any
 
 import jax
-import numpy as np
 from jaxtyping import Array
 
 from .._types import Scalar, State
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import is_traced
 from ..system import AbstractSystem
-from ..system.coordinates import real_numbers
+from ..system.arguments import check_kind, real_array
 
 
 def check_system(function: str, system: Any) -> None:
     """Raise a `ValueError` for anything but a compiled scene or another system."""
-    if isinstance(system, AbstractSystem):
-        return
     cure = "compile the scene first, scene.compile()" if hasattr(system, "compile") else "scene.compile() makes one"
-    raise ValueError(f"{function}: system must be a compiled scene or another system, got {_shown(system)}; {cure}.")
+    check_kind(f"{function}: system", system, AbstractSystem, "a compiled scene or another system", cure)
 
 
 def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
-    """The guess as arrays, default the guess of the system."""
+    """The guess as arrays, or the system's own where none is given."""
     if guess is None:
         return system.guess
-    if not isinstance(guess, State):
-        raise ValueError(f"{function}: guess must be a State(q, u), got {_shown(guess)}; assemble returns one.")
+    check_kind(f"{function}: guess", guess, State, "a State(q, u)", "assemble returns one")
     return State(
         _vector(f"{function}: guess.q", guess.q, system.guess.q),
         _vector(f"{function}: guess.u", guess.u, system.guess.u),
@@ -34,22 +30,9 @@ def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
 
 def checked_time(function: str, t: Scalar, dtype: Any) -> Any:
     """The time as an array without axes."""
-    if real_numbers(f"{function}: t", t) != ():
-        raise ValueError(f"{function}: t must be one number [s], got shape {np.shape(t)}.")
-    return as_array(t, dtype)
+    return real_array(f"{function}: t", t, dtype)
 
 
 def _vector(label: str, value: Any, like: Array) -> Array:
-    shape = real_numbers(label, value)
-    if shape != like.shape:
-        raise ValueError(
-            f"{label} must have shape {like.shape}, got {shape}; mb.State(q, u) holds coordinates and rates."
-        )
-    if isinstance(value, jax.Array):
-        return value
-    value = as_array(value, like.dtype)
-    return value if is_traced(value) else jax.device_put(value)
-
-
-def _shown(value: Any) -> str:
-    return repr(value) if value is None or isinstance(value, str | float | int) else f"a {type(value).__name__}"
+    array = real_array(label, value, like.dtype, (like.shape,))
+    return array if is_traced(array) else jax.device_put(array)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..linalg.elimination import full_pivot
+from ..system.bodies import Implied
 from ..system.equation import Ranks
 from ..system.joint_graph import elimination_order
-from ..system.bodies import Implied
 from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
 from .closest import (

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..linalg.arrays import as_array, is_traced
@@ -24,15 +26,26 @@ def real_array(name: str, value: Any, dtype: Any, shapes: tuple[tuple[int, ...],
 
     **Raises:** `ValueError` for anything but real numbers, another shape, and NaN.
     """
-    if is_traced(value):
-        return as_array(value, dtype)
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        array = np.asarray(None)
-    if array.dtype.kind not in "fiub" or (shapes is not None and array.shape not in shapes):
-        kinds = ("a real number" if shape == () else f"an array of shape {shape}" for shape in shapes or ())
-        raise ValueError(f"{name} must be {' or '.join(kinds) or 'an array of real numbers'}, got {value!r}.")
-    if np.any(np.isnan(array)):
+    shape = real_shape(name, value, "a real number" if shapes == ((),) else "an array of real numbers")
+    if shapes is not None and shape not in shapes:
+        if shapes == ((),):
+            raise ValueError(f"{name} must be a real number, got an array of shape {shape}.")
+        raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {shape}.")
+    array = as_array(value, dtype)
+    if not is_traced(array) and np.any(np.isnan(array)):
         raise ValueError(f"{name} must not be NaN, got {value!r}.")
-    return as_array(array, dtype)
+    return array
+
+
+def real_shape(name: str, value: Any, expected: str = "a real number or an array of them") -> tuple[int, ...]:
+    """The shape of real numbers.
+
+    **Raises:** `ValueError` for text, None, complex numbers and ragged lists.
+    """
+    try:
+        array = jax.eval_shape(jnp.asarray, value) if is_traced(value) else np.asarray(value)
+    except (TypeError, ValueError):
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name} must be {expected}, got {value!r}.")
+    return array.shape

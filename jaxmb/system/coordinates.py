@@ -1,16 +1,14 @@
 """Coordinates and rates by name: the entries of q and u that a name such as `"crank.angle"` denotes."""
 
 from collections.abc import Mapping
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import VectorLike
-from ..linalg.arrays import as_array, is_traced, replaced
+from ..linalg.arrays import as_array, replaced
 from ..parts.names import unknown
+from .arguments import real_shape
 from .layout import Layout
 
 
@@ -64,24 +62,10 @@ def prescribe(
         if name not in names:
             raise unknown(what, name, names)
         index = names[name]
-        shape = real_numbers(f"{what.capitalize()} {name!r}", value)
+        shape = real_shape(f"{what.capitalize()} {name!r}", value)
         if shape not in ((), (len(index),)) or (shape == () and len(index) > 1):
             raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {shape}.")
         value = as_array(value, vector.dtype)
         vector = replaced(vector, np.array(index), value)
         fixed[index] = True
     return vector, fixed
-
-
-def real_numbers(label: str, value: Any) -> tuple[int, ...]:
-    """The shape of a real number or an array of them.
-
-    **Raises:** `ValueError` for text, None, complex numbers and ragged lists, with the label.
-    """
-    try:
-        array = jax.eval_shape(jnp.asarray, value) if is_traced(value) else np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{label} must be a real number or an array of them, got {value!r}.") from error
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"{label} must be a real number or an array of them, got {value!r}.")
-    return array.shape
