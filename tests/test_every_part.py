@@ -1,8 +1,7 @@
 """Every part in a scene: it compiles, moves on its constraints, has derivatives, finds its equilibrium, and is known
-when it stands twice.
+when it stands twice. Every method of integration gives the same motion.
 
-Each part has bodies of its own. All parts of a space in one scene share the few programs that are compiled for it;
-alone, with another method of integration, each has programs without anything of the others.
+Each stands in a small scene of its own, where gravity and a spring move it.
 """
 
 import dataclasses
@@ -19,7 +18,6 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import (
-    AbstractBody,
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
@@ -30,7 +28,6 @@ from jaxmb.parts import (
 )
 
 CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
-TIMES = jnp.array([0.08, 0.2])
 
 
 @dataclasses.dataclass
@@ -49,10 +46,6 @@ class Example:
     forces: tuple = ()
     rests: bool = True
     ideal: bool = True
-
-    @property
-    def constrains(self):
-        return isinstance(self.part, CONSTRAINTS)
 
 
 # Plane
@@ -311,181 +304,139 @@ SPATIAL = [
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
 ]
 
-GROUPS = {"planar": PLANAR, "spatial": SPATIAL, "functions": FUNCTIONS, "spatial friction": [rubbing_3d()]}
-EXAMPLES = {f"{group}: {example.part.name}": (group, example) for group, own in GROUPS.items() for example in own}
-ALONE = {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Projection()}
+SPACES = {"planar": PLANAR, "functions": FUNCTIONS, "spatial": [*SPATIAL, rubbing_3d()]}
+EXAMPLES = {f"{space}: {example.part.name}": example for space, own in SPACES.items() for example in own}
+CONSTRAINED = [name for name, example in EXAMPLES.items() if isinstance(example.part, CONSTRAINTS)]
+AT_REST = [name for name, example in EXAMPLES.items() if example.rests and example.ideal]
+# By a method that is compiled sooner than the default.
+METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "max_steps": 512}
+T1 = 0.2
+
+
+# What is tested
+
+
+def compiled(example, *more):
+    """The scene of an example, and of more joints."""
+    part, bodies, forces = example.part, example.bodies, list(example.forces)
+    forces += [part] if isinstance(part, AbstractForce | AbstractNonIdeal) else []
+    joints = [*example.joints, *([] if part in bodies or part in forces else [part]), *more]
+    gravity = mb.Gravity((0.0, -9.81) if bodies[0].dimension == 2 else (0.0, 0.0, -9.81))
+    return mb.Scene(bodies, joints=joints, forces=[*forces, gravity]).compile()
+
+
+@functools.cache
+def programs(name):
+    """A motion and its forward derivative with respect to a parameter of the part, and its reverse derivative.
+
+    Both are functions of a number that is added to the parameter, in its own size, and of the tolerance.
+    """
+    example = EXAMPLES[name]
+    system, parameter = compiled(example), f"{example.part.name}.{example.parameter}"
+    value = mb.parameters(system)[parameter]
+    size = max(float(np.max(np.abs(value))), 0.1)
+
+    def end(share, rtol, adjoint):
+        changed = mb.with_parameters(system, {parameter: value + share * size})
+        state = mb.assemble(changed, throw=False)
+        y = mb.simulate(changed, state, t1=T1, rtol=rtol, adjoint=adjoint, throw=False, **METHOD).ys
+        q, u = y.q[-1], y.u[-1]
+        energy = changed.kinetic_energy(T1, q, u) + changed.potential_energy(T1, q)
+        broken = changed.position_residual(T1, q), changed.velocity_residual(T1, q, u)
+        return jnp.cos(jnp.arange(float(system.nq))) @ q, (broken, energy)
+
+    @jax.jit
+    def forward(share, rtol):
+        return jax.jvp(lambda x: end(x, rtol, diffrax.ForwardMode()), (share,), (jnp.ones(()),), has_aux=True)
+
+    return forward, jax.jit(jax.grad(lambda share, rtol: end(share, rtol, None)[0]))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_motion_and_its_derivative(name):
+    """The state stays on the constraints, and the derivative is that of central differences."""
+    forward, _ = programs(name)
+    still = jnp.zeros(())
+    _, _, (broken, energy) = forward(still, 1e-6)
+    for residual in broken:
+        np.testing.assert_allclose(residual, 0.0, atol=1e-9)
+    assert np.isfinite(energy)
+
+    _, derivative, _ = forward(still, 1e-9)
+    # A parameter without effect would pass the rest.
+    assert abs(derivative) > 1e-6
+    h = 1e-3
+    value = lambda s: forward(still + s, 1e-12)[0]
+    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(derivative, difference, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_reverse_derivative(name):
+    forward, reverse = programs(name)
+    still = jnp.zeros(())
+    np.testing.assert_allclose(reverse(still, 1e-9), forward(still, 1e-9)[1], rtol=1e-9, atol=1e-10)
 
 
 def twin(part):
     return dataclasses.replace(part, name=f"{part.name} twin")
 
 
-# What is tested
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_a_part_that_stands_twice_is_named(name):
+    """As many rows are implied as the part has, each by its twin."""
+    part = EXAMPLES[name].part
+    once, twice = compiled(EXAMPLES[name]), compiled(EXAMPLES[name], twin(part))
+    names = {part.name, twin(part).name}
+    assert len(twice.implied) == len([own for own, _ in once.rows if own == part.name])
+    for item in twice.implied:
+        assert item.name in names and names - {item.name} <= set(item.by)
+    assert once.velocity_rank == twice.velocity_rank
 
 
-def compiled(examples, *, twins=False):
-    """All examples in one scene; `twins`: with all their constraints in it twice."""
-    parts = [example.part for example in examples if not isinstance(example.part, AbstractBody)]
-    parts += [twin(example.part) for example in examples if twins and example.constrains]
-    forces = [part for part in parts if isinstance(part, AbstractForce | AbstractNonIdeal)]
-    joints = [part for part in parts if part not in forces]
-    of_all = lambda name: [own for example in examples for own in getattr(example, name)]
-    bodies = of_all("bodies")
-    gravity = mb.Gravity((0.0, -9.81) if bodies[0].dimension == 2 else (0.0, 0.0, -9.81))
-    joints, forces = [*of_all("joints"), *joints], [*of_all("forces"), *forces, gravity]
-    return mb.Scene(bodies, joints=joints, forces=forces).compile()
-
-
-def observers(system, examples):
-    """A row for each example: weights of the coordinates of its own bodies, so that no other part counts."""
-    weights = np.zeros((len(examples), system.nq))
-    for row, example in zip(weights, examples, strict=True):
-        for name, index in system.coordinate_names().items():
-            if name.rpartition(".")[0] in [body.name for body in example.bodies]:
-                row[list(index)] = np.cos(np.asarray(index))
-    return weights
-
-
-@dataclasses.dataclass
-class Motion:
-    """A short motion of examples, compiled: from a share that is added to their parameters to what they show."""
-
-    examples: list
-    options: dict
-
-    def __post_init__(self):
-        system = compiled(self.examples)
-        names = [f"{example.part.name}.{example.parameter}" for example in self.examples]
-        base = [mb.parameters(system)[name] for name in names]
-        size = np.array([max(np.max(np.abs(value)), 0.1) for value in base])
-        weights = jnp.asarray(observers(system, self.examples))
-
-        def seen(shares, rtol, adjoint):
-            values = [value + change for value, change in zip(base, shares * size, strict=True)]
-            changed = mb.with_parameters(system, dict(zip(names, values, strict=True)))
-            state = mb.assemble(changed, throw=False)
-            options = {"saveat": TIMES, "max_steps": 1024, "throw": False, "adjoint": adjoint} | self.options
-            sol = mb.simulate(changed, state, t1=TIMES[-1], rtol=rtol, **options)
-            y = sol.ys
-            broken = jax.vmap(lambda t, q, u: changed.position_residual(t, q))(sol.ts, y.q, y.u)
-            slipping = jax.vmap(changed.velocity_residual)(sol.ts, y.q, y.u)
-            return weights @ y.q[-1], (broken, slipping, sol.energy, y)
-
-        self.system = system
-        tangent = jnp.ones(len(names))
-
-        @jax.jit
-        def forward(shares, rtol):
-            push = lambda shares: seen(shares, rtol, diffrax.ForwardMode())
-            return jax.jvp(push, (shares,), (tangent,), has_aux=True)
-
-        self.forward = forward
-        self.reverse = jax.jit(jax.grad(lambda shares, rtol: jnp.sum(seen(shares, rtol, None)[0])))
-
-    def by_name(self, values, mask):
-        """The examples for which a mask holds, with values of theirs: what fails, by name."""
-        return {e.part.name: v for e, v, wrong in zip(self.examples, values, mask, strict=True) if wrong}
-
-
-@functools.cache
-def motion(key):
-    """That of a group of examples together, or of one alone."""
-    if key in GROUPS:
-        return Motion(GROUPS[key], {})
-    return Motion([EXAMPLES[key][1]], ALONE)
-
-
-def start(own):
-    return jnp.zeros(len(own.examples))
-
-
-def check_motion(own):
-    _, _, (broken, slipping, energy, y) = own.forward(start(own), 1e-6)
-    rows = [name for name, _ in own.system.rows]
-    for residual in (broken, slipping):
-        worst = {name: size for name, size in zip(rows, np.max(np.abs(residual), axis=0), strict=False) if size > 1e-9}
-        assert worst == {}
-    assert np.all(np.isfinite(energy)) and np.all(np.isfinite(y.u))
-
-
-def check_derivatives(own):
-    """Forward, reverse and central differences of a tighter solution."""
-    _, forward, _ = own.forward(start(own), 1e-9)
-    reverse = own.reverse(start(own), 1e-9)
-    # A parameter of no effect would pass the rest.
-    assert own.by_name(forward, np.abs(forward) < 1e-6) == {}
-    pairs = np.stack([forward, reverse], axis=1)
-    assert own.by_name(pairs, np.abs(reverse - forward) > 1e-9 * (1 + np.abs(forward))) == {}
-    h = 1e-3
-    value = lambda s: own.forward(start(own) + s, 1e-12)[0]
-    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
-    pairs = np.stack([forward, difference], axis=1)
-    assert own.by_name(pairs, np.abs(difference - forward) > 1e-6 * (1 + np.abs(forward))) == {}
-
-
-def check_redundancy(examples, options):
-    """With all constraints twice, the rows of each twin imply those of the other, and the motion is the same."""
-    once, twice = compiled(examples), compiled(examples, twins=True)
-    for example in examples:
-        names = {example.part.name, twin(example.part).name}
-        implied = [item for item in twice.implied if item.name in names]
-        assert len(implied) == len([name for name, _ in once.rows if name == example.part.name]), names
-        assert all(set(item.by) >= names - {item.name} for item in implied), names
+@pytest.mark.long
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_a_part_that_stands_twice_moves_as_once(name):
     ends = []
-    for system in (once, twice):
-        end = mb.simulate(system, mb.assemble(system), t1=TIMES[-1], rtol=1e-10, **options).ys
+    for more in ((), (twin(EXAMPLES[name].part),)):
+        system = compiled(EXAMPLES[name], *more)
+        end = mb.simulate(system, mb.assemble(system), t1=T1, rtol=1e-10, **METHOD).ys
         ends.append(np.concatenate([end.q[-1], end.u[-1]]))
     np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-8)
 
 
-def check_equilibrium(examples):
-    system = compiled(examples)
+@pytest.mark.long
+@pytest.mark.parametrize("name", AT_REST)
+def test_equilibrium(name):
+    """Nothing starts to move from it."""
+    system = compiled(EXAMPLES[name])
     state = mb.equilibrium(system)
-    at_rest = jax.jit(lambda q: accelerations(system, Multipliers(), 0.0, q, jnp.zeros(system.nu))[0])(state.q)
-    np.testing.assert_allclose(at_rest, 0.0, atol=1e-8)
-    np.testing.assert_allclose(system.position_residual(0.0, state.q), 0.0, atol=1e-12)
+    still = jnp.zeros(system.nu)
+    udot, broken = jax.jit(
+        lambda q: (accelerations(system, Multipliers(), 0.0, q, still)[0], system.position_residual(0.0, q))
+    )(state.q)
+    np.testing.assert_allclose(udot, 0.0, atol=1e-8)
+    np.testing.assert_allclose(broken, 0.0, atol=1e-12)
 
 
-# All parts of a space in one scene
+# By a Runge–Kutta method with another way to stay on the constraints, or by none, and by the multistep methods.
+METHODS = {
+    "Adams": {"solver": mb.solvers.Adams(), "manifold": mb.manifold.Partition()},
+    "Adams on projection": {
+        "manifold": mb.manifold.Projection(),
+        "stepsize_controller": mb.solvers.MultistepController(rtol=1e-10, atol=1e-12),
+    },
+    "Hermite": {"solver": mb.solvers.Hermite()},
+    "Baumgarte": {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(20.0)},
+    "without constraints": {"manifold": mb.manifold.Unconstrained()},
+}
 
 
-@pytest.mark.parametrize("group", GROUPS)
-def test_motion(group):
-    check_motion(motion(group))
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_derivatives(group):
-    check_derivatives(motion(group))
-
-
-@pytest.mark.parametrize("group", ["planar", "spatial", "functions"])
-def test_redundancy(group):
-    check_redundancy([example for example in GROUPS[group] if example.constrains], {})
-
-
-@pytest.mark.parametrize("group", ["planar", "spatial", "functions"])
-def test_equilibrium(group):
-    check_equilibrium([example for example in GROUPS[group] if example.rests and example.ideal])
-
-
-# Each part alone
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_motion_and_derivatives_alone(name):
-    check_motion(motion(name))
-    check_derivatives(motion(name))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [name for name, (_, example) in EXAMPLES.items() if example.constrains])
-def test_redundancy_alone(name):
-    check_redundancy([EXAMPLES[name][1]], ALONE)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [name for name, (_, e) in EXAMPLES.items() if e.rests and e.ideal])
-def test_equilibrium_alone(name):
-    check_equilibrium([EXAMPLES[name][1]])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_gives_the_same_motion(method):
+    system = compiled(EXAMPLES["planar: Body" if method == "without constraints" else "planar: Revolute"])
+    start = mb.assemble(system)
+    ends = [mb.simulate(system, start, t1=T1, rtol=1e-10, **own).ys for own in (METHOD, METHODS[method])]
+    np.testing.assert_allclose(ends[1].q, ends[0].q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[1].u, ends[0].u, rtol=0, atol=1e-7)
