@@ -180,7 +180,7 @@ def rubbing(build, name, parameter):
 
 
 def rub(poses, velocities, reactions, t, p):
-    return -p["share"] * jnp.sum(reactions[:, :2] ** 2) * velocities * jnp.array([0.0, 0.0, 1.0])
+    return -p["share"] * jnp.sum(reactions[:, :2] ** 2) * velocities * jnp.array([[0.0, 0.0, 1.0]])
 
 
 def program():
