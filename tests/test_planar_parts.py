@@ -1,17 +1,25 @@
 """Identities that every part of a planar scene satisfies."""
 
-import dataclasses
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 import pytest
+from part_checks import (
+    Case,
+    Setup,
+    check_joint_holds,
+    check_joint_rank,
+    check_joint_reaction,
+    check_joint_resolves,
+    check_joint_stacks,
+    check_parameter_derivatives,
+    rank,
+)
 
 from jaxmb import planar
 from jaxmb.linalg.rotations import rotate_2d
+from jaxmb.parts import contact, terrain
 from jaxmb.parts.planar.kinematics import PLANE
 
 POINT_A, POINT_B = (0.1, -0.2), (0.4, 0.3)
@@ -33,24 +41,6 @@ def move(pose, angle, center, shift):
     return jnp.concatenate([center + rotate_2d(angle, pose[:2] - center) + shift, (pose[2] + angle)[None]])
 
 
-def rank(matrix):
-    return np.linalg.matrix_rank(np.asarray(matrix), tol=1e-6)
-
-
-def perturbed(part, direction, s):
-    return jtu.tree_map(lambda x, dx: x + s * dx, part, direction)
-
-
-def check_parameter_derivatives(f, part, rng):
-    """The derivative of `f(part)` along a random direction of all its numbers equals central differences."""
-    direction = jtu.tree_map(lambda x: jnp.asarray(rng.normal(size=x.shape)), part)
-    _, derivative = jax.jvp(f, (part,), (direction,))
-    central = lambda h: (f(perturbed(part, direction, h)) - f(perturbed(part, direction, -h))) / (2 * h)
-    difference = (4 * central(1e-4) - central(2e-4)) / 3
-    scale = 1.0 + float(jnp.max(jnp.abs(difference)))
-    np.testing.assert_allclose(derivative, difference, rtol=0, atol=1e-7 * scale)
-
-
 def net_wrench(poses, wrenches):
     """Resultant force and moment about the world origin."""
     moments = poses[:, 0] * wrenches[:, 1] - poses[:, 1] * wrenches[:, 0] + wrenches[:, 2]
@@ -58,19 +48,6 @@ def net_wrench(poses, wrenches):
 
 
 # Joints
-
-
-@dataclasses.dataclass
-class Case:
-    """A joint that holds at given poses, and the motions of its bodies that it admits.
-
-    `build(poses, point, axis)`; `motion(poses, point, axis, x)` is a function of as many numbers as it leaves free.
-    """
-
-    rows: int
-    build: Callable
-    motion: Callable
-    bodies: int = 2
 
 
 def world(cls):
@@ -151,100 +128,78 @@ CASES = {
 }
 
 
-class Setup:
-    """A joint between bodies at random poses, at which it holds because it is given there."""
-
-    def __init__(self, case):
-        rng = np.random.default_rng(7)
-        self.case, self.rng, self.poses = case, rng, random_poses(rng, case.bodies)
-        frame = (jnp.asarray(rng.normal(size=2)), random_unit(rng))
-        self.part = case.build(self.poses, *frame).resolve(PLANE, self.poses)
-        self.motion = lambda x: case.motion(self.poses, *frame, x)
-        # Gear and rack: all motions; otherwise those of B relative to A.
-        whole = type(self.part) in (planar.Gear, planar.RackAndPinion)
-        self.freedoms = 3 * (case.bodies if whole else 1) - case.rows
-        numbers = {planar.Gear: 10, planar.RackAndPinion: 5}.get(type(self.part), self.freedoms)
-        self.x = jnp.asarray(rng.uniform(0.3, 1.0, size=numbers))
-        # All bodies carried along, several turns.
-        self.moved = jnp.stack([move(q, jnp.array(9.0), jnp.zeros(2), jnp.ones(2)) for q in self.motion(self.x)])
-        self.elsewhere = random_poses(rng, case.bodies)
+def set_up(case):
+    rng = np.random.default_rng(7)
+    poses = random_poses(rng, case.bodies)
+    frame = (jnp.asarray(rng.normal(size=2)), random_unit(rng))
+    part = case.build(poses, *frame).resolve(PLANE, poses)
+    motion = lambda x: case.motion(poses, *frame, x)
+    # Gear and rack: all motions; otherwise those of B relative to A.
+    whole = type(part) in (planar.Gear, planar.RackAndPinion)
+    freedoms = 3 * (case.bodies if whole else 1) - case.rows
+    numbers = {planar.Gear: 10, planar.RackAndPinion: 5}.get(type(part), freedoms)
+    x = jnp.asarray(rng.uniform(0.3, 1.0, size=numbers))
+    # All bodies carried along, several turns.
+    moved = jnp.stack([move(q, jnp.array(9.0), jnp.zeros(2), jnp.ones(2)) for q in motion(x)])
+    return Setup(PLANE, case, rng, poses, part, motion, x, freedoms, moved, random_poses(rng, case.bodies))
 
 
 @pytest.fixture(params=CASES, scope="module")
 def setup(request):
-    return Setup(CASES[request.param])
-
-
-def residual(part, poses):
-    return part.residual(PLANE, poses, 0.0)
+    return set_up(CASES[request.param])
 
 
 def test_joint_holds_along_admissible_motions(setup):
-    part = setup.part
-    assert part.rows == setup.case.rows
-    assert len(part.bodies) == setup.case.bodies
-    assert not part.rheonomic
-    for poses in (setup.poses, setup.moved):
-        assert residual(part, poses).shape == (part.rows,)
-        np.testing.assert_allclose(residual(part, poses), 0.0, atol=1e-13)
-    assert jnp.max(jnp.abs(residual(part, setup.elsewhere))) > 1e-2
+    check_joint_holds(setup)
 
 
 def test_joint_rank_and_freedoms(setup):
-    rows = setup.case.rows
-    jacobian = jax.jacfwd(lambda q: residual(setup.part, q))(setup.moved).reshape(rows, -1)
-    assert rank(jacobian) == rank(jacobian[:, :3]) == rank(jacobian[:, 3:6]) == rows
-    # What the rows leave free is what the motions use, all of it.
-    if setup.freedoms:
-        motions = jax.jacfwd(setup.motion)(setup.x)
-        assert rank(motions.reshape(-1, len(setup.x))) == setup.freedoms
+    check_joint_rank(setup)
 
 
 def test_joint_reaction_has_no_net_wrench(setup):
-    for row in jax.jacfwd(lambda q: residual(setup.part, q))(setup.moved):
-        np.testing.assert_allclose(net_wrench(setup.moved, row), 0.0, atol=1e-12)
+    check_joint_reaction(setup, net_wrench)
 
 
 def test_joint_resolves_to_body_fixed_form(setup):
-    fields = {f.name: getattr(setup.part, f.name) for f in dataclasses.fields(setup.part)}
-    assert all(fields.get(name) is None for name in ("point", "axis"))
-    again = type(setup.part)(**fields).resolve(PLANE, setup.elsewhere)
-    np.testing.assert_allclose(residual(again, setup.moved), residual(setup.part, setup.moved), rtol=0, atol=1e-13)
+    check_joint_resolves(setup)
 
 
 def test_joint_parameter_derivatives(setup):
-    check_parameter_derivatives(lambda part: residual(part, setup.elsewhere), setup.part, setup.rng)
+    check_parameter_derivatives(lambda part: setup.residual(part, setup.elsewhere), setup.part, setup.rng)
 
 
 def test_joint_stacks(setup):
-    other = perturbed(setup.part, jtu.tree_map(jnp.ones_like, setup.part), 0.1)
-    stacked = jtu.tree_map(lambda *x: jnp.stack(x), setup.part, other)
-    batch = jax.jit(jax.vmap(residual))(stacked, jnp.stack([setup.poses, setup.elsewhere]))
-    for k, (part, poses) in enumerate([(setup.part, setup.poses), (other, setup.elsewhere)]):
-        np.testing.assert_allclose(batch[k], residual(part, poses), rtol=0, atol=1e-14)
+    check_joint_stacks(setup)
 
 
 def test_distance_multiplier_is_the_rod_force():
     poses = random_poses(np.random.default_rng(5))
     part = planar.Distance("rod", "a", "b", point_a=POINT_A, point_b=POINT_B).resolve(PLANE, poses)
-    np.testing.assert_allclose(jnp.linalg.norm(jax.jacfwd(lambda q: residual(part, q))(poses)[0, 1, :2]), 1.0)
+    np.testing.assert_allclose(
+        jnp.linalg.norm(jax.jacfwd(lambda q: part.residual(PLANE, q, 0.0))(poses)[0, 1, :2]), 1.0
+    )
 
 
 def test_pinion_on_top_of_a_rack_turns_clockwise_to_the_right():
     poses = jnp.array([[0.0, RADIUS, 0.0], [0.0, 0.0, 0.0]])
     part = planar.RackAndPinion("J", "a", "b", radius=RADIUS).resolve(PLANE, poses)
     rolled = poses.at[0].add(jnp.array([RADIUS * 0.5, 0.0, -0.5]))
-    np.testing.assert_allclose(residual(part, rolled), 0.0, atol=1e-15)
+    np.testing.assert_allclose(part.residual(PLANE, rolled, 0.0), 0.0, atol=1e-15)
 
 
 def test_gears_that_mesh_outside_turn_against_each_other():
     poses = jnp.zeros((3, 3))
     part = planar.Gear("J", "a", "b", ratio=-1.0 / 2.0).resolve(PLANE, poses)
     assert part.bodies == ("a", "b", "ground")
-    np.testing.assert_allclose(residual(part, poses.at[0, 2].set(1.0).at[1, 2].set(-0.5)), 0.0, atol=1e-15)
+    turned = poses.at[0, 2].set(1.0).at[1, 2].set(-0.5)
+    np.testing.assert_allclose(part.residual(PLANE, turned, 0.0), 0.0, atol=1e-15)
 
 
 # Drivers
+
+
+QUANTITIES = ("angle", "x", "y", "distance")
 
 
 def driver(quantity, **kwargs):
@@ -252,7 +207,7 @@ def driver(quantity, **kwargs):
     return planar.Driver("drive", "a", "b", quantity=quantity, motion=motion, parameters={"speed": 3.0}, **kwargs)
 
 
-@pytest.mark.parametrize("quantity", ["angle", "x", "y", "distance"])
+@pytest.mark.parametrize("quantity", QUANTITIES)
 def test_driver(quantity):
     rng = np.random.default_rng(2)
     poses = random_poses(rng)
@@ -277,9 +232,20 @@ def test_driver(quantity):
 # Rolling
 
 
+ROLLING = {"KnifeEdge": planar.KnifeEdge("blade", "a", point=(0.2, 0.0))}
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_rolling_parameter_derivatives(name):
+    rng = np.random.default_rng(3)
+    poses, velocities = random_poses(rng, 1), random_poses(rng, 1)
+    rows = lambda part: part.residual(PLANE, poses, velocities, 0.0)
+    check_parameter_derivatives(rows, ROLLING[name].resolve(PLANE, poses), rng)
+
+
 def test_knife_edge():
     pose = jnp.array([[0.3, 0.4, 0.7]])
-    blade = planar.KnifeEdge("blade", "a", point=(0.2, 0.0)).resolve(PLANE, pose)
+    blade = ROLLING["KnifeEdge"].resolve(PLANE, pose)
     rows = lambda u: blade.residual(PLANE, pose, jnp.asarray(u)[None], 0.0)
     c, s = np.cos(0.7), np.sin(0.7)
     np.testing.assert_allclose(rows([c, s, 0.0]), [0.0], rtol=0, atol=1e-15)
@@ -329,6 +295,27 @@ def pairs():
     }
 
 
+def forces():
+    """Every force; those between two bodies are `pairs`."""
+    points = {"point_a": POINT_A, "point_b": POINT_B}
+    path = [("a", (1.0, 0.2)), ("b", (-0.6, 0.3)), ("a", (0.1, -0.9))]
+    return pairs() | {
+        "Damper": planar.Damper("F", "a", "b", damping=2.0, **points),
+        "PointForce": planar.PointForce("F", "b", force=(1.0, 2.0), point=POINT_A),
+        "body PointForce": planar.PointForce("F", "b", force=(1.0, 2.0), point=POINT_A, frame="body"),
+        "Track": planar.Track("F", path, pretension=2.0, stiffness=30.0, free_length=1.0),
+        "Contact": planar.Contact(
+            "F",
+            ("a", "b"),
+            terrain=terrain.Slope(0.2),
+            normal=contact.Linear(30.0),
+            friction=contact.Coulomb(0.4, transition_speed=0.5),
+            radius=2.0,
+            damping=0.5,
+        ),
+    }
+
+
 def force_state():
     rng = np.random.default_rng(9)
     return random_poses(rng), random_poses(rng), random_poses(rng)
@@ -358,10 +345,11 @@ def test_action_equals_reaction(name):
     np.testing.assert_allclose(net_wrench(poses, wrenches), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", pairs())
+@pytest.mark.parametrize("name", forces())
 def test_force_parameter_derivatives(name):
-    given, poses, velocities = force_state()
-    part = pairs()[name].resolve(PLANE, given)
+    part = forces()[name]
+    given, poses, velocities = (x[: len(part.bodies)] for x in force_state())
+    part = part.resolve(PLANE, given)
     wrenches = eqx.filter_jit(lambda part: jnp.ravel(part.wrenches(PLANE, poses, velocities, 0.0)))
     check_parameter_derivatives(wrenches, part, np.random.default_rng(0))
 
@@ -410,15 +398,22 @@ def test_springs_rest_at_the_given_poses():
 # Bodies
 
 
-def test_body_state():
-    body = planar.Body("a", mass=2, inertia=1, position=(1, 2), angle=0.5, velocity=(4, 5), angular_velocity=7)
+BODIES = {
+    "Body": (
+        planar.Body("a", mass=2, inertia=1, position=(1, 2), angle=0.5, velocity=(4, 5), angular_velocity=7),
+        ([1, 2, 0.5], [4, 5, 7]),
+    ),
+    "PointMass": (planar.PointMass("m", mass=1.0, position=(1, 2), velocity=(4, 5)), ([1, 2], [4, 5])),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_body_state(name):
+    body, (pose, velocities) = BODIES[name]
     body.check()
-    np.testing.assert_array_equal(body.pose(), [1, 2, 0.5])
-    np.testing.assert_array_equal(body.velocities(), [4, 5, 7])
-    mass = planar.PointMass("m", mass=1.0, position=(1, 2), velocity=(4, 5))
-    mass.check()
-    np.testing.assert_array_equal(mass.pose(), [1, 2])
-    np.testing.assert_array_equal(mass.velocities(), [4, 5])
+    np.testing.assert_array_equal(body.pose(), pose)
+    np.testing.assert_array_equal(body.velocities(), velocities)
+    assert (body.dimension, body.rotates) == (2, len(pose) == 3)
 
 
 def test_inertias_against_sums_over_points():

@@ -1,17 +1,26 @@
 """Identities that every part of a spatial scene satisfies."""
 
-import dataclasses
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
+import part_checks
 import pytest
+from part_checks import (
+    Case,
+    Setup,
+    check_joint_holds,
+    check_joint_rank,
+    check_joint_reaction,
+    check_joint_resolves,
+    check_joint_stacks,
+    check_parameter_derivatives,
+    rank,
+)
 
 from jaxmb import spatial
 from jaxmb.linalg import rotations as rot
+from jaxmb.parts import AbstractCompound, AbstractVelocityConstraint, contact, terrain
 from jaxmb.parts.spatial.kinematics import SPACE
 
 POINT_A, POINT_B = (0.1, -0.2, 0.3), (0.4, 0.1, -0.2)
@@ -56,62 +65,35 @@ def move(pose, p, center, shift):
 
 
 def pose_rates(poses, velocities):
-    return jnp.stack([SPACE.rates(pose, velocity) for pose, velocity in zip(poses, velocities, strict=True)])
+    return part_checks.pose_rates(SPACE, poses, velocities)
 
 
 def velocity_jacobian(f, poses):
-    """Derivative of `d/dt f(poses)` with respect to the velocities of all bodies."""
-    columns = np.eye(6 * len(poses)).reshape(-1, len(poses), 6)
-    return np.stack([jax.jvp(f, (poses,), (pose_rates(poses, u),))[1] for u in columns], axis=1)
-
-
-def rank(matrix):
-    return np.linalg.matrix_rank(np.asarray(matrix), tol=1e-6)
-
-
-def perturbed(part, direction, s):
-    return jtu.tree_map(lambda x, dx: x + s * dx, part, direction)
-
-
-def check_parameter_derivatives(f, part, rng):
-    """The derivative of `f(part)` along a random direction of all its numbers equals central differences."""
-    direction = jtu.tree_map(lambda x: jnp.asarray(rng.normal(size=x.shape)), part)
-    _, derivative = jax.jvp(f, (part,), (direction,))
-    central = lambda h: (f(perturbed(part, direction, h)) - f(perturbed(part, direction, -h))) / (2 * h)
-    difference = (4 * central(1e-4) - central(2e-4)) / 3
-    scale = 1.0 + float(jnp.max(jnp.abs(difference)))
-    np.testing.assert_allclose(derivative, difference, rtol=0, atol=1e-7 * scale)
+    return part_checks.velocity_jacobian(SPACE, f, poses)
 
 
 # Joints
 
 
-@dataclasses.dataclass
-class Case:
-    """A joint in its world form, and every motion of B that it admits, a function of as many numbers as it leaves free.
-
-    `build(point, axis, second)` and `motion(poses, point, axis, second, x)`; `second` is perpendicular to `axis`.
-    """
-
-    rows: int
-    build: Callable
-    motion: Callable
-
-
 def world(cls, **kwargs):
-    return lambda point, axis, second: cls("J", "a", "b", point=point, axis=axis, **kwargs)
+    return lambda q, point, axis, second: cls("J", "a", "b", point=point, axis=axis, **kwargs)
 
 
 def ball(cls):
-    return lambda point, axis, second: cls("J", "a", "b", point=point)
+    return lambda q, point, axis, second: cls("J", "a", "b", point=point)
 
 
-def cardan(point, axis, second):
+def cardan(q, point, axis, second):
     return spatial.Universal("J", "a", "b", point=point, axis_a_W=axis, axis_b_W=second)
 
 
-def link(point, axis, second):
+def link(q, point, axis, second):
     return spatial.Distance("J", "a", "b", point_a=POINT_A, point_b=POINT_B)
+
+
+def of_b(motion):
+    """The poses of both bodies from a motion of B."""
+    return lambda q, point, axis, second, x: q.at[1].set(motion(q, point, axis, second, x))
 
 
 def on_link(poses, point, axis, second, x):
@@ -134,106 +116,81 @@ def in_plane(axis, x):
 
 
 CASES = {
-    "Spherical": Case(3, ball(spatial.Spherical), lambda q, point, a, b, x: move(q[1], turn_3(x), point, STILL)),
-    "Revolute": Case(5, world(spatial.Revolute), lambda q, point, a, b, x: move(q[1], turn(a, x[0]), point, STILL)),
+    "Spherical": Case(3, ball(spatial.Spherical), of_b(lambda q, point, a, b, x: move(q[1], turn_3(x), point, STILL))),
+    "Revolute": Case(
+        5, world(spatial.Revolute), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[0]), point, STILL))
+    ),
     "Universal": Case(
         4,
         cardan,
-        lambda q, point, a, b, x: move(q[1], rot.multiply(turn(a, x[0]), turn(b, x[1])), point, STILL),
+        of_b(lambda q, point, a, b, x: move(q[1], rot.multiply(turn(a, x[0]), turn(b, x[1])), point, STILL)),
     ),
     "Cylindrical": Case(
-        4, world(spatial.Cylindrical), lambda q, point, a, b, x: move(q[1], turn(a, x[0]), point, x[1] * a)
+        4, world(spatial.Cylindrical), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[0]), point, x[1] * a))
     ),
-    "Screw": Case(5, world(spatial.Screw, pitch=PITCH), on_thread),
-    "Prismatic": Case(5, world(spatial.Prismatic), lambda q, point, a, b, x: move(q[1], NO_TURN, point, x[0] * a)),
+    "Screw": Case(5, world(spatial.Screw, pitch=PITCH), of_b(on_thread)),
+    "Prismatic": Case(
+        5, world(spatial.Prismatic), of_b(lambda q, point, a, b, x: move(q[1], NO_TURN, point, x[0] * a))
+    ),
     "Planar": Case(
-        3, world(spatial.Planar), lambda q, point, a, b, x: move(q[1], turn(a, x[2]), point, in_plane(a, x))
+        3, world(spatial.Planar), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[2]), point, in_plane(a, x)))
     ),
-    "Fixed": Case(6, ball(spatial.Fixed), lambda q, point, a, b, x: q[1]),
-    "Distance": Case(1, link, on_link),
+    "Fixed": Case(6, ball(spatial.Fixed), of_b(lambda q, point, a, b, x: q[1])),
+    "Distance": Case(1, link, of_b(on_link)),
     "PointOnPlane": Case(
-        1, world(spatial.PointOnPlane), lambda q, point, a, b, x: move(q[1], turn_3(x[2:]), point, in_plane(a, x))
+        1, world(spatial.PointOnPlane), of_b(lambda q, point, a, b, x: move(q[1], turn_3(x[2:]), point, in_plane(a, x)))
     ),
     "PointOnLine": Case(
-        2, world(spatial.PointOnLine), lambda q, point, a, b, x: move(q[1], turn_3(x[1:]), point, x[0] * a)
+        2, world(spatial.PointOnLine), of_b(lambda q, point, a, b, x: move(q[1], turn_3(x[1:]), point, x[0] * a))
     ),
 }
 
 
-class Setup:
-    """A joint between bodies at random poses, at which it holds because it is given in the world there."""
-
-    def __init__(self, case):
-        rng = np.random.default_rng(7)
-        self.case, self.rng, self.poses = case, rng, random_poses(rng)
-        point, axis = jnp.asarray(rng.normal(size=3)), random_unit(rng)
-        frame = (point, axis, across(axis, rng.normal(size=3))[0])
-        self.part = case.build(*frame).resolve(SPACE, self.poses)
-        self.body_b = lambda x: case.motion(self.poses, *frame, x)
-        self.x = jnp.asarray(rng.uniform(0.3, 1.0, size=6 - case.rows))
-        # Both bodies carried along, and the other sign of B's Euler parameters: the same attitude.
-        p, shift = turn_3(jnp.asarray(rng.normal(size=3))), jnp.asarray(rng.normal(size=3))
-        moved = jnp.stack([self.poses[0], self.body_b(self.x)])
-        self.moved = jnp.stack([move(pose, p, STILL, shift) for pose in moved]).at[1, 3:].multiply(-1.0)
-        self.elsewhere = random_poses(rng)
-        self.residual = lambda part, poses: part.residual(SPACE, poses, 0.0)
+def set_up(case):
+    rng = np.random.default_rng(7)
+    poses = random_poses(rng)
+    point, axis = jnp.asarray(rng.normal(size=3)), random_unit(rng)
+    frame = (point, axis, across(axis, rng.normal(size=3))[0])
+    part = case.build(poses, *frame).resolve(SPACE, poses)
+    motion = lambda x: case.motion(poses, *frame, x)
+    x = jnp.asarray(rng.uniform(0.3, 1.0, size=6 - case.rows))
+    # Both bodies carried along, and the other sign of B's Euler parameters: the same attitude.
+    p, shift = turn_3(jnp.asarray(rng.normal(size=3))), jnp.asarray(rng.normal(size=3))
+    moved = jnp.stack([move(pose, p, STILL, shift) for pose in motion(x)]).at[1, 3:].multiply(-1.0)
+    return Setup(SPACE, case, rng, poses, part, motion, x, 6 - case.rows, moved, random_poses(rng))
 
 
 @pytest.fixture(params=CASES, scope="module")
 def setup(request):
-    return Setup(CASES[request.param])
+    return set_up(CASES[request.param])
 
 
 def test_joint_holds_along_admissible_motions(setup):
-    assert setup.part.rows == setup.case.rows
-    assert not setup.part.rheonomic
-    for poses in (setup.poses, setup.moved):
-        residual = setup.residual(setup.part, poses)
-        assert residual.shape == (setup.case.rows,)
-        assert jnp.max(jnp.abs(residual)) < 1e-13
-    assert jnp.max(jnp.abs(setup.residual(setup.part, setup.elsewhere))) > 1e-2
+    check_joint_holds(setup)
 
 
 def test_joint_rank_and_freedoms(setup):
-    rows = setup.case.rows
-    jacobian = velocity_jacobian(lambda q: setup.part.residual(SPACE, q, 0.0), setup.moved)
-    assert jacobian.shape == (rows, 12)
-    # Either body alone bears every row, so that the other may be the ground.
-    assert rank(jacobian) == rank(jacobian[:, :6]) == rank(jacobian[:, 6:]) == rows
-    # What the rows leave free is what the motions use, all of it: 6 - rows directions.
-    assert rank(jax.jit(jax.jacfwd(setup.body_b))(setup.x)) == 6 - rows
+    check_joint_rank(setup)
 
 
 def test_joint_reaction_has_no_net_wrench(setup):
-    jacobian = velocity_jacobian(lambda q: setup.part.residual(SPACE, q, 0.0), setup.moved)
-    for row in jacobian.reshape(-1, 2, 6):
-        np.testing.assert_allclose(net_wrench(setup.moved, row), 0.0, atol=1e-12)
+    check_joint_reaction(setup, net_wrench)
 
 
 def test_joint_resolves_to_body_fixed_form(setup):
-    """Given again with the body-fixed numbers of the resolved part, at other poses, it is the same joint."""
-    fields = {f.name: getattr(setup.part, f.name) for f in dataclasses.fields(setup.part)}
-    assert all(fields.get(name) is None for name in ("point", "axis", "axis_a_W", "axis_b_W"))
-    again = type(setup.part)(**fields).resolve(SPACE, setup.elsewhere)
-    np.testing.assert_allclose(
-        setup.residual(again, setup.moved), setup.residual(setup.part, setup.moved), rtol=0, atol=1e-13
-    )
-    if "point_a" in fields and type(setup.part) is not spatial.Distance:
-        A, B = SPACE.point(setup.poses[0], setup.part.point_a), SPACE.point(setup.poses[1], setup.part.point_b)
+    check_joint_resolves(setup)
+    part, poses = setup.part, setup.poses
+    if hasattr(part, "point_a") and type(part) is not spatial.Distance:
+        A, B = SPACE.point(poses[0], part.point_a), SPACE.point(poses[1], part.point_b)
         np.testing.assert_allclose(A, B, rtol=0, atol=1e-13)
 
 
 def test_joint_parameter_derivatives(setup):
-    check_parameter_derivatives(lambda part: part.residual(SPACE, setup.elsewhere, 0.0), setup.part, setup.rng)
+    check_parameter_derivatives(lambda part: setup.residual(part, setup.elsewhere), setup.part, setup.rng)
 
 
 def test_joint_stacks(setup):
-    other = perturbed(setup.part, jtu.tree_map(jnp.ones_like, setup.part), 0.1)
-    stacked = jtu.tree_map(lambda *x: jnp.stack(x), setup.part, other)
-    poses = jnp.stack([setup.poses, setup.elsewhere])
-    batch = jax.jit(jax.vmap(lambda part, q: part.residual(SPACE, q, 0.0)))(stacked, poses)
-    for k, part in enumerate((setup.part, other)):
-        np.testing.assert_allclose(batch[k], setup.residual(part, poses[k]), rtol=0, atol=1e-14)
+    check_joint_stacks(setup)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, -0.8)])
@@ -294,6 +251,10 @@ def test_distance_multiplier_is_the_rod_force():
 # Drivers
 
 
+LENGTHS = ("x", "y", "z", "distance")
+QUANTITIES = ("angle", *LENGTHS)
+
+
 def driver(quantity, motion, **kwargs):
     return spatial.Driver("drive", "a", "b", quantity=quantity, motion=motion, parameters={"speed": 3.0}, **kwargs)
 
@@ -316,7 +277,7 @@ def test_angle_driver_passes_many_turns():
         np.testing.assert_allclose(jacobian[0, 9:], rot.unrotate(turned[1, 3:], axis), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("quantity", ["x", "y", "z", "distance"])
+@pytest.mark.parametrize("quantity", LENGTHS)
 def test_length_driver(quantity):
     poses = random_poses(np.random.default_rng(2))
     part = driver(quantity, lambda t, p: p["speed"] * t, point_a=POINT_A, point_b=POINT_B).resolve(SPACE, poses)
@@ -329,6 +290,28 @@ def test_length_driver(quantity):
 
 
 # Rolling
+
+
+ROLLING = {
+    "KnifeEdge": spatial.KnifeEdge("blade", "a", point=(0.2, 0.0, 0.0)),
+    "RollingDisk": spatial.RollingDisk("wheel", "a", radius=0.5, center=(0.1, -0.2, 0.05)),
+    "RollingSphere": spatial.RollingSphere("ball", "a", radius=0.2, spin=2.5),
+}
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_rolling_parameter_derivatives(name):
+    rng = np.random.default_rng(3)
+    poses, velocities = random_pose(rng)[None], jnp.asarray(rng.normal(size=(1, 6)))
+
+    def rows(part):
+        if isinstance(part, AbstractCompound):
+            return jnp.concatenate([rows(component) for component in part.components()])
+        if isinstance(part, AbstractVelocityConstraint):
+            return part.residual(SPACE, poses, velocities, 0.0)
+        return part.residual(SPACE, poses, 0.0)
+
+    check_parameter_derivatives(eqx.filter_jit(rows), ROLLING[name].resolve(SPACE, poses), rng)
 
 
 def plane_frame(rng):
@@ -411,7 +394,7 @@ def test_rolling_sphere(spin):
 
 def test_knife_edge():
     pose = jnp.array([0.3, 0.4, 0.5, *turn(jnp.array([0.0, 0.0, 1.0]), jnp.array(0.7))])[None]
-    blade = spatial.KnifeEdge("blade", "a", point=(0.2, 0.0, 0.0)).resolve(SPACE, pose)
+    blade = ROLLING["KnifeEdge"].resolve(SPACE, pose)
     rows = lambda u: blade.residual(SPACE, pose, jnp.asarray(u)[None], 0.0)
     heading = np.array([np.cos(0.7), np.sin(0.7), 0.0])
     np.testing.assert_allclose(rows([*heading, 0.0, 0.0, 0.0]), [0.0], rtol=0, atol=1e-15)
@@ -452,6 +435,24 @@ def pairs():
     }
 
 
+def forces():
+    """Every force; those between two bodies are `pairs`."""
+    return pairs() | {
+        "Damper": spatial.Damper("F", "a", "b", damping=2.0, point_a=POINT_A, point_b=POINT_B),
+        "PointForce": spatial.PointForce("F", "b", force=(1.0, 2.0, 3.0), point=POINT_A),
+        "body PointForce": spatial.PointForce("F", "b", force=(1.0, 2.0, 3.0), point=POINT_A, frame="body"),
+        "Contact": spatial.Contact(
+            "F",
+            ("a", "b"),
+            terrain=terrain.Slope(0.2),
+            normal=contact.Linear(30.0),
+            friction=contact.Coulomb(0.4, transition_speed=0.5),
+            radius=2.0,
+            damping=0.5,
+        ),
+    }
+
+
 def net_wrench(poses, wrenches):
     """Resultant force and moment about the world origin."""
     moments = [np.cross(q[:3], w[:3]) + rot.rotate(q[3:], w[3:]) for q, w in zip(poses, wrenches, strict=True)]
@@ -487,10 +488,11 @@ def test_action_equals_reaction(name):
     np.testing.assert_allclose(net_wrench(poses, wrenches), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", pairs())
+@pytest.mark.parametrize("name", forces())
 def test_force_parameter_derivatives(name):
-    given, poses, velocities = force_state()
-    part = pairs()[name].resolve(SPACE, given)
+    part = forces()[name]
+    given, poses, velocities = (x[: len(part.bodies)] for x in force_state())
+    part = part.resolve(SPACE, given)
     wrenches = eqx.filter_jit(lambda part: jnp.ravel(part.wrenches(SPACE, poses, velocities, 0.0)))
     check_parameter_derivatives(wrenches, part, np.random.default_rng(0))
 
@@ -580,26 +582,34 @@ def test_bushing_law():
 # Bodies
 
 
-def test_body_state():
-    body = spatial.Body(
-        "a",
-        mass=2,
-        inertia=(1, 2, 2.5),
-        position=(1, 2, 3),
-        orientation=(0, 1, 0, 0),
-        velocity=(4, 5, 6),
-        angular_velocity=(7, 8, 9),
-    )
+BODIES = {
+    "Body": (
+        spatial.Body(
+            "a",
+            mass=2,
+            inertia=(1, 2, 2.5),
+            position=(1, 2, 3),
+            orientation=(0, 1, 0, 0),
+            velocity=(4, 5, 6),
+            angular_velocity=(7, 8, 9),
+        ),
+        ([1, 2, 3, 0, 1, 0, 0], [4, 5, 6, 7, 8, 9]),
+    ),
+    "PointMass": (spatial.PointMass("m", mass=1.0, position=(1, 2, 3), velocity=(4, 5, 6)), ([1, 2, 3], [4, 5, 6])),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_body_state(name):
+    body, (pose, velocities) = BODIES[name]
     body.check()
-    np.testing.assert_array_equal(body.pose(), [1, 2, 3, 0, 1, 0, 0])
-    np.testing.assert_array_equal(body.velocities(), [4, 5, 6, 7, 8, 9])
-    np.testing.assert_array_equal(body.inertia, np.diag([1, 2, 2.5]))
-    assert (body.dimension, body.rotates) == (3, True)
-    mass = spatial.PointMass("m", mass=1.0, position=(1, 2, 3), velocity=(4, 5, 6))
-    mass.check()
-    np.testing.assert_array_equal(mass.pose(), [1, 2, 3])
-    np.testing.assert_array_equal(mass.velocities(), [4, 5, 6])
-    assert (mass.dimension, mass.rotates) == (3, False)
+    np.testing.assert_array_equal(body.pose(), pose)
+    np.testing.assert_array_equal(body.velocities(), velocities)
+    assert (body.dimension, body.rotates) == (3, len(pose) == 7)
+
+
+def test_principal_moments_are_a_diagonal_inertia():
+    np.testing.assert_array_equal(BODIES["Body"][0].inertia, np.diag([1, 2, 2.5]))
 
 
 def of_points(points, mass):

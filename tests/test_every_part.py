@@ -1,0 +1,442 @@
+"""Every part in a scene: it compiles, moves on its constraints, has derivatives, finds its equilibrium, and is known
+when it stands twice. Every method of integration gives the same motion.
+
+Each stands in a small scene of its own, where gravity and a spring move it.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.parts import (
+    AbstractCompound,
+    AbstractConstraint,
+    AbstractForce,
+    AbstractNonIdeal,
+    AbstractVelocityConstraint,
+    contact,
+    terrain,
+)
+
+CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
+
+
+@dataclasses.dataclass
+class Example:
+    """A part with the bodies that it acts on, and with other parts that hold these.
+
+    `parameter` is the name of what derivatives are taken with respect to, without that of the part. `rests`: whether
+    the scene has a static equilibrium. `ideal`: whether its constraints bind positions or velocities and obey
+    d'Alembert's principle.
+    """
+
+    part: Any
+    bodies: list
+    parameter: str
+    joints: tuple = ()
+    forces: tuple = ()
+    rests: bool = True
+    ideal: bool = True
+
+
+# Plane
+
+
+def body_2d(name, **state):
+    return planar.Body(name, mass=1.5, inertia=0.2, **({"position": (0.5, 0.1), "angle": 0.2} | state))
+
+
+def hold_2d(body):
+    """A spring by which a body hangs: it starts to move, and it has a place to rest."""
+    place = {"point_a": (0.7, 0.9), "point_b": (0.2, 0.1)} if isinstance(body, planar.Body) else {"point_a": (0.7, 0.9)}
+    return planar.SpringDamper(f"{body.name} spring", "ground", body.name, stiffness=40.0, free_length=0.2, **place)
+
+
+def of_ground_2d(cls, parameter, *, name=None, joints=(), body=body_2d, rests=True, **options):
+    """A part between the ground and a body."""
+    name = cls.__name__ if name is None else name
+    own = body(f"{name} body")
+    part = cls(name, "ground", own.name, **options)
+    return Example(part, [own], parameter, tuple(joint(own) for joint in joints), (hold_2d(own),), rests)
+
+
+def on_body_2d(cls, parameter, *, name=None, rests=True, **options):
+    name = cls.__name__ if name is None else name
+    own = body_2d(f"{name} body", velocity=(0.5, 0.2), angular_velocity=1.0)
+    return Example(cls(name, own.name, **options), [own], parameter, (), (hold_2d(own),), rests)
+
+
+def pin_2d(body, point=(0.0, 0.0)):
+    return planar.Revolute(f"{body.name} pin", "ground", body.name, point=point)
+
+
+def gears():
+    bodies = [body_2d("small", position=(0.0, 0.0)), body_2d("large", position=(0.8, 0.0))]
+    pins = pin_2d(bodies[0], (0.0, 0.0)), pin_2d(bodies[1], (0.8, 0.0))
+    return Example(planar.Gear("Gear", "small", "large", ratio=-0.5), bodies, "ratio", pins, (hold_2d(bodies[1]),))
+
+
+def rack():
+    bodies = [body_2d("pinion", position=(0.0, 0.3), angle=0.0), body_2d("rack", position=(0.0, 0.0), angle=0.0)]
+    rail = planar.Prismatic("rail", "ground", "rack", point=(0.0, 0.0), axis=(1.0, 0.0))
+    part = planar.RackAndPinion("RackAndPinion", "pinion", "rack", radius=0.3)
+    return Example(part, bodies, "radius", (pin_2d(bodies[0], (0.0, 0.3)), rail), (hold_2d(bodies[1]),))
+
+
+def track():
+    own = body_2d("Track body")
+    path = [("ground", (0.0, 0.9)), (own.name, (0.1, -0.1)), ("ground", (1.0, 0.8))]
+    return Example(planar.Track("Track", path, pretension=3.0, stiffness=20.0), [own], "stiffness", (), (hold_2d(own),))
+
+
+def turn(t, p):
+    """From rest, so that there is an equilibrium at the start."""
+    return p["start"] + p["rate"] * t**2
+
+
+def circle(point, p):
+    return jnp.dot(point, point) - p["radius"] ** 2
+
+
+GROUND_2D = {
+    "terrain": terrain.Slope(0.1, level=-0.1),
+    "normal": contact.Linear(500.0),
+    "friction": contact.Coulomb(0.3, transition_speed=0.5),
+    "radius": 0.25,
+    "damping": 5.0,
+    "smoothing": 0.02,
+}
+POINT_MASS_2D = planar.PointMass("PointMass", mass=1.2, position=(0.4, 0.2))
+BODY_2D = body_2d("Body", velocity=(1.0, 0.0))
+
+PLANAR = [
+    Example(BODY_2D, [BODY_2D], "inertia", (), (hold_2d(BODY_2D),)),
+    Example(POINT_MASS_2D, [POINT_MASS_2D], "mass", (), (hold_2d(POINT_MASS_2D),)),
+    of_ground_2d(planar.Revolute, "point_b", point=(0.0, 0.0)),
+    of_ground_2d(planar.Fixed, "angle", point=(0.0, 0.0)),
+    of_ground_2d(planar.PointOnLine, "point_b", point=(0.2, 0.0), axis=(0.8, 0.6)),
+    of_ground_2d(planar.Prismatic, "angle", point=(0.2, 0.0), axis=(0.8, 0.6)),
+    of_ground_2d(planar.Distance, "length", point_b=(0.1, 0.0)),
+    of_ground_2d(planar.PointOnCurve, "radius", curve=circle, parameters={"radius": 0.5}),
+    gears(),
+    rack(),
+    of_ground_2d(
+        planar.Driver,
+        "rate",
+        quantity="angle",
+        motion=turn,
+        parameters={"start": 0.2, "rate": 5.0},
+        joints=(pin_2d,),
+    ),
+    of_ground_2d(
+        planar.Driver,
+        "rate",
+        name="Driver of a distance",
+        quantity="distance",
+        motion=turn,
+        parameters={"start": 0.5, "rate": 5.0},
+    ),
+    on_body_2d(planar.KnifeEdge, "point", point=(0.2, 0.0)),
+    of_ground_2d(planar.SpringDamper, "stiffness", stiffness=30.0, damping=0.5, free_length=0.1, point_b=(0.1, 0.2)),
+    of_ground_2d(planar.Damper, "damping", damping=3.0, point_b=(0.1, 0.2)),
+    on_body_2d(planar.PointForce, "force", force=(2.0, 1.0), point=(0.1, 0.2)),
+    on_body_2d(planar.Torque, "torque", torque=0.5),
+    of_ground_2d(planar.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, free_angle=0.8),
+    of_ground_2d(planar.BumpStop, "stiffness", stiffness=300.0, lower=-0.1, upper=0.1),
+    of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
+    of_ground_2d(
+        planar.DraftGear,
+        "preload",
+        stiffness=300.0,
+        preload=5.0,
+        travel=0.2,
+        stop_stiffness=500.0,
+        transition=0.5,
+        smoothing=0.05,
+        free_length=0.3,
+    ),
+    track(),
+    on_body_2d(planar.Contact, "normal.stiffness", **GROUND_2D),
+]
+
+
+# Functions, and laws of joints
+
+
+def rubbing(build, name, parameter):
+    """A pendulum whose pin rubs, swinging already, so that the direction of its slip is certain."""
+    own = body_2d(f"{name} body", angular_velocity=3.0)
+    pin = pin_2d(own)
+    return Example(build(name, pin.name), [own], parameter, (pin,), (hold_2d(own),), ideal=False)
+
+
+def rub(poses, velocities, reactions, t, p):
+    return -p["share"] * jnp.sum(reactions[:, :2] ** 2) * velocities * jnp.array([[0.0, 0.0, 1.0]])
+
+
+def program():
+    own = body_2d("Servo body")
+    drive = planar.Driver(
+        "Servo", "ground", own.name, quantity="angle", motion=turn, parameters={"start": 0.0, "rate": 2.0}
+    )
+    servo = mb.Servo(drive, damping=4.0, stiffness=9.0)
+    return Example(servo, [own], "stiffness", (pin_2d(own),), (hold_2d(own),), ideal=False)
+
+
+def on_parabola(poses, t, p):
+    return (poses[0, 1] - p["curvature"] * poses[0, 0] ** 2)[None]
+
+
+def skate(poses, velocities, t, p):
+    angle = poses[0, 2] + p["angle"]
+    return (velocities[0, 1] * jnp.cos(angle) - velocities[0, 0] * jnp.sin(angle))[None]
+
+
+def drag(poses, velocities, t, p):
+    return -p["drag"] * jnp.sum(velocities**2) * velocities
+
+
+FUNCTIONS = [
+    on_body_2d(mb.Constraint, "curvature", function=on_parabola, parameters={"curvature": 0.4}, rheonomic=False),
+    on_body_2d(mb.VelocityConstraint, "angle", function=skate, parameters={"angle": 0.1}, homogeneous=True),
+    on_body_2d(mb.Force, "drag", function=drag, parameters={"drag": 0.2}),
+    rubbing(lambda n, pin: mb.NonIdeal(n, pin, function=rub, parameters={"share": 1e-3}), "NonIdeal", "share"),
+    rubbing(
+        lambda n, pin: planar.Friction(n, pin, coefficient=0.3, radius=0.1, smoothing=0.05), "Friction", "coefficient"
+    ),
+    program(),
+]
+
+
+# Space
+
+AXIS = (0.6, 0.0, 0.8)
+
+
+def body_3d(name, **state):
+    return spatial.Body(name, mass=1.5, inertia=(0.2, 0.25, 0.3), **({"position": (0.5, 0.1, 0.2)} | state))
+
+
+def hold_3d(body):
+    place = {"point_b": (0.2, 0.1, 0.05)} if isinstance(body, spatial.Body) else {}
+    return spatial.SpringDamper(
+        f"{body.name} spring",
+        "ground",
+        body.name,
+        stiffness=40.0,
+        free_length=0.2,
+        point_a=(0.7, 0.3, 1.1),
+        **place,
+    )
+
+
+def of_ground_3d(cls, parameter, *, joints=(), rests=True, **options):
+    own = body_3d(f"{cls.__name__} body")
+    part = cls(cls.__name__, "ground", own.name, **options)
+    return Example(part, [own], parameter, tuple(joint(own) for joint in joints), (hold_3d(own),), rests)
+
+
+def on_body_3d(cls, parameter, *, rests=True, position=(0.5, 0.1, 0.2), **options):
+    moving = {"velocity": (0.5, 0.2, 0.0), "angular_velocity": (0.3, 1.0, 0.5), "position": position}
+    own = body_3d(f"{cls.__name__} body", **moving)
+    return Example(cls(cls.__name__, own.name, **options), [own], parameter, (), (hold_3d(own),), rests)
+
+
+def pin_3d(body):
+    return spatial.Revolute(f"{body.name} pin", "ground", body.name, point=(0.0, 0.0, 0.0), axis=AXIS)
+
+
+def rubbing_3d():
+    own = body_3d("Friction body", angular_velocity=(1.8, 0.0, 2.4))
+    pin = pin_3d(own)
+    part = spatial.Friction("Friction", pin.name, coefficient=0.3, radius=0.1, smoothing=0.05)
+    return Example(part, [own], "coefficient", (pin,), (hold_3d(own),), ideal=False)
+
+
+O = (0.0, 0.0, 0.0)
+POINT_MASS_3D = spatial.PointMass("PointMass", mass=1.2, position=(0.4, 0.2, 0.1))
+BODY_3D = body_3d("Body", angular_velocity=(1.0, 2.0, 0.5))
+
+SPATIAL = [
+    Example(BODY_3D, [BODY_3D], "inertia", (), (hold_3d(BODY_3D),)),
+    Example(POINT_MASS_3D, [POINT_MASS_3D], "mass", (), (hold_3d(POINT_MASS_3D),)),
+    of_ground_3d(spatial.Spherical, "point_b", point=O),
+    of_ground_3d(spatial.Revolute, "point_b", point=O, axis=AXIS),
+    of_ground_3d(spatial.Universal, "point_b", point=O, axis_a_W=AXIS, axis_b_W=(0.0, 1.0, 0.0)),
+    of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
+    of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
+    of_ground_3d(spatial.Prismatic, "axis_a", point=O, axis=AXIS),
+    of_ground_3d(spatial.Planar, "point_b", point=O, axis=AXIS),
+    of_ground_3d(spatial.Fixed, "point_b", point=O),
+    of_ground_3d(spatial.Distance, "length", point_b=(0.1, 0.0, 0.0)),
+    of_ground_3d(spatial.PointOnPlane, "point_b", point=O, axis=AXIS),
+    of_ground_3d(spatial.PointOnLine, "point_b", point=O, axis=AXIS),
+    of_ground_3d(
+        spatial.Driver,
+        "rate",
+        quantity="angle",
+        motion=turn,
+        parameters={"start": 0.0, "rate": 5.0},
+        axis=AXIS,
+        joints=(pin_3d,),
+    ),
+    on_body_3d(spatial.KnifeEdge, "point", point=(0.2, 0.0, 0.0)),
+    # A disk at rest falls over.
+    on_body_3d(spatial.RollingDisk, "radius", position=(0.5, 0.1, 0.3), radius=0.3, axis=(0.0, 1.0, 0.0), rests=False),
+    on_body_3d(spatial.RollingSphere, "radius", radius=0.2),
+    of_ground_3d(spatial.SpringDamper, "stiffness", stiffness=30.0, damping=0.5, free_length=0.1),
+    of_ground_3d(spatial.Damper, "damping", damping=3.0, point_b=(0.1, 0.2, 0.0)),
+    on_body_3d(spatial.PointForce, "force", force=(2.0, 1.0, 0.5), point=(0.1, 0.2, 0.0)),
+    on_body_3d(spatial.Torque, "torque", torque=(0.2, 0.1, 0.0)),
+    of_ground_3d(spatial.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, axis=AXIS, free_angle=0.5),
+    of_ground_3d(
+        spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
+    ),
+    on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
+]
+
+SPACES = {"planar": PLANAR, "functions": FUNCTIONS, "spatial": [*SPATIAL, rubbing_3d()]}
+EXAMPLES = {f"{space}: {example.part.name}": example for space, own in SPACES.items() for example in own}
+CONSTRAINED = [name for name, example in EXAMPLES.items() if isinstance(example.part, CONSTRAINTS)]
+AT_REST = [name for name, example in EXAMPLES.items() if example.rests and example.ideal]
+# By a method that is compiled sooner than the default.
+METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "max_steps": 512}
+T1 = 0.2
+
+
+# What is tested
+
+
+def compiled(example, *more):
+    """The scene of an example, and of more joints."""
+    part, bodies, forces = example.part, example.bodies, list(example.forces)
+    forces += [part] if isinstance(part, AbstractForce | AbstractNonIdeal) else []
+    joints = [*example.joints, *([] if part in bodies or part in forces else [part]), *more]
+    gravity = mb.Gravity((0.0, -9.81) if bodies[0].dimension == 2 else (0.0, 0.0, -9.81))
+    return mb.Scene(bodies, joints=joints, forces=[*forces, gravity]).compile()
+
+
+@functools.cache
+def programs(name):
+    """A motion and its forward derivative with respect to a parameter of the part, and its reverse derivative.
+
+    Both are functions of a number that is added to the parameter, in its own size, and of the tolerance.
+    """
+    example = EXAMPLES[name]
+    system, parameter = compiled(example), f"{example.part.name}.{example.parameter}"
+    value = mb.parameters(system)[parameter]
+    size = max(float(np.max(np.abs(value))), 0.1)
+
+    def end(share, rtol, adjoint):
+        changed = mb.with_parameters(system, {parameter: value + share * size})
+        state = mb.assemble(changed, throw=False)
+        y = mb.simulate(changed, state, t1=T1, rtol=rtol, adjoint=adjoint, throw=False, **METHOD).ys
+        q, u = y.q[-1], y.u[-1]
+        energy = changed.kinetic_energy(T1, q, u) + changed.potential_energy(T1, q)
+        broken = changed.position_residual(T1, q), changed.velocity_residual(T1, q, u)
+        return jnp.cos(jnp.arange(float(system.nq))) @ q, (broken, energy)
+
+    @jax.jit
+    def forward(share, rtol):
+        return jax.jvp(lambda x: end(x, rtol, diffrax.ForwardMode()), (share,), (jnp.ones(()),), has_aux=True)
+
+    return forward, jax.jit(jax.grad(lambda share, rtol: end(share, rtol, None)[0]))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_motion_and_its_derivative(name):
+    """The state stays on the constraints, and the derivative is that of central differences."""
+    forward, _ = programs(name)
+    still = jnp.zeros(())
+    _, _, (broken, energy) = forward(still, 1e-6)
+    for residual in broken:
+        np.testing.assert_allclose(residual, 0.0, atol=1e-9)
+    assert np.isfinite(energy)
+
+    _, derivative, _ = forward(still, 1e-9)
+    # A parameter without effect would pass the rest.
+    assert abs(derivative) > 1e-6
+    h = 1e-3
+    value = lambda s: forward(still + s, 1e-12)[0]
+    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(derivative, difference, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_reverse_derivative(name):
+    forward, reverse = programs(name)
+    still = jnp.zeros(())
+    np.testing.assert_allclose(reverse(still, 1e-9), forward(still, 1e-9)[1], rtol=1e-9, atol=1e-10)
+
+
+def twin(part):
+    return dataclasses.replace(part, name=f"{part.name} twin")
+
+
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_a_part_that_stands_twice_is_named(name):
+    """As many rows are implied as the part has, each by its twin."""
+    part = EXAMPLES[name].part
+    once, twice = compiled(EXAMPLES[name]), compiled(EXAMPLES[name], twin(part))
+    names = {part.name, twin(part).name}
+    assert len(twice.implied) == len([own for own, _ in once.rows if own == part.name])
+    for item in twice.implied:
+        assert item.name in names and names - {item.name} <= set(item.by)
+    assert once.velocity_rank == twice.velocity_rank
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_a_part_that_stands_twice_moves_as_once(name):
+    ends = []
+    for more in ((), (twin(EXAMPLES[name].part),)):
+        system = compiled(EXAMPLES[name], *more)
+        end = mb.simulate(system, mb.assemble(system), t1=T1, rtol=1e-10, **METHOD).ys
+        ends.append(np.concatenate([end.q[-1], end.u[-1]]))
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", AT_REST)
+def test_equilibrium(name):
+    """Nothing starts to move from it."""
+    system = compiled(EXAMPLES[name])
+    state = mb.equilibrium(system)
+    still = jnp.zeros(system.nu)
+    udot, broken = jax.jit(
+        lambda q: (accelerations(system, Multipliers(), 0.0, q, still)[0], system.position_residual(0.0, q))
+    )(state.q)
+    np.testing.assert_allclose(udot, 0.0, atol=1e-8)
+    np.testing.assert_allclose(broken, 0.0, atol=1e-12)
+
+
+# By a Runge–Kutta method with another way to stay on the constraints, or by none, and by the multistep methods.
+METHODS = {
+    "Adams": {"solver": mb.solvers.Adams(), "manifold": mb.manifold.Partition()},
+    "Adams on projection": {
+        "manifold": mb.manifold.Projection(),
+        "stepsize_controller": mb.solvers.MultistepController(rtol=1e-10, atol=1e-12),
+    },
+    "Hermite": {"solver": mb.solvers.Hermite()},
+    "Baumgarte": {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(20.0)},
+    "without constraints": {"manifold": mb.manifold.Unconstrained()},
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_gives_the_same_motion(method):
+    system = compiled(EXAMPLES["planar: Body" if method == "without constraints" else "planar: Revolute"])
+    start = mb.assemble(system)
+    ends = [mb.simulate(system, start, t1=T1, rtol=1e-10, **own).ys for own in (METHOD, METHODS[method])]
+    np.testing.assert_allclose(ends[1].q, ends[0].q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[1].u, ends[0].u, rtol=0, atol=1e-7)
