@@ -1,5 +1,6 @@
 import gc
 import os
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,11 +17,14 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
+    """Leave out long tests without `--all`: those marked so, and those listed by their measured time in `long.txt`."""
     if config.getoption("--all"):
         return
-    kept = [item for item in items if item.get_closest_marker("long") is None]
-    config.hook.pytest_deselected(items=[item for item in items if item not in set(kept)])
-    items[:] = kept
+    listed = set((Path(__file__).parent / "long.txt").read_text().splitlines())
+    is_long = lambda item: item.get_closest_marker("long") or {item.nodeid, item.nodeid.split("[")[0]} & listed
+    left_out = [item for item in items if is_long(item)]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if not is_long(item)]
 
 
 def pytest_configure(config):

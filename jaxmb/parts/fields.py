@@ -5,8 +5,8 @@ A part declares its fields with the helpers of this file, in place of `equinox.f
     class Spring(AbstractForce):
         name: str = name()
         body: str = body_name()
-        stiffness: Float[Array, ""] = parameter(unit="N/m", sign="positive")
-        point: Float[Array, "d"] = point(body=0, default="mass centre")
+        stiffness: Number = parameter(unit="N/m", sign="positive")
+        point: Number = point(body=0, default="mass centre")
 
 Numbers become read-only arrays and are the part's parameters, `"name.field"`; all other fields are static. A
 declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign and unit, the body that it is
