@@ -182,7 +182,9 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     forces = lambda z: (balance.force(balance.moved(q, z), multipliers),) * 2
     softness, force = jax.jacfwd(forces, has_aux=True)(still)
     stiffness = -allowed @ softness @ allowed
-    largest = jnp.max(jnp.abs(stiffness))
+    largest, overall = jnp.max(jnp.abs(stiffness)), jnp.max(jnp.abs(softness))
+    # Where the rows allow no displacement, or none that is resisted, what is left is rounding errors.
+    largest = jnp.where(largest > _NEGLIGIBLE * overall, largest, overall)
     stiffness += jnp.where(largest > 0, largest, 1.0) * (right.T @ right)
     curvatures, directions = jnp.linalg.eigh(0.5 * (stiffness + stiffness.T))
     return _Linearised(
