@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from . import fields
+from . import checks, fields
 from .space import AbstractSpace
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class AbstractPart(eqx.Module):
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
 
     def __check_init__(self):
-        fields.check_kinds(self, self.label)
+        checks.check_kinds(self, self.label)
 
     @property
     def label(self) -> str:
@@ -53,7 +53,7 @@ class AbstractPart(eqx.Module):
 
         **Arguments:** `dimension`: that of the scene, default that of the part.
         """
-        fields.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
+        checks.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
         type(self).validate(self)
 
     def validate(self) -> None:
@@ -127,7 +127,7 @@ class AbstractLaw(eqx.Module):
     """A law with parameters that is a field of a part, such as a terrain or a contact law; it has no name."""
 
     def __check_init__(self):
-        fields.check_kinds(self, type(self).__name__)
+        checks.check_kinds(self, type(self).__name__)
 
 
 class AbstractLink(AbstractPart):

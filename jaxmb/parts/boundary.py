@@ -65,12 +65,10 @@ def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[A
     try:
         # NumPy arrays refuse an out-of-bounds index; JAX arrays clamp it.
         return jax.eval_shape(lambda: _as_array(kernel(*given)))
-    except IndexError as error:
-        if "out of bounds" in str(error):
+    except Exception as error:
+        # Other errors do not count yet: NumPy arrays lack some operations, such as `.at[...]`.
+        if isinstance(error, IndexError) and "out of bounds" in str(error):
             raise ValueError(f"{label}: {name} indexes out of bounds: {error}.") from error
-    except Exception:
-        # NumPy arrays lack some operations, such as `.at[...]`.
-        pass
     try:
         return jax.eval_shape(lambda *given: _as_array(kernel(*given)), *given)
     except Exception as error:

@@ -37,9 +37,6 @@ else:
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d"]
 
-# A direction counts as a unit vector if its length differs from one by no more than this.
-_UNIT = 1e-6
-
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
@@ -124,7 +121,7 @@ def as_jax(value: Any) -> Array:
 
 
 def _lenient(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A converter that returns invalid values unchanged: `check_kinds` then names the part and the field."""
+    """A converter that returns invalid values unchanged: `checks.check_kinds` then names the part and the field."""
 
     def converter(value: Any) -> Any:
         try:
@@ -292,84 +289,6 @@ def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool
 
 def _optional(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda value: None if value is None else convert(value)
-
-
-# Checks
-
-
-def check_kinds(part: Any, label: str) -> None:
-    """Raise a `ValueError` if the value of a field is not of the declared kind."""
-    for field, declared in declarations(type(part)).items():
-        value = getattr(part, field)
-        if declared.is_number:
-            if not _is_number(value) and not (value is None and declared.optional):
-                raise ValueError(
-                    f"{label}: {field}: expected a real number or an array of real numbers, got {value!r}."
-                )
-        elif declared.kind in ("identity", "body"):
-            if not isinstance(value, str):
-                raise ValueError(f"{label}: {field} must be a name, got {value!r}.")
-        elif declared.kind == "bodies":
-            if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not value:
-                raise ValueError(f"{label}: {field} must be the name of a body or several names, got {value!r}.")
-        elif declared.kind == "choice":
-            if value not in declared.of:
-                raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")
-        elif declared.kind == "numbers":
-            if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-                raise ValueError(f"{label}: {field} must be a dictionary of numbers, got {value!r}.")
-            for key, number in value.items():
-                if not _is_number(number):
-                    raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
-        elif not isinstance(value, declared.of):
-            raise ValueError(f"{label}: {field} must be {declared.what}, got {value!r}.")
-
-
-def _is_number(value: Any) -> bool:
-    # JAX transformations may put other objects in place of arrays.
-    return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
-
-
-def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
-    """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
-    vectors, in the part and its laws.
-    """
-    for field, declared in declarations(type(part)).items():
-        value, shown = getattr(part, field), prefix + field
-        if declared.kind == "law":
-            if value is not None:
-                check_numbers(value, label, dimension, f"{shown}.")
-        elif declared.kind == "numbers":
-            for key, number in value.items():
-                if not np.all(np.isfinite(number)):
-                    raise ValueError(f"{label}: {prefix}{key} must be finite, got {np.asarray(number)}.")
-        elif declared.is_number and value is not None and not is_traced(value):
-            _check_number(declared, label, shown, np.asarray(value), dimension)
-
-
-def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
-    if declared.shape is not None:
-        shape = tuple(dimension if size == "d" else size for size in declared.shape)
-        if value.shape != shape:
-            raise ValueError(f"{label}: {shown} must have shape {shape}, got {value.shape}.")
-    if not np.isfinite(value).all():
-        raise ValueError(f"{label}: {shown} must be finite, got {value.tolist()}.")
-    sign = declared.sign
-    if sign == "nonzero" and (value == 0).any():
-        raise ValueError(f"{label}: {shown} must not be zero.")
-    if (sign == "positive" and (value <= 0).any()) or (sign == "non-negative" and (value < 0).any()):
-        raise ValueError(f"{label}: {shown} must be {sign}, got {value.tolist()}.")
-    if declared.is_direction or declared.is_attitude:
-        size = float(np.linalg.norm(value))
-        if abs(size - 1.0) <= _UNIT:
-            return
-        if declared.is_attitude:
-            raise ValueError(
-                f"{label}: {shown} must be unit Euler parameters (e0, e1, e2, e3), scalar first, got {value.tolist()} "
-                f"of length {size:.6g}; normalise them, or make them with rotations.from_axis_angle."
-            )
-        cure = "divide it by its length" if size > 0 else "give a direction"
-        raise ValueError(f"{label}: {shown} must be a unit vector, got {value.tolist()} of length {size:.6g}; {cure}.")
 
 
 # Queries

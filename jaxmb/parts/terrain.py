@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced
-from . import fields
+from . import checks, fields
 from .base import AbstractLaw
 from .smooth import step
 
@@ -25,7 +25,7 @@ class AbstractTerrain(AbstractLaw):
 
     def __check_init__(self):
         if not is_traced(self):
-            fields.check_numbers(self, type(self).__name__, 2)
+            checks.check_numbers(self, type(self).__name__, 2)
 
     @abc.abstractmethod
     def height(self, place: Place) -> Float[Array, ""]:
