@@ -425,7 +425,7 @@ def turning_pendulum():
     kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2) + 0.5 * q[0] ** 2 * v[1] ** 2
     rod = mb.lagrangian.Holonomic("rod", lambda t, q, p: q @ q - 1.0)
     axes = lambda t, q, p: jnp.array([[jnp.cos(q[1]), -jnp.sin(q[1])], [jnp.sin(q[1]), jnp.cos(q[1])]])
-    kinematics = mb.lagrangian.Frame(axes, 2, lambda t, q, p: jnp.array([0.1, 0.2]) * jnp.cos(t))
+    kinematics = mb.lagrangian.QuasiVelocityFrame(axes, 2, lambda t, q, p: jnp.array([0.1, 0.2]) * jnp.cos(t))
     return mb.lagrangian.LagrangianSystem(
         kinetic=kinetic, constraints=[rod], kinematics=kinematics, q=(1.0, 0.0), u=(0.0, 0.3)
     )
