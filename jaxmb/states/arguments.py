@@ -35,4 +35,7 @@ def checked_time(function: str, t: Scalar, dtype: Any) -> Any:
 
 def _vector(label: str, value: Any, like: Array) -> Array:
     array = real_array(label, value, like.dtype, (like.shape,))
+    if isinstance(value, jax.Array):
+        # As it is: under a trace a copy of known numbers would be traced as well.
+        return value
     return array if is_traced(array) else jax.device_put(array)
