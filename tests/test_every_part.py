@@ -419,7 +419,7 @@ def test_equilibrium(name):
         lambda q: (accelerations(system, Multipliers(), 0.0, q, still)[0], system.position_residual(0.0, q))
     )(state.q)
     # In m/s² and rad/s², where weights accelerate by ten.
-    np.testing.assert_allclose(udot, 0.0, atol=1e-7)
+    np.testing.assert_allclose(udot, 0.0, atol=1e-8)
     np.testing.assert_allclose(broken, 0.0, atol=1e-12)
 
 
