@@ -1,7 +1,5 @@
 """Integration of all coordinates, with a projection on the constraints after every step."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +10,7 @@ from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
 from .orthogonal_projection import project, project_in_metric, project_normalized
@@ -130,35 +129,10 @@ class ProjectionTerm(AbstractManifoldTerm):
         return chart
 
 
-class ProjectedSolver(diffrax.AbstractWrappedSolver):
+class ProjectedSolver(WrappedSolver):
     """A Runge–Kutta solver whose steps end with a projection on the constraints."""
 
-    solver: diffrax.AbstractSolver
     system: AbstractSystem
-    scan_kind: Any = None  # set by diffrax's adjoints, for the loop over stages
-
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
-
-    # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
@@ -166,12 +140,6 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        solver = self.solver
-        if self.scan_kind is not None:
-            solver = eqx.tree_at(lambda s: s.scan_kind, solver, self.scan_kind, is_leaf=lambda x: x is None)
-        y1, error, dense_info, solver_state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         direction = getattr(terms, "direction", 1)
         return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ._evaluation import check_real, check_term, derivative, first_chart, next_chart
 from ._order import StepEstimate
+from ._tangent import Tangent, TangentControl, pushed, pushed_only
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Args, Chart, Y
 
@@ -31,10 +32,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     """A multistep method under a `MultistepController`.
 
     `solves_implicitly` says whether a step solves an equation for the independent components of the state, which an
-    `AbstractManifoldTerm` then has to name (`free`).
+    `AbstractManifoldTerm` then has to name (`free`). `tangent_control` is set where a tangent's error is controlled.
     """
 
     tolerances: AbstractVar[Tolerances]
+    tangent_control: AbstractVar[TangentControl | None]
     solves_implicitly: AbstractVar[bool]
 
     # diffrax fills in the tolerances of a step size controller here; there is no root finder.
@@ -90,12 +92,63 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         """The initial solver state; `before`: the state before a jump, None at the first start."""
 
     @abc.abstractmethod
+    def _attempt(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> Any:
+        """The numbers of a step, before it is judged, as a tuple of arrays with the raveled state `after` it."""
+
+    @abc.abstractmethod
     def _advance(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
         """A step: the outputs of `step`, with a failure flag instead of the result."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def _memory(state: Any) -> PyTree[Array]:
+        """The part of a solver's state that a step depends on smoothly; that at its end, from the step's numbers."""
+
+    def _first_tangents(
+        self, numbers: Callable[..., tuple[Array, PyTree]], terms, flat: Float[Array, " n"], before: Any
+    ) -> tuple[Tangent, ...]:
+        """The tangents at a start whose errors are controlled.
+
+        **Arguments:** `numbers(terms, flat)`: the state on the manifold and the memory of a solver that starts there;
+        `before`: the solver state before a jump, None at the first start.
+        """
+        control = self.tangent_control
+        if control is None:
+            return ()
+        starts = control.starts() if before is None else [tangent.w for tangent in before.tangents]
+        pushes = [pushed_only(numbers, (terms, flat), at) for at in zip(control.of_terms(terms), starts, strict=True)]
+        return tuple(Tangent(w, memory, control.largest(w)) for w, memory in pushes)
+
+    def _attempted(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> tuple[Any, list[Any]]:
+        """The numbers of a step, and their derivatives along the tangents whose error is controlled."""
+        if self.tangent_control is None:
+            return self._attempt(terms, t1, before, like, args, state), []
+        step = eqx.Partial(_step_from, self, t1, like, args, state)
+        of_terms = self.tangent_control.of_terms(terms)
+        along = tuple((of, x.w, x.memory) for of, x in zip(of_terms, state.tangents, strict=True))
+        return pushed(step, (terms, before, self._memory(state)), along)
+
+    def _tangents_after(
+        self, tangents: tuple[Tangent, ...], along: list[Any]
+    ) -> tuple[tuple[Tangent, ...], list[Float[Array, " n"]]]:
+        """The tangents at the end of a step, from the derivatives of its numbers, and the errors tolerated in them."""
+        control = self.tangent_control
+        if control is None:
+            return (), []
+        out, scales = [], []
+        for tangent, end in zip(tangents, along, strict=True):
+            peak = jnp.maximum(tangent.peak, control.largest(end.after))
+            out.append(Tangent(end.after, self._memory(end), peak))
+            scales.append(control.scale(self.tolerances.rtol, tangent, end.after))
+        return tuple(out), scales
 
     def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
         """The weighted norm of an error."""
         return norm_of(self.tolerances.norm, error / scale, like)
+
+
+def _step_from(solver, t1, like, args, state, terms, before, memory):
+    return solver._attempt(terms, t1, before, like, args, eqx.tree_at(solver._memory, state, memory))
 
 
 def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], Any]) -> Tolerances:

@@ -1,7 +1,7 @@
 """The Adams method of Shampine and Gordon, of variable order and variable step."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,12 +11,22 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import controlled_components, evaluate, next_chart, project_near, ravel, unravel_like
+from ._evaluation import (
+    Evaluation,
+    controlled_components,
+    evaluate,
+    field_of,
+    next_chart,
+    project_near,
+    ravel,
+    unravel_like,
+)
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
 from ._interpolation import RateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, choose_order
 from ._stiffness import Stiffness, none_found, observed
+from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Chart
 
@@ -42,6 +52,7 @@ class AdamsState(eqx.Module):
         `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more without a given `dt0`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
+    - `tangents`: those whose errors are controlled beside that of the state.
     """
 
     history: History
@@ -49,6 +60,21 @@ class AdamsState(eqx.Module):
     step_counts: Int[Array, " length"]
     chart: Chart | None
     stiffness: Stiffness | None
+    tangents: tuple[Tangent, ...]
+
+
+class _Step(NamedTuple):
+    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas, the
+    `mismatch` of the corrector at the end, and the evaluations of the prediction and of the corrected state.
+    """
+
+    after: Float[Array, " n"]
+    history: History
+    errors: Float[Array, "3 n"]
+    mismatch: Float[Array, " n"]
+    predicted: Float[Array, " n"]
+    first: Evaluation
+    second: Evaluation
 
 
 class Adams(AbstractMultistep):
@@ -87,6 +113,7 @@ class Adams(AbstractMultistep):
     """
 
     tolerances: Tolerances
+    tangent_control: TangentControl | None
     min_order: int = eqx.field(static=True)
     max_order: int = eqx.field(static=True)
     stiffness: str = eqx.field(static=True)
@@ -125,6 +152,7 @@ class Adams(AbstractMultistep):
                 f"`min_order={min_order}` and `max_order={max_order}`."
             )
         self.tolerances = tolerances_of("Adams", rtol, atol, norm)
+        self.tangent_control = None
         self.min_order = min_order
         self.max_order = max_order
         self.stiffness = stiffness
@@ -152,11 +180,22 @@ class Adams(AbstractMultistep):
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
         else:
             step_counts, stiffness = before.step_counts, before.stiffness
-        return AdamsState(start(t0, f, t1 - t0), jnp.asarray(1, np.int32), step_counts.at[0].add(1), chart, stiffness)
+        history = start(t0, f, t1 - t0)
 
-    def _advance(self, terms, t1, y0, args, state: AdamsState):
+        def numbers(terms, flat):
+            (y, f), _ = field_of(terms, t0, unravel_like(y0, flat), chart, args)(t0, flat)
+            return y, start(t0, f, t1 - t0).differences
+
+        tangents = self._first_tangents(numbers, terms, ravel(y0), before)
+        order = jnp.asarray(1, np.int32)
+        return AdamsState(history, order, step_counts.at[0].add(1), chart, stiffness, tangents)
+
+    @staticmethod
+    def _memory(state):
+        return state.history.differences
+
+    def _attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
-        before = ravel(y0)
         dtype = before.dtype
         h = (t1 - history.mesh[0]).astype(dtype)
 
@@ -172,7 +211,7 @@ class Adams(AbstractMultistep):
         sums = jnp.concatenate([every, near]) @ history.differences
         partial_sums, neighbours, mean = sums[:LENGTH], sums[LENGTH:-1], sums[-1]
         predicted = before + h * mean
-        first = evaluate(terms, t1, predicted, y0, chart, args)
+        first = evaluate(terms, t1, predicted, like, chart, args)
 
         # The contribution of the new derivative to these polynomials, and its integral.
         defects = first.f[None] - neighbours
@@ -182,11 +221,24 @@ class Adams(AbstractMultistep):
         differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
         errors = h * differences[:, None] * defects
         corrected = predicted + h * last * defects[1]
-        second = project_near(terms, t1, corrected, y0, first, args)
-        after, f = second.y, second.f
+        second = project_near(terms, t1, corrected, like, first, args)
+        mismatch = predicted + h * last * (second.f - neighbours[1]) - second.y
+        return _Step(
+            second.y, advance(history, end, second.f, partial_sums), errors, mismatch, predicted, first, second
+        )
 
-        failed = first.failed | second.failed
-        sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), self._sizes(terms, y0, before, after, errors, chart))
+    def _advance(self, terms, t1, y0, args, state: AdamsState):
+        history, order, before = state.history, state.order, ravel(y0)
+        dtype = before.dtype
+        step, along = self._attempted(terms, t1, before, y0, args, state)
+        after = step.after
+
+        failed = step.first.failed | step.second.failed
+        sizes = self._sizes(terms, y0, self.tolerances.scale(before, after), step.errors, state.chart)
+        tangents, scales = self._tangents_after(state.tangents, along)
+        for end, scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(terms, y0, scale, end.errors, state.chart))
+        sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         change, estimate = choose_order(
             sizes,
             order + np.arange(3, dtype=np.int32),
@@ -198,19 +250,21 @@ class Adams(AbstractMultistep):
             work=jnp.asarray(_WORK),
         )
         y1 = unravel_like(y0, after)
+        h = (t1 - history.mesh[0]).astype(dtype)
         new_state = AdamsState(
-            history=advance(history, end, f, partial_sums),
+            history=step.history,
             order=order + change,
             step_counts=state.step_counts + (order == INDEX).astype(np.int32),
-            chart=next_chart(terms, t1, y1, second.chart, args),
-            stiffness=self._observed(state, h, before, predicted, after, first.f, f, y0),
+            chart=next_chart(terms, t1, y1, step.second.chart, args),
+            stiffness=self._observed(state, h, before, step.predicted, after, step.first.f, step.second.f, y0),
+            tangents=tangents,
         )
         used = (order >= INDEX)[:, None]
         dense_info = {
             "y1": y1,
             "differences": jnp.where(used, new_state.history.differences, jnp.zeros((), dtype)),
             "mesh": new_state.history.mesh,
-            "mismatch": predicted + h * last * (f - neighbours[1]) - after,
+            "mismatch": step.mismatch,
         }
         if self.stiffness == "stop" and state.stiffness is not None:
             failed = failed | state.stiffness.found
@@ -225,9 +279,9 @@ class Adams(AbstractMultistep):
         change = size(after - before), size(second - state.history.differences[0])
         return observed(state.stiffness, state.order, lax.stop_gradient(h), correction, change)
 
-    def _sizes(self, terms, y0, before, after, errors, chart) -> Float[Array, "3"]:
+    def _sizes(self, terms, y0, scale, errors, chart) -> Float[Array, "3"]:
         """Weighted norms of the errors in the controlled components."""
-        errors = lax.stop_gradient(errors) / self.tolerances.scale(before, after)[None]
+        errors = lax.stop_gradient(errors) / scale[None]
         controlled = controlled_components(terms, chart)
         if controlled is not None:
             # The norm is a mean over all components.

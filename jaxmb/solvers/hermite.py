@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._damping import are_damped, is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
@@ -21,6 +21,7 @@ from ._implicit import Linearization, Solved, derivatives, differentiable, linea
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
+from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
 from .controller import ControllerState
 from .manifold_term import Chart
@@ -45,6 +46,7 @@ class HermiteState(eqx.Module):
     - `work`: evaluations of f with g, and matrices computed, in accepted steps; the first evaluation after a start is
         in `step_counts`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
+    - `tangents`: those whose errors are controlled beside that of the state.
     """
 
     history: History
@@ -54,6 +56,24 @@ class HermiteState(eqx.Module):
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
+    tangents: tuple[Tangent, ...]
+
+
+class _Step(NamedTuple):
+    """The numbers of a step: the state `after` it, the history there and its `slope`; the `ends` of the step by every
+    formula, for their errors; for interpolation the history with the last point doubled, and the `mismatch` of the
+    formula at the end; the chart there, whether the evaluation `broke` down, and the end of Newton's method.
+    """
+
+    after: Float[Array, " n"]
+    history: History
+    slope: Float[Array, " m"]
+    ends: Float[Array, "formulas n"]
+    doubled: History
+    mismatch: Float[Array, " n"]
+    chart: Chart | None
+    broke: Bool[Array, ""]
+    newton: Solved
 
 
 class Hermite(AbstractMultistep):
@@ -98,6 +118,7 @@ class Hermite(AbstractMultistep):
     """
 
     tolerances: Tolerances
+    tangent_control: TangentControl | None
     family: str = eqx.field(static=True)
     past_points: tuple[int, ...] = eqx.field(static=True)
 
@@ -137,6 +158,7 @@ class Hermite(AbstractMultistep):
                 f"these numbers, increasing. Got `past_points={past_points}`."
             )
         self.tolerances = tolerances_of("Hermite", rtol, atol, norm)
+        self.tangent_control = None
         self.family = family
         self.past_points = past_points
 
@@ -179,11 +201,22 @@ class Hermite(AbstractMultistep):
             step_counts, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
         else:
             step_counts, work = before.step_counts, before.work
-        return HermiteState(history, slope, jnp.asarray(1, np.int32), matrix, step_counts.at[0].add(1), work, chart)
 
-    def _advance(self, terms, t1, y0, args, state: HermiteState):
+        def numbers(terms, flat):
+            at = derivatives(field_of(terms, t0, unravel_like(y0, flat), chart, args), t0, flat)
+            z, slope = self._recorded(at.y, at.f, at.g)
+            return at.y, (start(family, t0, z, slope, t1 - t0).differences, slope)
+
+        tangents = self._first_tangents(numbers, terms, flat, before)
+        index = jnp.asarray(1, np.int32)
+        return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, tangents)
+
+    @staticmethod
+    def _memory(state):
+        return state.history.differences, state.slope
+
+    def _attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
         family, history, k = FAMILIES[self.family], state.history, state.order_index
-        before = ravel(y0)
         n, dtype = before.size, before.dtype
         nodes = family.multiplicity * k
         index = np.arange(family.length, dtype=np.int32)
@@ -205,14 +238,13 @@ class Hermite(AbstractMultistep):
         base, unit = (before, h) if family.integrated else (jnp.zeros_like(before), jnp.ones_like(h))
         past = base + unit * (coefficients.past[nodes] @ history.differences[:, :n])
         a, b = h * coefficients.slope[nodes], h**2 * coefficients.curvature[nodes]
-        field = field_of(terms, t1, y0, state.chart, args)
+        field = field_of(terms, t1, like, state.chart, args)
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.scale(before, before)
         latest = before, state.slope[-n:]
-        newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, y0)
+        newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like)
         y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
-        chart, broken = newton.end.rest
-        failed = ~newton.converged | broken | ~is_resolved(h, newton.matrix.spectrum)
+        chart, broke = newton.end.rest
 
         ends = coefficients.past @ history.differences[:, :n]
         ends = (
@@ -220,10 +252,32 @@ class Hermite(AbstractMultistep):
             + (h * coefficients.slope)[:, None] * f[None]
             + (h**2 * coefficients.curvature)[:, None] * g[None]
         )
+        z, slope = self._recorded(y, f, g)
+        advanced = advance(history, end, z, partial_sums)
+        doubled = double(advanced, slope)
+        history = doubled if family.multiplicity == 2 else advanced
+        return _Step(y, history, slope, ends, doubled, past + a * f + b * g - y, chart, broke, newton)
+
+    def _advance(self, terms, t1, y0, args, state: HermiteState):
+        family, history, k = FAMILIES[self.family], state.history, state.order_index
+        before = ravel(y0)
+        n, dtype = before.size, before.dtype
+        nodes = family.multiplicity * k
+        index = np.arange(family.length, dtype=np.int32)
+        h = (step_end(history, t1) - history.mesh[0]).astype(dtype)
+        free = free_components(terms, before, state.chart)
+        scale = self.tolerances.scale(before, before)
+        step, along = self._attempted(terms, t1, before, y0, args, state)
+        newton = step.newton
+        failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
+
         ladder = _ladder(self.past_points)
         around = jnp.asarray(ladder)[k]
         candidates = jnp.append(around, self._stable or 1)
-        sizes = self._sizes(ends, candidates, family, newton, free, scale, y0)
+        sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
+        tangents, scales = self._tangents_after(state.tangents, along)
+        for end, scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(end.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         bounded = None if self._stable is None else functools.partial(self._bounded, around, h, newton.matrix.spectrum)
         change, estimate = choose_order(
@@ -246,31 +300,29 @@ class Hermite(AbstractMultistep):
             order_index = jnp.where(better, candidates[3], order_index)
             estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))
 
-        z, slope = self._recorded(y, f, g)
-        advanced = advance(history, end, z, partial_sums)
-        doubled = double(advanced, slope)
-        y1 = unravel_like(y0, y)
-        renewed = next_chart(terms, t1, y1, chart, args)
+        y1 = unravel_like(y0, step.after)
+        renewed = next_chart(terms, t1, y1, step.chart, args)
         matrix = newton.matrix
-        if chart is not None:
+        if step.chart is not None:
             # A new choice of components invalidates the matrix.
             changed = jnp.any(free_components(terms, before, renewed) != free)
             matrix = eqx.tree_at(lambda m: m.renewals, matrix, jnp.maximum(matrix.renewals, changed.astype(jnp.int32)))
         new_state = HermiteState(
-            history=doubled if family.multiplicity == 2 else advanced,
-            slope=slope,
+            history=step.history,
+            slope=step.slope,
             order_index=order_index,
             matrix=matrix,
             step_counts=state.step_counts + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
             work=state.work + newton.work,
             chart=renewed,
+            tangents=tangents,
         )
         used = (index < nodes + 2)[:, None]
         dense_info = {
             "y1": y1,
-            "differences": jnp.where(used, doubled.differences[:, :n], jnp.zeros((), dtype)),
-            "mesh": doubled.mesh,
-            "mismatch": past + a * f + b * g - y,
+            "differences": jnp.where(used, step.doubled.differences[:, :n], jnp.zeros((), dtype)),
+            "mesh": step.doubled.mesh,
+            "mismatch": step.mismatch,
         }
         return y1, estimate, dense_info, new_state, failed
 

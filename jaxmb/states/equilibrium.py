@@ -251,7 +251,7 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
 
     def advance(carry):
         q, local, step, radius, _, k = carry
-        size = jnp.max(jnp.abs(step)) + jnp.max(jnp.abs(local.correction))
+        size, off = jnp.max(jnp.abs(step)), jnp.max(jnp.abs(local.correction))
         trial = balance.moved(q, step + local.correction)
         there = _linearise(balance, trial)
         # A step is too long if the forces at its end push back at least half as hard as they pushed at its beginning.
@@ -265,8 +265,9 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         step = _step(local)
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
-        # The error after a small step of Newton's method is of the size of its square.
-        return q, local, step, radius, good & (size <= close) & (k > 0), k + 1
+        # The error after a small step of Newton's method is of the size of its square, and of that of the correction,
+        # whose effect on the forces is not counted.
+        return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
     # Before the first linearisation nothing is known, and the step is zero.
     unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))

@@ -1,0 +1,138 @@
+"""Error control of tangents beside the state.
+
+Steps that follow a motion may lie far outside the stability region of a mode that is not excited. The motion does not
+show it, but its derivatives do: they grow from step to step without bound. A solve that is differentiated therefore
+carries a tangent w of the state along, `w' = J(t, y) w`, from a start that excites every mode, and keeps its local
+error small as well. Tangents that are carried along have no derivatives themselves.
+
+They are those of the numerical solution: each step is differentiated along the tangents of the state and of the
+solver's memory. The derivative of the error estimate is then the error estimate of the tangent.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ._evaluation import freeze
+
+# The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
+_LOOSER, _FLOOR = 10.0, 0.01
+
+
+class TangentControl(eqx.Module):
+    """What a solver is told of the tangents whose error it controls.
+
+    **Fields:**
+
+    - `units`: the natural sizes of the components of the raveled state.
+    - `blocks`: groups of components that are measured by the largest one among them, `(start, end)`.
+    - `direction`: a tangent of the term, None where derivatives are not along a known direction. The tangent of the
+        state that it causes, `d' = J d + f_p`, is carried along in addition.
+    """
+
+    units: Float[Array, " n"]
+    blocks: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    direction: PyTree = None
+
+    def starts(self) -> tuple[Float[Array, " n"], ...]:
+        """A tangent with entries of random signs, between one half and one unit, always the same one; and zeros."""
+        random = np.random.default_rng(0)
+        entries = random.choice([-1.0, 1.0], self.units.size) * random.uniform(0.5, 1.0, self.units.size)
+        excited = self.units * jnp.asarray(entries, self.units.dtype)
+        return (excited,) if self.direction is None else (excited, jnp.zeros_like(excited))
+
+    def of_terms(self, terms: PyTree) -> tuple[PyTree, ...]:
+        """The tangents of a solver's terms, which diffrax has wrapped."""
+        none = jax.tree.map(lambda _: None, terms)
+        if self.direction is None:
+            return (none,)
+        return none, eqx.tree_at(lambda terms: (terms.term, terms.direction), terms, (self.direction, None))
+
+    def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The largest entry of the group of each component, in its unit."""
+        relative = jnp.abs(w) / self.units
+        groups = [jnp.full(b - a, jnp.max(relative[a:b], initial=0.0), w.dtype) for a, b in self.blocks]
+        return self.units * jnp.concatenate(groups)
+
+    def scale(self, rtol: Any, tangent: "Tangent", after: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The error tolerated in each component of a tangent in a step that ends with `after`."""
+        after = jnp.where(jnp.isnan(after), 0.0, jnp.abs(after))
+        size = jnp.maximum(jnp.abs(tangent.w), after) + _FLOOR * jnp.maximum(tangent.peak, self.largest(after))
+        # A direction that has had no effect yet has no size.
+        return _LOOSER * rtol * (size + self.units * jnp.finfo(after.dtype).eps ** 2)
+
+
+class Tangent(eqx.Module):
+    """A tangent between steps.
+
+    **Fields:** `w`, of the raveled state; `memory`, of the solver's memory; `peak`: the largest entries of
+    the groups so far.
+    """
+
+    w: Float[Array, " n"]
+    memory: PyTree
+    peak: Float[Array, " n"]
+
+
+def pushed(function: Any, at: PyTree, along: tuple[PyTree, ...], differentiable: Any = None) -> tuple[PyTree, list]:
+    """`function(*at)` and its derivatives `along` tangents, which have no derivatives themselves.
+
+    **Arguments:** `function`: a pytree, since it has derivatives as well; `differentiable`: the same function in a form
+    that adjoints can differentiate, if that is another.
+    """
+    out, tangents = _pushed(function, at, along, differentiable)
+    return out, [_filled(tangent, out) for tangent in tangents]
+
+
+def pushed_only(function: Any, at: PyTree, along: PyTree) -> PyTree:
+    """The derivative of `function(*at)` along a tangent."""
+    out, tangent = eqx.filter_jvp(function, freeze(at), along)
+    return _filled(tangent, out)
+
+
+def _filled(tangent, out):
+    """A tangent with zeros where it has no entries, as constants have none."""
+    fill = lambda t, x: jnp.zeros_like(x) if t is None and eqx.is_inexact_array(x) else t
+    return freeze(jax.tree.map(fill, tangent, out, is_leaf=_is_none))
+
+
+@eqx.filter_custom_jvp
+def _pushed(function, at, along, differentiable):
+    del differentiable
+    outs = [eqx.filter_jvp(function, at, tangent) for tangent in along]
+    return outs[0][0], [tangent for _, tangent in outs]
+
+
+@_pushed.def_jvp
+def _pushed_jvp(primals, tangents):
+    function, at, along, differentiable = primals
+    dfunction, dat, _, ddifferentiable = tangents
+    if differentiable is not None:
+        out, pushes = _pushed(*primals)
+        call = lambda function, at: function(*at)
+        _, dout = eqx.filter_jvp(call, (differentiable, at), (ddifferentiable, dat))
+        return (out, pushes), (dout, jax.tree.map(lambda _: None, pushes))
+    # One linearisation serves all directions.
+    none = jax.tree.map(lambda _: None, function)
+    own = [(none, tangent) for tangent in along]
+    used = lambda *tangents: any(t is not None for t in tangents)
+    moving, still = eqx.partition((function, at), jax.tree.map(used, (dfunction, dat), *own, is_leaf=_is_none))
+
+    def run(moving):
+        function, at = eqx.combine(moving, still)
+        return eqx.partition(function(*at), eqx.is_inexact_array)
+
+    out, push, rest = jax.linearize(run, moving, has_aux=True)
+    zeros = jax.tree.map(jnp.zeros_like, moving)
+    dout = push(eqx.combine((dfunction, dat), zeros))
+    # As a derivative of the linear function, each leaves out what its direction does not change.
+    pushes = [eqx.filter_jvp(push, (zeros,), (tangent,))[1] for tangent in own]
+    return (eqx.combine(out, rest), pushes), (dout, jax.tree.map(lambda _: None, pushes))
+
+
+def _is_none(x):
+    return x is None

@@ -1,0 +1,130 @@
+"""Runs that are differentiated resolve their derivatives, also those of modes that the motion does not excite."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb.lagrangian import LagrangianSystem
+
+SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
+RATE, END = 100.0, 3.0
+
+
+def two_masses():
+    """A slow and a fast mass, each on a spring of its own."""
+    return LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(v, v),
+        potential=lambda t, q, p: 0.5 * (q[0] ** 2 + (p["rate"] * q[1]) ** 2),
+        q=(1.0, 0.0),
+        parameters={"rate": RATE},
+    )
+
+
+def at_rest(offset):
+    """The slow mass moves; the fast one is at rest, but for an offset."""
+    return mb.State(jnp.stack([jnp.ones_like(offset), offset]), jnp.zeros(2))
+
+
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.long)])
+def test_a_fast_mode_at_rest(solver):
+    system = two_masses()
+
+    def end(offset, rtol, adjoint=None):
+        sol = mb.simulate(system, at_rest(offset), t1=END, rtol=rtol, solver=SOLVERS[solver], adjoint=adjoint)
+        return sol.ys.q[-1, 1]
+
+    reverse = jax.jit(jax.grad(end))
+    forward = jax.jit(lambda x, rtol: jax.jvp(lambda x: end(x, rtol, diffrax.ForwardMode()), (x,), (1.0,))[1])
+    for rtol, error in ((1e-6, 1e-2), (1e-8, 2e-4), (1e-10, 2e-6)):
+        assert abs(reverse(0.0, rtol) - np.cos(RATE * END)) < error
+        np.testing.assert_allclose(forward(0.0, rtol), reverse(0.0, rtol), rtol=0, atol=1e-9)
+
+
+def test_only_runs_that_are_differentiated_resolve_the_tangent():
+    system = two_masses()
+
+    def run(offset):
+        sol = mb.simulate(system, at_rest(offset), t1=END, rtol=1e-6, saveat=[1.0, END])
+        return sol.ys.q, sol.stats["num_steps"]
+
+    derivative = jax.jit(jax.value_and_grad(lambda x: (run(x)[0][-1, 0], run(x)), has_aux=True))
+    (_, (values, resolved)), _ = derivative(0.0)
+    plain, steps = run(jnp.array(0.0))
+    inside = jax.jit(run)(0.0)
+    assert inside[1] == steps < 100 < resolved
+    np.testing.assert_array_equal(inside[0], plain)
+    np.testing.assert_allclose(values, plain, atol=1e-5)
+
+
+def test_batches_events_dense_output_and_nested_jit():
+    system = two_masses()
+    crossing = diffrax.Event(lambda t, y, args, **kw: y.q[0], root_finder=None)
+
+    @jax.jit
+    def between(offset):
+        dense = diffrax.SaveAt(dense=True)
+        return mb.simulate(system, at_rest(offset), t1=END, rtol=1e-9, saveat=dense).at(2.0).q[1]
+
+    def until(offset):
+        stop = mb.simulate(system, at_rest(offset), t1=END, rtol=1e-9, event=crossing)
+        return stop.ys.q[-1, 1], stop.ts[-1]
+
+    gradients = jax.jit(jax.vmap(jax.grad(between)))(jnp.array([0.0, 1e-3]))
+    np.testing.assert_allclose(gradients, np.cos(2 * RATE), atol=1e-4)
+    slope, end = jax.jit(jax.grad(until, has_aux=True))(0.0)
+    np.testing.assert_allclose(slope, np.cos(RATE * end), atol=1e-4)
+
+
+@pytest.mark.long
+def test_second_derivatives():
+    system = two_masses()
+
+    def end(rate):
+        sol = mb.simulate(
+            mb.with_parameters(system, {"rate": rate}),
+            at_rest(jnp.array(0.1)),
+            t1=0.3,
+            rtol=1e-10,
+            adjoint=diffrax.ForwardMode(),
+        )
+        return sol.ys.q[-1, 1]
+
+    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(20.0)
+    np.testing.assert_allclose(second, -0.1 * 0.3**2 * np.cos(20 * 0.3), rtol=1e-6)
+
+
+def test_a_mode_that_is_kicked_late_needs_its_direction():
+    # The random part of the tangent has died away, by the factor exp(-40), when the kick comes.
+    system = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(v, v),
+        potential=lambda t, q, p: 0.5 * (q[0] ** 2 + (RATE * q[1]) ** 2),
+        force=lambda t, q, v, p: jnp.stack([0.0 * t, p["kick"] * jnp.exp(-(((t - 10.0) / 0.02) ** 2)) - 8.0 * v[1]]),
+        q=(1.0, 0.0),
+        parameters={"kick": 0.0},
+    )
+
+    def end(kick, rtol, direction):
+        kicked = mb.with_parameters(system, {"kick": kick})
+        sol = mb.simulate(kicked, at_rest(jnp.array(0.0)), t1=10.1, rtol=rtol, direction=direction)
+        return sol.ys.q[-1, 1]
+
+    # The response to the kick, by quadrature of Green's function.
+    damped = np.sqrt(RATE**2 - 4.0**2)
+    s = np.linspace(9.8, 10.1, 200001)
+    green = np.exp(-4.0 * (10.1 - s)) * np.sin(damped * (10.1 - s)) / damped
+    exact = np.trapezoid(green * np.exp(-(((s - 10.0) / 0.02) ** 2)), s)
+    slope = jax.jit(lambda x: jax.grad(end)(x, 1e-8, {"kick": 1.0}))(0.0)
+    np.testing.assert_allclose(slope, exact, rtol=1e-5)
+
+
+def test_directions_are_checked():
+    run = lambda direction: mb.simulate(two_masses(), at_rest(jnp.array(0.0)), t1=0.1, direction=direction)
+    with pytest.raises(ValueError, match="rat"):
+        run({"rat": 1.0})
+    with pytest.raises(ValueError, match=r"direction\['rate'\] must"):
+        run({"rate": [1.0, 2.0]})
+    with pytest.raises(ValueError, match="direction must be a dictionary"):
+        run(1.0)
