@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._evaluation import unravel_like
+from ._scales import RunningScales
 
 
 def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> Any:
@@ -16,10 +17,18 @@ def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> 
     return norm(unravel_like(jax.tree.map(lambda leaf: leaf.astype(flat.dtype), like), flat))
 
 
+def absolute_tolerance(atol: Any, scales: RunningScales | None, sizes: Array | None) -> Any:
+    """The absolute tolerance of the components of a state."""
+    return atol if scales is None or sizes is None else atol * scales.of_components(sizes)
+
+
 class MultistepNorm(eqx.Module):
-    """The norm of a `MultistepController`; its type tells a solver which controller it runs under."""
+    """The norm of a `MultistepController`; its type tells a solver which controller it runs under. With `scales`, the
+    absolute tolerance is relative to them.
+    """
 
     norm: Callable[[PyTree], Any]
+    scales: RunningScales | None = None
 
     def __call__(self, x: PyTree) -> Any:
         return self.norm(x)
@@ -47,10 +56,18 @@ class Tolerances(eqx.Module):
                 f"`diffrax.PIDController` and its like. (It may be wrapped in `diffrax.ClipStepSizeController`.)"
             )
 
-    def scale(self, y0: Array, y1: Array) -> Array:
-        """The error tolerated in each component over a step from `y0` to `y1`."""
+    @property
+    def scales(self) -> RunningScales | None:
+        """What the absolute tolerance is relative to."""
+        return getattr(self.norm, "scales", None)
+
+    def scale(self, y0: Array, y1: Array, sizes: Array | None) -> Array:
+        """The error tolerated in each component over a step from `y0` to `y1`; `sizes` are those of the running scales
+        so far.
+        """
         # A step that ends where the vector field is undefined is measured at its start.
         y1 = jnp.where(jnp.isnan(y1), y0, y1)
         with jax.numpy_dtype_promotion("standard"):
-            scale = self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+            absolute = absolute_tolerance(self.atol, self.scales, sizes)
+            scale = absolute + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
         return jax.lax.stop_gradient(scale.astype(y0.dtype))

@@ -52,6 +52,7 @@ class AdamsState(eqx.Module):
         `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more without a given `dt0`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
+    - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: those whose errors are controlled beside that of the state.
     """
 
@@ -60,6 +61,7 @@ class AdamsState(eqx.Module):
     step_counts: Int[Array, " length"]
     chart: Chart | None
     stiffness: Stiffness | None
+    sizes: Float[Array, "2"] | None
     tangents: tuple[Tangent, ...]
 
 
@@ -188,7 +190,8 @@ class Adams(AbstractMultistep):
 
         tangents = self._first_tangents(numbers, terms, ravel(y0), before)
         order = jnp.asarray(1, np.int32)
-        return AdamsState(history, order, step_counts.at[0].add(1), chart, stiffness, tangents)
+        sizes = self._first_sizes(ravel(y0), f, before)
+        return AdamsState(history, order, step_counts.at[0].add(1), chart, stiffness, sizes, tangents)
 
     @staticmethod
     def _memory(state):
@@ -234,7 +237,7 @@ class Adams(AbstractMultistep):
         after = step.after
 
         failed = step.first.failed | step.second.failed
-        sizes = self._sizes(terms, y0, self.tolerances.scale(before, after), step.errors, state.chart)
+        sizes = self._sizes(terms, y0, self.tolerances.scale(before, after, state.sizes), step.errors, state.chart)
         tangents, scales = self._tangents_after(state.tangents, along)
         for end, scale in zip(along, scales, strict=True):
             sizes = jnp.maximum(sizes, self._sizes(terms, y0, scale, end.errors, state.chart))
@@ -257,6 +260,7 @@ class Adams(AbstractMultistep):
             step_counts=state.step_counts + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, step.second.chart, args),
             stiffness=self._observed(state, h, before, step.predicted, after, step.first.f, step.second.f, y0),
+            sizes=self._grown(state.sizes, after),
             tangents=tangents,
         )
         used = (order >= INDEX)[:, None]
@@ -273,7 +277,7 @@ class Adams(AbstractMultistep):
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
             return None
-        scale = self.tolerances.scale(before, after)
+        scale = self.tolerances.scale(before, after, state.sizes)
         size = lambda change: self._size(lax.stop_gradient(change), scale, like)
         correction = size(after - predicted), size(second - first)
         change = size(after - before), size(second - state.history.differences[0])

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._evaluation import check_real, ravel, unravel_like
 from ._order import StepEstimate
-from ._tolerances import MultistepNorm, norm_of
+from ._scales import RunningScales
+from ._tolerances import MultistepNorm, absolute_tolerance, norm_of
 from .manifold_term import Args, Y
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
@@ -74,6 +75,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         atol: Any,
         *,
         norm: Callable[[PyTree], Any] = optx.rms_norm,
+        scales: RunningScales | None = None,
         dtmin: Any = None,
         dtmax: Any = None,
         force_dtmin: bool = False,
@@ -86,6 +88,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         - `rtol`, `atol`: relative and absolute tolerance: scalars, or vectors with one entry for each component of the
             raveled state.
         - `norm`: the norm of the weighted error.
+        - `scales`: sizes that `atol` is relative to, of coordinates and velocities whose units do not matter.
         - `dtmin`, `dtmax`: bounds of the step.
         - `force_dtmin`: if true, steps of size `dtmin` are accepted with any error, and the solve continues.
         - `safety`: multiplies every step that the error estimates allow.
@@ -96,7 +99,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         """
         self.rtol = rtol
         self.atol = atol
-        self.norm = MultistepNorm(norm)  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.norm = MultistepNorm(norm, scales)  # pyright: ignore[reportIncompatibleMethodOverride]
         self.dtmin = dtmin
         self.dtmax = dtmax
         self.force_dtmin = force_dtmin
@@ -219,23 +222,30 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         frozen = lambda tree: jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
         terms, t0, t1, y0, args = frozen((terms, t0, t1, y0, args))
         flat = ravel(y0)
-        with jax.numpy_dtype_promotion("standard"):
-            scale = (self.atol + self.rtol * jnp.abs(flat)).astype(flat.dtype)
-        size = lambda x: norm_of(self.norm, x / scale, y0)
+        scales = self.norm.scales
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
 
         def trial(carry, _):
             # At the start, then after a step along the first derivative; in a loop, so that the vector field is
             # compiled once.
-            t, y = carry
+            t, y, scale = carry
             f = ravel(func(terms, t, unravel_like(y0, y), args), flat.dtype)
+            if scales is not None:
+                sizes = scales.start(flat, f)
+                with jax.numpy_dtype_promotion("standard"):
+                    own = absolute_tolerance(self.atol, scales, sizes) + self.rtol * jnp.abs(flat)
+                scale = jnp.where(scale > 0, scale, own.astype(flat.dtype))
+            size = lambda x: norm_of(self.norm, x / scale, y0)
             # Within this time the state changes by its own size, or at least by the tolerance.
             reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
-            return (t0 + (reach / 100).astype(t0.dtype), flat + reach / 100 * f), (f, reach)
+            return (t0 + (reach / 100).astype(t0.dtype), flat + reach / 100 * f, scale), (f, reach)
 
-        _, (f, (reach, _)) = lax.scan(trial, (t0, flat), None, length=2)
+        with jax.numpy_dtype_promotion("standard"):
+            first = jnp.zeros_like(flat) if scales is not None else (self.atol + self.rtol * jnp.abs(flat))
+        carry = t0, flat, jnp.broadcast_to(first, flat.shape).astype(flat.dtype)
+        (_, _, scale), (f, (reach, _)) = lax.scan(trial, carry, None, length=2)
         # The local error of order one is h^2/2 times the change of the derivative.
-        change = size(f[1] - f[0]) / (reach / 100)
+        change = norm_of(self.norm, (f[1] - f[0]) / scale, y0) / (reach / 100)
         step = jnp.minimum(1 / jnp.sqrt(change), reach)
         return jnp.where(jnp.isfinite(step), step, span / 1000).astype(t0.dtype)
 

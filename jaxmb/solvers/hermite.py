@@ -46,6 +46,7 @@ class HermiteState(eqx.Module):
     - `work`: evaluations of f with g, and matrices computed, in accepted steps; the first evaluation after a start is
         in `step_counts`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
+    - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: those whose errors are controlled beside that of the state.
     """
 
@@ -56,6 +57,7 @@ class HermiteState(eqx.Module):
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
+    sizes: Float[Array, "2"] | None
     tangents: tuple[Tangent, ...]
 
 
@@ -209,7 +211,8 @@ class Hermite(AbstractMultistep):
 
         tangents = self._first_tangents(numbers, terms, flat, before)
         index = jnp.asarray(1, np.int32)
-        return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, tangents)
+        sizes = self._first_sizes(flat, f, before)
+        return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
 
     @staticmethod
     def _memory(state):
@@ -240,7 +243,7 @@ class Hermite(AbstractMultistep):
         a, b = h * coefficients.slope[nodes], h**2 * coefficients.curvature[nodes]
         field = field_of(terms, t1, like, state.chart, args)
         free = free_components(terms, before, state.chart)
-        scale = self.tolerances.scale(before, before)
+        scale = self.tolerances.scale(before, before, state.sizes)
         latest = before, state.slope[-n:]
         newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like)
         y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
@@ -266,7 +269,7 @@ class Hermite(AbstractMultistep):
         index = np.arange(family.length, dtype=np.int32)
         h = (step_end(history, t1) - history.mesh[0]).astype(dtype)
         free = free_components(terms, before, state.chart)
-        scale = self.tolerances.scale(before, before)
+        scale = self.tolerances.scale(before, before, state.sizes)
         step, along = self._attempted(terms, t1, before, y0, args, state)
         newton = step.newton
         failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
@@ -315,6 +318,7 @@ class Hermite(AbstractMultistep):
             step_counts=state.step_counts + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
             work=state.work + newton.work,
             chart=renewed,
+            sizes=self._grown(state.sizes, step.after),
             tangents=tangents,
         )
         used = (index < nodes + 2)[:, None]

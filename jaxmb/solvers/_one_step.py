@@ -1,5 +1,6 @@
-"""The error control of tangents for one-step methods, and the controller that takes them into account."""
+"""One-step methods that carry tangents along, and their controller, which also knows running scales."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,7 +13,9 @@ from jaxtyping import Array, Float, PyTree
 
 from ._evaluation import ravel, unravel_like
 from ._multistep import AbstractMultistep
+from ._scales import RunningScales
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
+from ._tolerances import MultistepNorm, Tolerances
 from ._wrapped import WrappedSolver
 
 
@@ -63,12 +66,14 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
             return solver, controller, lambda state: state
         solver = eqx.tree_at(lambda s: s.tangent_control, solver, control, is_leaf=lambda x: x is None)
         return solver, controller, lambda state: eqx.tree_at(lambda s: s.tangents, state, ())
-    is_pid = lambda x: isinstance(x, diffrax.PIDController)
-    found = [x for x in jax.tree.leaves(controller, is_leaf=is_pid) if is_pid(x)]
+    kinds = (diffrax.PIDController, OneStepController)
+    # A concrete class, since a controller may be wrapped in others that diffrax has.
+    is_known = lambda x: isinstance(x, kinds)
+    found = [x for x in jax.tree.leaves(controller, is_leaf=is_known) if is_known(x)]
     if not found:
         return solver, controller, lambda state: state
-    watched = lambda x: ControllerWithTangents(x.rtol, x.atol, x.norm, x) if is_pid(x) else x
-    controller = jax.tree.map(watched, controller, is_leaf=is_pid)
+    watched = lambda x: dataclasses.replace(x if hasattr(x, "scales") else OneStepController.around(x), tangents=True)
+    controller = jax.tree.map(lambda x: watched(x) if is_known(x) else x, controller, is_leaf=is_known)
     return WithTangents(solver, control, found[0].rtol), controller, lambda state: state[0]
 
 
@@ -79,31 +84,52 @@ class ErrorWithTangents(NamedTuple):
     of_tangents: list[Float[Array, " n"]]
 
 
-class ControllerWithTangents(diffrax.AbstractAdaptiveStepSizeController):
-    """A PID controller of the largest of several errors, of the state and of tangents; `rtol`, `atol` and `norm` are
-    those of `controller`.
+class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
+    """A PID controller of the error of a state in units of tolerances that may be relative to running `scales`, and of
+    the errors of `tangents` where the solver carries them along. `rtol`, `atol` and `norm` are those of `controller`.
     """
 
     rtol: Any
     atol: Any
     norm: Callable[[PyTree], Any]
     controller: diffrax.PIDController
+    scales: RunningScales | None = None
+    tangents: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def around(cls, controller: Any, scales: RunningScales | None = None) -> "OneStepController":
+        """With the tolerances of a PID controller."""
+        return cls(controller.rtol, controller.atol, controller.norm, controller, scales)
 
     def wrap(self, direction):
         controller: Any = self.controller.wrap(direction)
-        return eqx.tree_at(lambda c: c.controller, self, controller)
+        return dataclasses.replace(self, controller=controller)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        if self.scales is None:
+            first, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+            return first, (state, None)
+        flat = ravel(y0)
+        sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
+        # In units of these sizes the absolute tolerance is the same for all components.
+        unit = self.scales.of_components(sizes)
+        scaled = lambda y: unravel_like(y0, ravel(y) / unit)
+        field = lambda terms, t, y, args: scaled(func(terms, t, unravel_like(y0, ravel(y) * unit), args))
+        first, state = self.controller.init(terms, t0, t1, scaled(y0), dt0, args, field, error_order)
+        return first, (state, sizes)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        norm, like = self.norm, ravel(y0)
-        # The controller divides by its tolerances. Those of the tangents have been applied: for them it divides by one.
-        every = lambda errors: functools.reduce(jnp.maximum, map(norm, errors))
-        controller = eqx.tree_at(lambda c: c.norm, self.controller, every)
-        zero, one = unravel_like(y0, jnp.zeros_like(like)), unravel_like(y0, jnp.ones_like(like))
-        with jax.numpy_dtype_promotion("standard"):
-            of_tangents = [unravel_like(y0, error * (self.atol + self.rtol)) for error in y_error.of_tangents]
-        count = len(of_tangents)
-        before, after, errors = (y0, *[zero] * count), (y1_candidate, *[one] * count), (y_error.error, *of_tangents)
-        return controller.adapt_step_size(t0, t1, before, after, args, errors, error_order, controller_state)
+        state, sizes = controller_state
+        of_state, of_tangents = (y_error.error, y_error.of_tangents) if self.tangents else (y_error, [])
+        scale = Tolerances(self.rtol, self.atol, MultistepNorm(self.norm, self.scales)).scale(
+            ravel(y0), ravel(y1_candidate), sizes
+        )
+        errors = [self.norm(unravel_like(y0, error)) for error in (ravel(of_state) / scale, *of_tangents)]
+        # What is left to the controller is one number in units of the tolerance.
+        unit = eqx.tree_at(lambda c: (c.rtol, c.atol, c.norm), self.controller, (0.0, 1.0, jnp.abs))
+        zero = jnp.zeros_like(errors[0])
+        error = functools.reduce(jnp.maximum, errors)
+        keep, *rest, state, result = unit.adapt_step_size(t0, t1, zero, zero, args, error, error_order, state)
+        if self.scales is not None and sizes is not None:
+            sizes = jnp.where(keep, self.scales.grown(sizes, ravel(y1_candidate)), sizes)
+        return keep, *rest, (state, sizes), result
