@@ -1,21 +1,29 @@
 """Integration of all coordinates, with a projection on the constraints after every step."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
+from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractSystem
+from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
+
+# Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
+_FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+# Redundant rows may be violated by this multiple of the pivots that count as zero.
+_ALLOWED = 8.0
 
 
 class Projection(AbstractManifold):
@@ -37,6 +45,7 @@ class Projection(AbstractManifold):
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)
+    restores: ClassVar[bool] = True
 
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
@@ -59,7 +68,16 @@ class Projection(AbstractManifold):
         return {}
 
     def diagnose(self, system, t, y, solver_state, result, failed):
-        return result
+        if not drops_rows(system):
+            return result
+        violated = _violated(*lax.stop_gradient((system, t, y)))
+        return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
+
+
+@eqx.filter_jit
+def _violated(system, t, y):
+    """Whether redundant rows are violated at a state on the others."""
+    return violation_of_dropped_rows(system, t, y, row_sizes(system, t, y)) > _ALLOWED * jnp.finfo(y.q.dtype).eps ** 0.5
 
 
 def _check_multistep(system, formulation):
@@ -170,8 +188,13 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         if self.scan_kind is not None:
             solver = eqx.tree_at(lambda s: s.scan_kind, solver, self.scan_kind, is_leaf=lambda x: x is None)
         y1, error, dense_info, solver_state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        direction = getattr(terms, "direction", 1)
-        return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
+        t1 = t1 * getattr(terms, "direction", 1)
+        y1 = project(self.system, t1, y1)
+        if drops_rows(self.system):
+            # diffrax forgets the result of a step that is rejected.
+            violated = _violated(*lax.stop_gradient((self.system, t1, y1)))
+            result = diffrax.RESULTS.where(violated, _FAILED, result)
+        return y1, error, dense_info, solver_state, result
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
