@@ -168,7 +168,10 @@ class PartitionTerm(AbstractManifoldTerm):
     def init_chart(self, t, y, args):
         system, y = lax.stop_gradient((self.system, y))
         split, fresh, singular = _choose(system, t, y, _of_coordinates(system, t, y))
-        redundant = RedundantRows(row_sizes(system, t, y), jnp.zeros((), y.q.dtype)) if drops_rows(system) else None
+        redundant = None
+        if drops_rows(system):
+            sizes = row_sizes(system, t, y)
+            redundant = RedundantRows(sizes, _violation(system, t, y, sizes, self.newton_tol))
         return Chart(split, fresh, fresh, jnp.stack([0, 0, 0, 1, singular.astype(int)]), redundant)
 
     def evaluate(self, t, y, chart, args):

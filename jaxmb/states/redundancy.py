@@ -23,7 +23,7 @@ _DISPLACEMENT = 1 / 8
 # The largest relative difference that counts as zero, as a power of eps: 1e-6.
 _ZERO = 3 / 8
 # Rows that depend on time are followed to these times [s], as far as the coordinates move less than this.
-_TIMES = tuple(10.0**k for k in range(-4, 7))
+_TIMES = tuple(10.0**k for k in range(-9, 7))
 _NEAR = 0.2
 # Largest number of steps of Newton's method.
 _ITERATIONS = 10
@@ -36,8 +36,8 @@ def check_gradients(system: AbstractSystem, jacobian: Float[np.ndarray, "m nu"])
     if np.any(zero):
         listed = ", ".join(f"row {k} of {name}" for (name, k), z in zip(system.rows, zero, strict=True) if z)
         raise ValueError(
-            f"At the given pose the gradient of {listed} is zero, so it binds nothing there: the pose is singular. "
-            "Give a pose off this position, or write the constraint without products or powers that vanish with it."
+            f"At the given poses and velocities the gradient of {listed} is zero, so it binds nothing there: they are "
+            "singular. Give others, or write the constraint without products or powers that vanish with it."
         )
 
 

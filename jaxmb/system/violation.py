@@ -22,12 +22,13 @@ def violations(
     system: AbstractSystem, t: Scalar, y: State, sizes: Float[Array, "velocity_rows"]
 ) -> tuple[Float[Array, "position_rows"], Float[Array, "velocity_rows"]]:
     """For each row of Φ the change of the coordinates, in their scales, that restores it; for each row of ψ the change
-    of the velocities that does, relative to the largest velocity. Nothing divided by nothing is zero.
+    of the velocities that does, relative to the largest velocity.
     """
     speed = jnp.max(jnp.abs(y.u) / system.velocity_scale())
     rate = jnp.abs(system.velocity_residual(t, y.q, y.u)) / sizes
     positions = jnp.abs(system.position_residual(t, y.q)) / sizes[: system.position_rows]
-    return positions, jnp.where(rate > 0, rate / speed, 0.0)
+    # At rest there are only rounding errors to compare.
+    return positions, jnp.where(rate > jnp.finfo(rate.dtype).eps ** 0.75, rate / speed, 0.0)
 
 
 def violation_of_dropped_rows(
