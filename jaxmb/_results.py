@@ -14,6 +14,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives "
         "are not smooth, or numbers that are not finite. With `throw=False` the motion up to there is kept."
     )
+    inconsistent_constraints = (
+        "Constraint rows that others implied when the system was compiled are violated along the motion: they "
+        "contradict the others. Remove them, or make dimensions and prescribed motions agree. With `throw=False` the "
+        "motion up to there is kept."
+    )
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )

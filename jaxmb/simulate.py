@@ -22,6 +22,7 @@ from .parts.names import unknown
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .solvers._tangent import TangentControl
 from .solvers._tangent_of_stages import with_tangents
+from .states.consistency import consistent, contradiction
 from .system import AbstractSystem
 from .system.arguments import check_kind, real_array
 from .system.parameters import parameters, with_parameters
@@ -98,7 +99,9 @@ def simulate(
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work;
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
+    a state that violates the constraints (of other parameters, another system, another time), unless the manifold lets
+    states drift; under a trace such a run fails instead, with `RESULTS.assembly_failed`;
     `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
     trajectory up to there is kept.
 
@@ -149,17 +152,18 @@ def simulate(
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
         method = policy.default_formulation(system) if formulation is None else formulation
         term, prepared = policy.prepare(system, method, solver, relative)
+        start = consistent(system, options["t0"], state) if policy.restores else state
         along = None
         if direction is not None:
-            moved = lambda step: with_parameters(system, {k: start + step * x for k, (start, x) in changes.items()})
+            moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in changes.items()})
             changed = lambda step: policy.prepare(moved(step), method, solver, relative)[0]
             along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
-        return _integrate(system, method, policy, term, prepared, options, interpolated, along)
+        return _integrate(system, method, policy, term, prepared, options | {"y0": start}, interpolated, along)
 
-    trajectory, failed = motion(solver)
+    trajectory, failed, end = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory, failed = motion(Hermite())
+        trajectory, failed, end = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -167,6 +171,8 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
+    if throw and not isinstance(failed, Tracer) and trajectory.result == RESULTS.inconsistent_constraints:
+        raise RuntimeError(contradiction(system, *end))
     if throw and (isinstance(failed, Tracer) or failed):
         # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
         spoiled = lambda y: y * jnp.where(failed, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
@@ -216,7 +222,7 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, _failed(result)
+    return trajectory, _failed(result), end
 
 
 @eqx.filter_custom_jvp

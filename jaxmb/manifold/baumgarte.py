@@ -4,6 +4,8 @@ Source: J. Baumgarte, "Stabilization of constraints and integrals of motion in d
 Mech. Eng. 1, 1972.
 """
 
+from typing import ClassVar
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +29,7 @@ class Baumgarte(AbstractManifold):
     """
 
     rate: float = eqx.field(static=True, default=10.0)
+    restores: ClassVar[bool] = False
 
     def __check_init__(self):
         if not (np.isfinite(self.rate) and self.rate > 0):

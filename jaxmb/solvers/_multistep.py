@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ._evaluation import check_real, check_term, derivative, first_chart, next_chart
-from ._order import StepEstimate
+from ._evaluation import check_real, check_term, derivative, first_chart, next_chart, refused
+from ._order import StepEstimate, refuse
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Args, Chart, Y
@@ -75,6 +75,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         state = _restart_after(made_jump, restart, solver_state)
         y1, estimate, dense_info, state, failed = self._advance(terms, t1, y0, args, state)
+        off = refused(terms, state.chart)
+        if off is not False:
+            failed, estimate = failed | off, refuse(estimate, off)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)

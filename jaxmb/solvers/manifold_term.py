@@ -95,6 +95,13 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         The result is used only if the step to this state is accepted. It is also called before a restart after a jump.
         """
 
+    def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
+        """Whether the state at which a chart was updated is none of the manifold; the step to it is then retried with a
+        smaller one.
+        """
+        del chart
+        return False
+
 
 def stop(x: Any) -> Any:
     """An array without its derivative; anything else as it is."""
