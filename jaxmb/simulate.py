@@ -16,6 +16,7 @@ from ._results import RESULTS
 from ._types import Scalar, State
 from .formulations import AbstractFormulation
 from .linalg.arrays import as_array, is_traced
+from .linalg.failure import not_a_number_where
 from .manifold import AbstractManifold, default_manifold
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .system import AbstractSystem
@@ -93,7 +94,10 @@ def simulate(
 
     **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work;
     `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
-    trajectory up to there is kept.
+    trajectory up to there is kept, with times and states of infinity after it. Under `jit`, `vmap` or a derivative,
+    where nothing can be kept for some members of a batch only, a motion that fails is not a number as a whole, and so
+    are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
+    members are as if it were not there.
 
     Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
     ones. A mesh is made for the motion it follows: from a state of rest in equilibrium it is coarse, and derivatives
@@ -148,18 +152,30 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
-    if throw and (isinstance(failed, Tracer) or failed):
-        # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
-        spoiled = lambda y: y * jnp.where(failed, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
-        trajectory = eqx.tree_at(lambda trajectory: trajectory.ys, trajectory, jax.tree.map(spoiled, trajectory.ys))
-        trajectory = trajectory.result.error_if(trajectory, failed)
+    if is_traced((failed, trajectory.ys)) or (throw and failed):
+        # A derivative would be that of the part before the failure. An error goes with the value, and not with a
+        # derivative that is taken alone.
+        motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
+        spoiled = not_a_number_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
+        trajectory = eqx.tree_at(motion_of, trajectory, spoiled, is_leaf=lambda leaf: leaf is None)
+        if throw:
+            trajectory = trajectory.result.error_if(trajectory, failed)
     return trajectory.trimmed()
 
 
 @eqx.filter_jit
 def _integrate(system, formulation, manifold, term, solver, options, interpolated):
+    start, first = options["y0"], options["saveat"].subs[0]
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
+    # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
+    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
+    options = options | {"t1": at_once(options["t1"])}
+    if times is not None:
+        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(times))
     solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
     ts, saved = solution.ts[0], solution.ys[0]
+    if times is not None:
+        ts = jnp.where(finite, ts, jnp.inf)
     correction = manifold.correction(interpolated)
     # `SaveAt(fn=...)` may save something else than states.
     are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
@@ -167,11 +183,8 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         saved = _corrected(system, ts, saved, correction)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
-    start = options["y0"]
-    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
-    stuck = _failed(result)
-    result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
-    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck & finite)
+    result = RESULTS.where(finite, result, RESULTS.assembly_failed)
+    result = manifold.diagnose(system, *end, solution.solver_state, result, _failed(result) & finite)
     stats = dict(solution.stats)
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
