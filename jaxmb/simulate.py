@@ -135,11 +135,13 @@ def simulate(
         "progress_meter": diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
     }
 
+    valid = system.parameters_in_range()
+
     def motion(solver):
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
         method = policy.default_formulation(system) if formulation is None else formulation
         term, prepared = policy.prepare(system, method, solver, relative)
-        return _integrate(system, method, policy, term, prepared, options, interpolated)
+        return _integrate(system, method, policy, term, prepared, options, interpolated, valid)
 
     trajectory, failed = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
@@ -164,9 +166,9 @@ def simulate(
 
 
 @eqx.filter_jit
-def _integrate(system, formulation, manifold, term, solver, options, interpolated):
+def _integrate(system, formulation, manifold, term, solver, options, interpolated, valid):
     start, first = options["y0"], options["saveat"].subs[0]
-    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
     options = options | {"t1": at_once(options["t1"])}
@@ -184,6 +186,8 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
+    if valid is not True:
+        result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
     result = manifold.diagnose(system, *end, solution.solver_state, result, _failed(result) & finite)
     stats = dict(solution.stats)
     if isinstance(solver, AbstractMultistep):

@@ -11,7 +11,7 @@ work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -99,6 +99,16 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def positive_parameters(self) -> frozenset[str]:
         """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
+
+    @abc.abstractmethod
+    def check_parameters(self, names: Collection[str]) -> None:
+        """Raise a `ValueError` for values of these parameters that are out of range; traced ones are left to
+        `parameters_in_range`.
+        """
+
+    @abc.abstractmethod
+    def parameters_in_range(self) -> bool | Bool[Array, ""]:
+        """Whether all parameters that are traced are in their ranges; True if none are traced."""
 
     @abc.abstractmethod
     def describe(self) -> Description:
