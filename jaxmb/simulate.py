@@ -123,7 +123,7 @@ def simulate(
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-    saved = _save_at(saveat)
+    saved = _save_at(saveat, options["t0"], options["t1"])
     interpolated = event is not None or (saved.subs is not None and saved.subs.ts is not None)
     options |= {
         "y0": state,
@@ -249,17 +249,31 @@ def _tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     return relative, relative / 100 if absolute is None else absolute
 
 
-def _save_at(saveat) -> diffrax.SaveAt:
+def _save_at(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
     if saveat is None:
         return diffrax.SaveAt(t1=True)
     if isinstance(saveat, diffrax.SaveAt):
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
+        if saveat.subs is not None and saveat.subs.ts is not None:
+            _check_saved_times(saveat.subs.ts, start, end)
         return saveat
-    ts = real_array("saveat", saveat, jnp.result_type(float), None)
+    return diffrax.SaveAt(ts=jax.device_put(_check_saved_times(saveat, start, end)))
+
+
+def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
+    ts = real_array("saveat", times, jnp.result_type(float), None)
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
-    return diffrax.SaveAt(ts=jax.device_put(ts))
+    if is_traced((ts, start, end)):
+        return ts
+    if not (min(start, end) <= ts.min() and ts.max() <= max(start, end)):
+        raise ValueError(
+            f"saveat must lie between t0 = {start:g} and t1 = {end:g}, got times from {ts.min():g} to {ts.max():g}."
+        )
+    if np.any(np.diff(ts) * (1 if start <= end else -1) < 0):
+        raise ValueError(f"saveat must run from t0 to t1 without turning back, got {ts}.")
+    return ts
 
 
 def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:

@@ -1,5 +1,6 @@
 """Numbers that no scene would be compiled with, and times at which nothing can be simulated."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,3 +94,20 @@ def test_traced_moments_of_inertia_are_positive_definite(top, value):
     inside = jax.jit(lambda inertia: mb.with_parameters(top, {"top.inertia": inertia}).parameters_in_range())
     assert inside(np.diag(SIZE)) and not inside(value)
     assert mb.with_parameters(top, {"top.inertia": np.diag(SIZE)}).parameters_in_range() is True
+
+
+TIMES = {
+    "after the end": ({"saveat": [0.5, 2.0]}, "saveat must lie between t0 = 0 and t1 = 1, got times from 0.5 to 2"),
+    "before the start": ({"saveat": diffrax.SaveAt(ts=[-0.5, 0.5])}, "saveat must lie between t0 = 0 and t1 = 1"),
+    "of a run back": ({"t1": -1.0, "saveat": [0.0, 0.5]}, "saveat must lie between t0 = 0 and t1 = -1"),
+    "back and forth": ({"saveat": [0.5, 0.2]}, "saveat must run from t0 to t1 without turning back"),
+    "against a run back": ({"t1": -1.0, "saveat": [-0.5, -0.2]}, "saveat must run from t0 to t1"),
+    "NaN in a SaveAt": ({"saveat": diffrax.SaveAt(ts=[0.5, np.nan])}, "saveat must not be NaN"),
+}
+
+
+@pytest.mark.parametrize("case", TIMES)
+def test_times_to_save_at(rod, case):
+    changes, message = TIMES[case]
+    with pytest.raises(ValueError, match=message):
+        mb.simulate(rod, mb.assemble(rod), **({"t1": 1.0} | changes))
