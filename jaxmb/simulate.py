@@ -143,10 +143,10 @@ def simulate(
         term, prepared = policy.prepare(system, method, solver, relative)
         return _integrate(system, method, policy, term, prepared, options, interpolated, valid)
 
-    trajectory, failed = motion(solver)
+    trajectory, failed, end = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory, failed = motion(Hermite())
+        trajectory, failed, end = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -154,8 +154,10 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
-    if is_traced((failed, trajectory.ys)) or (throw and failed):
-        # A derivative would be that of the part before the failure. An error goes with the value, and not with a
+    if throw and not isinstance(failed, Tracer) and failed:
+        raise RuntimeError(_reason(system, trajectory.result, options["t1"], *lax.stop_gradient(end)))
+    if is_traced((failed, trajectory.ys)):
+        # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.
         motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
         spoiled = not_a_number_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
@@ -202,11 +204,24 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, _failed(result)
+    return trajectory, _failed(result), end
 
 
 def _failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+
+
+def _reason(system, result, t1, t, y) -> str:
+    """Why a simulation ended at a state, in one line, with what is not finite there or just beyond."""
+    text = RESULTS[result]
+    if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate([y.q, y.u]))):
+        return text
+    rates = system.rates(t, y.q, y.u)
+    for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
+        wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
+        if wrong:
+            return f"{text.rstrip('.')}: at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
+    return text
 
 
 def _corrected(system, ts, saved, correction):

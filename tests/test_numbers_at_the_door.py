@@ -111,3 +111,45 @@ def test_times_to_save_at(rod, case):
     changes, message = TIMES[case]
     with pytest.raises(ValueError, match=message):
         mb.simulate(rod, mb.assemble(rod), **({"t1": 1.0} | changes))
+
+
+def pushed_until(end):
+    law = lambda poses, velocities, t, p: jnp.stack([jnp.sqrt(p["end"] - t), 0.0 * t, 0.0 * t])[None]
+    forces = [mb.Force("push", "body", law, parameters={"end": end}), mb.Gravity((0.0, -9.81))]
+    return mb.Scene([planar.PointMass("body", mass=1.0)], forces=forces).compile()
+
+
+def driven_until(end):
+    """An angle whose second derivative grows beyond bounds."""
+    turn = lambda t, p: -((p["end"] - t) ** 1.5)
+    drive = planar.Driver("drive", "ground", "body", quantity="angle", motion=turn, parameters={"end": end})
+    return mb.Scene([planar.Body("body", mass=1.0, inertia=1.0)], joints=[drive]).compile()
+
+
+def in_coordinates(end):
+    kinetic, potential = lambda t, q, v, p: 0.5 * v @ v, lambda t, q, p: jnp.sqrt(p["end"] - q[0]) ** 3
+    numbers = {"q": [0.0], "u": [1.0], "parameters": {"end": end}}
+    return mb.lagrangian.LagrangianSystem(kinetic=kinetic, potential=potential, **numbers)
+
+
+WRONG = {
+    "force": (pushed_until, 0.5, "at t = 0.5 the force of 'push' is not finite"),
+    "driver": (driven_until, 0.3, "at t = 0.3 the residual of 'drive' is not finite"),
+    "potential": (in_coordinates, 0.1, "at t = 0.0[0-9]* the force on the coordinates is not finite"),
+}
+
+
+@pytest.mark.parametrize("case", ["force", pytest.param("driver", marks=pytest.mark.long), "potential"])
+def test_an_error_names_what_is_not_finite_in_one_line(case):
+    build, end, message = WRONG[case]
+    system = build(end)
+    with pytest.raises(RuntimeError, match=message) as failed:
+        mb.simulate(system, mb.assemble(system), t1=1.0)
+    assert len(str(failed.value)) < 300 and "\n" not in str(failed.value)
+
+
+def test_an_error_of_another_kind_is_one_line():
+    system = pushed_until(2.0)
+    with pytest.raises(RuntimeError) as failed:
+        mb.simulate(system, mb.assemble(system), t1=1.0, max_steps=3)
+    assert str(failed.value) == "The maximum number of solver steps was reached. Try increasing `max_steps`."

@@ -234,6 +234,31 @@ class AbstractBodySystem(AbstractSystem):
         poses = jax.vmap(self.poses)(ys.q)
         return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
 
+    def not_finite(self, t, q, u):
+        values = self._of_parts(jnp.asarray(t, q.dtype), q, u)
+        kinds = zip(
+            ("residual", "residual", "force"), (self.constraints, self.joints, self.forces), values, strict=True
+        )
+        return tuple(
+            dict.fromkeys(
+                f"the {kind} of {name!r}"
+                for kind, of_kind, of_parts in kinds
+                for group, own in zip(of_kind, of_parts, strict=True)
+                for name, value in zip(group.group.names, np.asarray(own), strict=True)
+                if not np.all(np.isfinite(value))
+            )
+        )
+
+    @eqx.filter_jit
+    def _of_parts(self, t, q, u):
+        """Residuals of positions, those of accelerations, and wrenches, group by group."""
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return (
+            [g.residual(t, poses) for g in self.constraints],
+            [g.acceleration(t, poses, velocities, jnp.zeros_like(velocities)) for g in self.joints],
+            [g.wrenches(t, poses, velocities) for g in self.forces],
+        )
+
     # Bodies
 
     @property

@@ -65,6 +65,13 @@ class AbstractGeneralizedSystem(AbstractSystem):
         where, index = self.parameter_paths()[name][0]
         return where(self) if index is None else where(self)[index]
 
+    def not_finite(self, t, q, u):
+        t, rows = jnp.asarray(t, q.dtype), self.rows
+        residuals = (self.position_residual(t, q), self.acceleration_residual(t, q, u, jnp.zeros_like(u)))
+        wrong = [rows[k][0] for residual in residuals for k in np.flatnonzero(~np.isfinite(np.asarray(residual)))]
+        forces = () if np.all(np.isfinite(self.force(t, q, u))) else ("the force on the coordinates",)
+        return (*forces, *dict.fromkeys(f"the residual of {name!r}" for name in wrong))
+
     # There are no bodies to act on.
 
     def joint_names(self):
