@@ -53,6 +53,7 @@ def simulate(
     atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
+    jumps: ArrayLike | None = None,
     event: diffrax.Event | None = None,
     max_steps: int = 65536,
     throw: bool = True,
@@ -88,6 +89,10 @@ def simulate(
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
         them computed twice. For few parameters forward mode is faster and needs no memory: `jax.jacfwd` with
         `adjoint=diffrax.ForwardMode()`.
+    - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
+        and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
+        then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
+        does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
     - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
 
     **Returns:** a `Trajectory`.
@@ -119,6 +124,9 @@ def simulate(
     if stepsize_controller is None:
         controller = MultistepController if isinstance(solver, AbstractMultistep) else diffrax.PIDController
         stepsize_controller = controller(rtol=relative, atol=absolute)
+    if jumps is not None:
+        adaptive: Any = stepsize_controller
+        stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=_jump_times(jumps))
     if adjoint is None:
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
@@ -139,6 +147,13 @@ def simulate(
 
     def motion(solver):
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
+        jumping = jumps is not None and system.velocity_rows > 0
+        if jumping and not (policy.takes_impulses and system.positive_definite_mass):
+            raise ValueError(
+                "With jumps, a constrained system needs manifold=Partition() or Projection(), and a mass matrix that "
+                f"has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
+                f"{system.positive_definite_mass}."
+            )
         method = policy.default_formulation(system) if formulation is None else formulation
         term, prepared = policy.prepare(system, method, solver, relative)
         return _integrate(system, method, policy, term, prepared, options, interpolated, valid)
@@ -289,6 +304,13 @@ def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
     if np.any(np.diff(ts) * (1 if start <= end else -1) < 0):
         raise ValueError(f"saveat must run from t0 to t1 without turning back, got {ts}.")
     return ts
+
+
+def _jump_times(jumps: Any) -> Any:
+    times = real_array("jumps", jumps, jnp.result_type(float), None)
+    if times.ndim != 1 or times.shape[0] == 0 or not (is_traced(times) or np.all(np.isfinite(times))):
+        raise ValueError(f"jumps must be a vector of finite times, got {jumps!r}; leave it out if there are none.")
+    return jnp.asarray(times)
 
 
 def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,12 @@ Correction = Callable[[AbstractSystem, Scalar, State], State]
 
 
 class AbstractManifold(eqx.Module):
-    """A policy that turns a system into a term, and a solver into one that respects the constraints."""
+    """A policy that turns a system into a term, and a solver into one that respects the constraints.
+
+    `takes_impulses` says whether velocities follow a jump of prescribed rates.
+    """
+
+    takes_impulses: ClassVar[bool] = True
 
     @abc.abstractmethod
     def prepare(

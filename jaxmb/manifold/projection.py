@@ -12,7 +12,9 @@ from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractSystem
+from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
@@ -120,6 +122,9 @@ class ProjectionTerm(AbstractManifoldTerm):
         udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
         return State(system.rates(t, y.q, y.u), udot)
 
+    def after_jump(self, t, y, args):
+        return after_impulse(self.system, t, y)
+
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
@@ -169,8 +174,10 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         solver = self.solver
         if self.scan_kind is not None:
             solver = eqx.tree_at(lambda s: s.scan_kind, solver, self.scan_kind, is_leaf=lambda x: x is None)
-        y1, error, dense_info, solver_state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         direction = getattr(terms, "direction", 1)
+        if made_jump is not False:
+            y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
+        y1, error, dense_info, solver_state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
 
     def func(self, terms, t0, y0, args):
