@@ -17,7 +17,7 @@ from ._types import Scalar, State
 from .formulations import AbstractFormulation
 from .linalg.arrays import as_array, is_traced
 from .linalg.failure import not_a_number_where
-from .manifold import AbstractManifold, default_manifold
+from .manifold import AbstractManifold, default_manifold, find_jump
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .system import AbstractSystem
 from .system.arguments import check_kind, real_array
@@ -93,6 +93,7 @@ def simulate(
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
         then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
         does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
+        Without any, a warning tells of a jump or kink of a driver, except under `jit`, `vmap` or a derivative.
     - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
 
     **Returns:** a `Trajectory`.
@@ -169,6 +170,8 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
+    if jumps is None and not system.drift_free and not is_traced((system, end, options["t0"], options["t1"])):
+        _warn_of_jumps(system, end[1].q, options["t0"], options["t1"])
     if throw and not isinstance(failed, Tracer) and failed:
         raise RuntimeError(_reason(system, trajectory.result, options["t1"], *lax.stop_gradient(end)))
     if is_traced((failed, trajectory.ys)):
@@ -224,6 +227,18 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
 
 def _failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+
+
+def _warn_of_jumps(system, q, t0, t1) -> None:
+    t, row, found = find_jump(system, q, t0, t1)
+    if found:
+        # The rows of ψ, then those of A.
+        name = (*system.rows[: system.velocity_rows], *system.rows)[int(row)][0]
+        warnings.warn(
+            f"The motion that {name!r} prescribes has a jump or a kink at t = {float(t):.6g}, which an integration "
+            f"passes without an impulse or in many steps; simulate(..., jumps=[{float(t):.6g}]) restarts there.",
+            stacklevel=3,
+        )
 
 
 def _reason(system, result, t1, t, y) -> str:

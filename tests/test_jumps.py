@@ -111,6 +111,26 @@ def test_members_of_a_batch_jump_each_at_its_time(arm):
     assert abs(together[0] - together[1]) > 1e-2
 
 
+PROGRAMS = {
+    "jump of the rate": lambda t, p: jnp.where(t < 0.6, 0.4 * t, 0.24 + 2.5 * (t - 0.6)),
+    "kink of the rate": lambda t, p: jnp.where(t < 0.6, 0.0 * t, (t - 0.6) ** 2),
+    "smooth and steep": lambda t, p: 0.1 * jnp.tanh(100.0 * (t - 0.6)),
+}
+
+
+@pytest.mark.parametrize("case", PROGRAMS)
+def test_a_jump_that_is_not_announced_is_warned_of(case):
+    body = planar.Body("arm", mass=1.0, inertia=0.1)
+    drive = planar.Driver("drive", "ground", "arm", quantity="angle", motion=PROGRAMS[case])
+    system = mb.Scene([body], joints=[drive]).compile()
+    run = lambda: mb.simulate(system, mb.assemble(system), t1=1.0, rtol=1e-5)
+    if case == "smooth and steep":
+        run()
+    else:
+        with pytest.warns(UserWarning, match=r"'drive' prescribes has a jump or a kink at t = 0.6,.*jumps=\[0.6\]"):
+            run()
+
+
 REFUSED = {
     "NaN": ({"jumps": [np.nan]}, "jumps must not be NaN"),
     "endless": ({"jumps": [np.inf]}, "jumps must be a vector of finite times"),
