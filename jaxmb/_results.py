@@ -22,3 +22,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )
+    invalid_parameters = (
+        "A parameter is not finite, or not of the sign that its part asks for, or a direction is not a unit vector. "
+        "`jaxmb.with_parameters` with numbers that are not traced names it."
+    )

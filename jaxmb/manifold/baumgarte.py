@@ -35,6 +35,8 @@ class Baumgarte(AbstractManifold):
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ValueError(f"Baumgarte: rate must be positive and finite, got {self.rate}.")
 
+    takes_impulses: ClassVar[bool] = False
+
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver

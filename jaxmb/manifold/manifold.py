@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -25,10 +25,12 @@ Correction = Callable[[AbstractSystem, Scalar, State], State]
 class AbstractManifold(eqx.Module):
     """A policy that turns a system into a term, and a solver into one that respects the constraints.
 
-    `restores` says whether every step ends on the constraints.
+    `restores` says whether every step ends on the constraints, `takes_impulses` whether velocities follow a jump of
+    prescribed rates.
     """
 
     restores: AbstractVar[bool]
+    takes_impulses: ClassVar[bool] = True
 
     @abc.abstractmethod
     def prepare(

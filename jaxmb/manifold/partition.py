@@ -33,6 +33,7 @@ from .constrained import (
     shares_split,
 )
 from .diagnosis import diagnose
+from .impulse import after_impulse
 from .manifold import AbstractManifold, newton_tolerance
 from .orthogonal_projection import project_normalized
 from .vector_field import VectorField
@@ -220,6 +221,9 @@ class PartitionTerm(AbstractManifoldTerm):
         q, iterations, failed = restore_positions(self.system, t, y.q, split, self.newton_tol)
         out = self._evaluate(t, q, y.u, _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
+
+    def after_jump(self, t, y, args):
+        return after_impulse(self.system, t, y)
 
     def controlled(self, chart):
         # All components: where dependent ones change fast, the error of the independent ones alone shows it too late.

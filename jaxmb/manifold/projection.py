@@ -14,9 +14,11 @@ from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
+from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
@@ -139,6 +141,9 @@ class ProjectionTerm(AbstractManifoldTerm):
         udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
         return State(system.rates(t, y.q, y.u), udot)
 
+    def after_jump(self, t, y, args):
+        return after_impulse(self.system, t, y)
+
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
@@ -160,8 +165,11 @@ class ProjectedSolver(WrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        direction = getattr(terms, "direction", 1)
+        if made_jump is not False:
+            y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        t1 = t1 * getattr(terms, "direction", 1)
+        t1 = t1 * direction
         y1 = project(self.system, t1, y1)
         if drops_rows(self.system):
             # diffrax forgets the result of a step that is rejected.

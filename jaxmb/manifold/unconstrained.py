@@ -17,6 +17,7 @@ class Unconstrained(AbstractManifold):
     """
 
     restores: ClassVar[bool] = False
+    takes_impulses: ClassVar[bool] = False
 
     def prepare(self, system, formulation, solver, rtol):
         return diffrax.ODETerm(VectorField(system, formulation)), solver

@@ -83,6 +83,12 @@ def refused(term: Any, chart: Chart | None) -> Any:
     return False if manifold is None else manifold.refuses(chart)
 
 
+def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
+    """The state just after a jump; `y` for a plain vector field."""
+    manifold = _manifold(term)
+    return y if manifold is None else manifold.after_jump(t * term.direction, y, args)
+
+
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
     """Evaluate the vector field; `like` has the structure of the state before raveling."""
     manifold = _manifold(term)

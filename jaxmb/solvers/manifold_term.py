@@ -80,6 +80,14 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         out = self.project_near(t, y, linearized_at, args)
         return out._replace(failed=out.failed | linearized_at.failed)
 
+    def after_jump(self, t: Any, y: Y, args: Args) -> Y:
+        """The state just after a time at which the field or the manifold jumps; by default it has not changed.
+
+        A manifold whose states jump with it overrides this method.
+        """
+        del t, args
+        return y
+
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
         """A mask with the structure of `y`: true for the components that the local error is measured on."""

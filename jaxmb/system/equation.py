@@ -11,7 +11,7 @@ work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -101,6 +101,16 @@ class AbstractSystem(eqx.Module):
         """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
 
     @abc.abstractmethod
+    def check_parameters(self, names: Collection[str]) -> None:
+        """Raise a `ValueError` for values of these parameters that are out of range; traced ones are left to
+        `parameters_in_range`.
+        """
+
+    @abc.abstractmethod
+    def parameters_in_range(self) -> bool | Bool[Array, ""]:
+        """Whether all parameters that are traced are in their ranges; True if none are traced."""
+
+    @abc.abstractmethod
     def describe(self) -> Description:
         """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
 
@@ -127,6 +137,10 @@ class AbstractSystem(eqx.Module):
         """The points that a picture of each body shows along a motion, world axes [m]: its mass centre, and the points
         where joints and forces act on it. Empty for a system without bodies.
         """
+
+    @abc.abstractmethod
+    def not_finite(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> tuple[str, ...]:
+        """What is not finite at a state, forces and residuals, by the names of the parts; for messages."""
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:
