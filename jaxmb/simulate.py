@@ -15,8 +15,10 @@ from jaxtyping import ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State
 from .formulations import AbstractFormulation
+from .formulations.friction import coupled_most
 from .linalg.arrays import as_array, is_traced
 from .manifold import AbstractManifold, default_manifold
+from .manifold.diagnosis import diagnose_friction
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .system import AbstractSystem
 from .system.arguments import check_kind, real_array
@@ -137,10 +139,10 @@ def simulate(
         term, prepared = policy.prepare(system, method, solver, relative)
         return _integrate(system, method, policy, term, prepared, options, interpolated)
 
-    trajectory, failed = motion(solver)
+    trajectory, failed, coupling = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory, failed = motion(Hermite())
+        trajectory, failed, coupling = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -148,6 +150,8 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
+    if throw and not isinstance(failed, Tracer) and np.any(coupling):
+        raise RuntimeError(_about_friction(system, coupling))
     if throw and (isinstance(failed, Tracer) or failed):
         # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
         spoiled = lambda y: y * jnp.where(failed, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
@@ -172,6 +176,9 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
     stuck = _failed(result)
     result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
     result = manifold.diagnose(system, *end, solution.solver_state, result, stuck & finite)
+    coupling = None
+    if system.friction_parts:
+        result, coupling = diagnose_friction(system, formulation, *end, result, stuck & finite)
     stats = dict(solution.stats)
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
@@ -185,7 +192,17 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, _failed(result)
+    return trajectory, _failed(result), coupling
+
+
+def _about_friction(system, coupling) -> str:
+    own = system.friction_rows[coupled_most(np.asarray(coupling))]
+    names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in own))
+    return (
+        f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on so "
+        "much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a compliant "
+        "contact has one. With `throw=False` the motion up to there is kept."
+    )
 
 
 def _failed(result) -> Any:

@@ -95,6 +95,10 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         return not self.nonideal
 
     @property
+    def friction_parts(self) -> frozenset[str]:
+        return frozenset(law.constraint for law in self.nonideal if law.of_multipliers)
+
+    @property
     def rates_are_velocities(self) -> bool:
         return self.kinematics.identity
 

@@ -30,12 +30,13 @@ else:
 class AbstractNonIdealForce(eqx.Module):
     """The force C of one constraint.
 
-    `constraint` is the name of the constraint, and `coefficients` are the names of the system's parameters that the law
-    uses.
+    `constraint` is the name of the constraint, `coefficients` are the names of the system's parameters that the law
+    uses, and `of_multipliers` says whether C depends on the constraint's multipliers.
     """
 
     constraint: AbstractVar[str]
     coefficients: AbstractVar[tuple[str, ...]]
+    of_multipliers: ClassVar[bool] = True
 
     @abc.abstractmethod
     def force(
@@ -105,12 +106,13 @@ class Viscous(AbstractNonIdealForce):
     constraint: str = eqx.field(static=True)
     coefficient: str = eqx.field(static=True)
     slip: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
+    of_multipliers: ClassVar[bool] = False
 
     @property
     def coefficients(self):
         return (self.coefficient,)
 
-    def force(self, t, q, v, ideal, multipliers, parameters):
+    def force(self, t, q, v, reaction, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
         return -parameters[self.coefficient] * pull(s)[0]
 
