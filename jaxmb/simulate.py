@@ -199,9 +199,9 @@ def _about_friction(system, coupling) -> str:
     own = system.friction_rows[coupled_most(np.asarray(coupling))]
     names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in own))
     return (
-        f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on so "
-        "much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a compliant "
-        "contact has one. With `throw=False` the motion up to there is kept."
+        f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on "
+        "so much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a "
+        "compliant contact has one. With `throw=False` the motion up to there is kept."
     )
 
 

@@ -1,7 +1,7 @@
 """Forces of constraints that depend on the constraints' own multipliers, such as Coulomb friction.
 
-Such a force C changes the multipliers that it depends on: with friction the normal force is not that of the frictionless
-joint. Of the rows that C depends on, the multipliers x solve
+Such a force C changes the multipliers that it depends on: with friction the normal force is not that of the joint
+without. Of the rows that C depends on, the multipliers x solve
 
     x = x⁰ + P C(x)
 
@@ -47,10 +47,11 @@ def find_multipliers(
     # Corrections shrink quadratically in the end: the next one is below rounding errors.
     tol = jnp.finfo(dtype).eps ** 0.75
     x, size = newton(correct, lambda _, size: ~(size <= tol), start, most=_CORRECTIONS, dtype=dtype)
-    solved = size <= tol
-    x = jnp.where(solved, x, start)
+    converged = size <= tol
+    x = jnp.where(converged, x, start)
     coupling = jnp.abs(value_and_slope(x)[1])
-    return x, coupling, ~(solved & contracts(coupling))
+    failed = ~(converged & contracts(coupling))
+    return jnp.where(failed, start, x), coupling, failed
 
 
 def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:

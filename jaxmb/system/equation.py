@@ -55,8 +55,8 @@ class AbstractSystem(eqx.Module):
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
     - `acceleration_rows`, `acceleration_rank`: rows of A and the number of independent ones.
-    - `ideal`: whether C is zero; `friction_parts`: names of the parts that C depends on the multipliers of; `positive_definite_mass`: whether M is positive definite for all velocities, also
-        those that violate constraints.
+    - `ideal`: whether C is zero; `friction_parts`: names of the parts that C depends on the multipliers of.
+    - `positive_definite_mass`: whether M is positive definite for all velocities, also those that violate constraints.
     - `rates_are_velocities`: whether q̇ = u.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
     - `has_bodies`: whether the system has bodies; `Trajectory[name]` is the motion of a body if so, otherwise of a
