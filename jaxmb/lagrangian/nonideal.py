@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.rotations import norm
-from ..parts.smooth import direction
+from ..parts.smooth import dry_friction
 from .kinematics import Parameters
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class CoulombFriction(AbstractNonIdealForce):
     def force(self, t, q, v, reaction, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
         normal = norm(reaction) if self.normal is None else jnp.abs(self.normal(t, q, multipliers, parameters))
-        return -parameters[self.coefficient] * normal * pull(direction(s, self.transition_speed))[0]
+        return pull(dry_friction(parameters[self.coefficient] * normal, s, self.transition_speed))[0]
 
 
 class Viscous(AbstractNonIdealForce):

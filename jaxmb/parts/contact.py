@@ -15,7 +15,7 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
-from .smooth import direction, ramp, step
+from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain
 
 Number = Float[Array, ""]
@@ -115,7 +115,7 @@ class Coulomb(AbstractFrictionLaw):
 
     def force(self, load, engaged, slip, travel):
         del engaged, travel
-        return -self.coefficient * load * direction(slip, self.transition_speed)
+        return dry_friction(self.coefficient * load, slip, self.transition_speed)
 
 
 class Janosi(AbstractFrictionLaw):

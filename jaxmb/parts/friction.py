@@ -7,7 +7,7 @@ import numpy as np
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractCompound, AbstractNonIdeal, rows_of
-from .smooth import direction
+from .smooth import dry_friction
 
 
 class Friction(AbstractNonIdeal):
@@ -72,4 +72,4 @@ class Friction(AbstractNonIdeal):
     def wrenches(self, space, poses, velocities, reactions, t):
         slip, pull = jax.vjp(lambda v: self.slip(space, poses, v), velocities)
         normal = norm(reactions[-1, : space.dimension])
-        return pull(-self.coefficient * normal * direction(slip, self.transition_speed))[0]
+        return pull(dry_friction(self.coefficient * normal, slip, self.transition_speed))[0]

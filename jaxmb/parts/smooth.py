@@ -13,14 +13,14 @@ def sign(speed: Float[Array, "*n"], transition_speed: Scalar) -> Float[Array, "*
     return jnp.tanh(speed / transition_speed)
 
 
-def direction(velocity: Float[Array, "d"], transition_speed: Scalar) -> Float[Array, "d"]:
-    """The direction of a velocity, regularised at rest: as long as `sign` of the speed."""
-    s = velocity / transition_speed
+def dry_friction(limit: Scalar, slip: Float[Array, "d"], transition_speed: Scalar) -> Float[Array, "d"]:
+    """A force against a velocity of slip, as large as `limit` times the `sign` of the speed."""
+    s = slip / transition_speed
     square = jnp.dot(s, s)
     small = square < 1e-3
     size = jnp.sqrt(jnp.where(small, 1.0, square))
     series = 1 - square * (1 / 3 - square * (2 / 15 - square * (17 / 315)))
-    return jnp.where(small, series, jnp.tanh(size) / size) * s
+    return -limit * jnp.where(small, series, jnp.tanh(size) / size) * s
 
 
 def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
