@@ -121,6 +121,7 @@ def test_friction_is_the_coefficient_times_the_normal_force(law):
     assert signs == {-1.0, 1.0}
 
 
+@pytest.mark.long
 def test_a_sliding_rod():
     """Its motion, with a slip that turns round, against an integration in its own coordinates."""
     times = np.linspace(0.0, 0.5, 6)
@@ -146,10 +147,14 @@ def into_the_paradox():
     return rod(mu=STEEP), rod_state(0.5, SLIDING, 6.0)
 
 
-SOLVERS = {"Adams": {}, "Tsit5": {"solver": diffrax.Tsit5(), "max_steps": 500, "rtol": 1e-6}}
+SOLVERS = {
+    "Adams": {},
+    "Tsit5": {"solver": diffrax.Tsit5(), "max_steps": 500, "rtol": 1e-6},
+    "Hermite": {"solver": mb.solvers.Hermite()},
+}
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", [pytest.param(s, marks=[pytest.mark.long][: s != "Adams"]) for s in SOLVERS])
 def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
     system, start = into_the_paradox()
     options = {"t1": 1.0, "saveat": diffrax.SaveAt(steps=True), "throw": False} | SOLVERS[solver]
@@ -265,6 +270,7 @@ def test_a_ladder_rubs_on_floor_and_wall():
     np.testing.assert_allclose(np.abs(multipliers), [floor, wall], rtol=1e-12)
 
 
+@pytest.mark.long
 def test_a_bead_in_a_rough_loop():
     """With the angle φ from the lowest point, `dv²/dφ = −2 g R sin φ − 2 μ (v² + g R cos φ)` has a closed form."""
     mu, start = 0.3, 12.0
@@ -279,6 +285,7 @@ def test_a_bead_in_a_rough_loop():
     np.testing.assert_allclose(np.sum(np.square(run["bead"].velocity[-1])), expected, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_a_bead_on_a_turning_wire():
     """Pressed on it by Coriolis' force, `r̈ = ω² r − 2 μ ω ṙ`."""
     mu, omega, start = 0.4, 3.0, 0.2
@@ -308,6 +315,7 @@ def test_a_bead_on_a_turning_wire():
 # Derivatives
 
 
+@pytest.mark.long
 def test_derivatives_of_accelerations():
     """Of the implicit equation, to second order: forward, reverse and differences."""
     system, y = rod(), rod_state(0.7, -1.5, 8.0)
@@ -329,6 +337,7 @@ def test_derivatives_of_accelerations():
     np.testing.assert_allclose(second, central, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.long
 def test_derivatives_of_a_motion():
     system, y = rod(), rod_state(1.2, 2.0, 0.0)
     names = ["rub.coefficient", "rod.mass"]
@@ -356,10 +365,10 @@ def test_derivatives_of_a_motion():
 
 def test_regularised_friction():
     v = jnp.array([0.3, -0.4])
-    np.testing.assert_allclose(smooth.dry_friction(2.0, v, 0.2), -2.0 * v / 0.5 * np.tanh(2.5), rtol=1e-15)
+    np.testing.assert_allclose(smooth.dry_friction(jnp.array(2.0), v, 0.2), -2.0 * v / 0.5 * np.tanh(2.5), rtol=1e-15)
     np.testing.assert_array_equal(smooth.sign(jnp.array([-5.0, 0.0, 5.0]), 0.1), [-1.0, 0.0, 1.0])
-    np.testing.assert_allclose(jax.jacfwd(smooth.dry_friction, 1)(2.0, jnp.zeros(2), 0.2), -10.0 * np.eye(2))
+    np.testing.assert_allclose(jax.jacfwd(smooth.dry_friction, 1)(jnp.array(2.0), jnp.zeros(2), 0.2), -10.0 * np.eye(2))
     # The series near rest joins the formula.
     for size in (0.0316, 0.0317):
-        force = smooth.dry_friction(1.0, size * v / 0.5, 1.0)
+        force = smooth.dry_friction(jnp.array(1.0), size * v / 0.5, 1.0)
         np.testing.assert_allclose(force, -v / 0.5 * np.tanh(size), rtol=1e-13)

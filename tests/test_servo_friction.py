@@ -118,7 +118,7 @@ def test_friction_takes_the_energy():
     times = np.linspace(0.0, 0.6, 61)
     motion = mb.simulate(system, start, t1=0.6, rtol=1e-11, saveat=jnp.asarray(times))
     # The pin carries the weight and what accelerates the arm.
-    bearing = 1.5 * np.linalg.norm(motion.accelerations[:, :2] + np.array([0.0, 9.81]), axis=-1)
+    bearing = 1.5 * np.linalg.norm(np.asarray(motion.accelerations)[:, :2] + np.array([0.0, 9.81]), axis=-1)
     slip = 0.05 * np.asarray(motion["arm"].angular_velocity)
     power = 0.3 * bearing * slip * np.tanh(slip / 1e-4)
     # Simpson's rule, away from the start, where the slip grows through the transition.

@@ -13,7 +13,7 @@ def sign(speed: Float[Array, "*n"], transition_speed: Scalar) -> Float[Array, "*
     return jnp.tanh(speed / transition_speed)
 
 
-def dry_friction(limit: Scalar, slip: Float[Array, "d"], transition_speed: Scalar) -> Float[Array, "d"]:
+def dry_friction(limit: Float[Array, ""], slip: Float[Array, "d"], transition_speed: Scalar) -> Float[Array, "d"]:
     """A force against a velocity of slip, as large as `limit` times the `sign` of the speed."""
     s = slip / transition_speed
     square = jnp.dot(s, s)
