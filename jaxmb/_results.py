@@ -8,7 +8,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     singular_configuration = (
         "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints "
-        "falls, and the motion beyond is not determined by them. With `throw=False` the motion up to there is kept."
+        "falls, or friction has no solution or more than one, and the motion beyond is not determined by them. With "
+        "`throw=False` the motion up to there is kept."
     )
     newton_failed = (
         "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives "

@@ -16,9 +16,11 @@ from jaxtyping import ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State, VectorLike
 from .formulations import AbstractFormulation
+from .formulations.friction import coupled_most
 from .linalg.arrays import as_array, is_traced
 from .linalg.failure import not_a_number_where
 from .manifold import AbstractManifold, default_manifold, find_jump
+from .manifold.diagnosis import diagnose_friction
 from .parts.names import unknown
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .solvers._tangent import TangentControl
@@ -182,10 +184,10 @@ def simulate(
         own = options | {"y0": start}
         return _integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
 
-    trajectory, failed, end = motion(solver)
+    trajectory, failed, end, coupling = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory, failed, end = motion(Hermite())
+        trajectory, failed, end, coupling = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -196,7 +198,8 @@ def simulate(
     if jumps is None and not system.drift_free and not is_traced((system, end, options["t0"], options["t1"])):
         _warn_of_jumps(system, end[1].q, options["t0"], options["t1"])
     if throw and not isinstance(failed, Tracer) and failed:
-        raise RuntimeError(_reason(system, trajectory.result, options["t1"], *lax.stop_gradient(end)))
+        reason = _about_friction(system, coupling) if np.any(coupling) else None
+        raise RuntimeError(reason or _reason(system, trajectory.result, options["t1"], *lax.stop_gradient(end)))
     if is_traced((failed, trajectory.ys)):
         # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.
@@ -243,7 +246,11 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
-    result = manifold.diagnose(system, *end, solution.solver_state, result, _failed(result) & finite)
+    stuck = _failed(result) & finite
+    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck)
+    coupling = None
+    if system.friction_parts:
+        result, coupling = diagnose_friction(system, formulation, *end, result, stuck)
     stats = dict(solution.stats)
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
@@ -257,7 +264,7 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, _failed(result), end
+    return trajectory, _failed(result), end, coupling
 
 
 @eqx.filter_custom_jvp
@@ -289,6 +296,16 @@ def _tangent_control(system, options, direction) -> TangentControl:
     units = jnp.concatenate([coordinates, velocities * rate]).astype(state.q.dtype)
     blocks = (0, system.nq), (system.nq, system.nq + system.nu)
     return lax.stop_gradient(TangentControl(units, blocks, direction))
+
+
+def _about_friction(system, coupling) -> str:
+    own = system.friction_rows[coupled_most(np.asarray(coupling))]
+    names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in own))
+    return (
+        f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on "
+        "so much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a "
+        "compliant contact has one. With `throw=False` the motion up to there is kept."
+    )
 
 
 def _failed(result) -> Any:

@@ -180,7 +180,7 @@ class PartitionTerm(AbstractManifoldTerm):
         return self._evaluate(t, q, y.u, chart)
 
     def _evaluate(self, t, q, u, chart):
-        system, split, quality = self.system, chart.split, chart.quality
+        system, split, quality, failed = self.system, chart.split, chart.quality, None
         if system.acceleration_rows == 0:
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
@@ -188,12 +188,15 @@ class PartitionTerm(AbstractManifoldTerm):
                 out = ideal_acceleration(system, self.formulation, t, q, u, split.velocity)
             else:
                 out = general_acceleration(system, self.formulation, t, q, u, split)
+                failed = out.failed
             u, udot, factors = out.u, out.udot, out.factor
             quality = _velocity_quality(system, factors, split.velocity)
             if split.coordinate is None:
                 split = ChartIndices(split.velocity, split.acceleration, None, factors.right_inverse)
         chart = Chart(split, quality, chart.fresh, chart.counters, chart.redundant)
-        return ManifoldEvaluation(State(q, u), State(system.rates(t, q, u), udot), chart, chart.singular, factors)
+        f = State(system.rates(t, q, u), udot)
+        failed = chart.singular if failed is None else chart.singular | failed
+        return ManifoldEvaluation(State(q, u), f, chart, failed, factors)
 
     def project_near(self, t, y, linearized_at, args):
         system, chart = self.system, linearized_at.chart

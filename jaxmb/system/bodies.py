@@ -110,6 +110,10 @@ class AbstractBodySystem(AbstractSystem):
         return not self.nonideal
 
     @property
+    def friction_parts(self) -> frozenset[str]:
+        return frozenset(name for g in self.nonideal for name in g.joints)
+
+    @property
     def positive_definite_mass(self) -> bool:
         return True
 
