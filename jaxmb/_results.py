@@ -8,12 +8,22 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     singular_configuration = (
         "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints "
-        "falls, and the motion beyond is not determined by them. With `throw=False` the motion up to there is kept."
+        "falls, or friction has no solution or more than one, and the motion beyond is not determined by them. With "
+        "`throw=False` the motion up to there is kept."
     )
     newton_failed = (
         "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives "
         "are not smooth, or numbers that are not finite. With `throw=False` the motion up to there is kept."
     )
+    inconsistent_constraints = (
+        "Constraint rows that others implied when the system was compiled are violated along the motion: they "
+        "contradict the others. Remove them, or make dimensions and prescribed motions agree. With `throw=False` the "
+        "motion up to there is kept."
+    )
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
+    )
+    invalid_parameters = (
+        "A parameter is not finite, or not of the sign that its part asks for, or a direction is not a unit vector. "
+        "`jaxmb.with_parameters` with numbers that are not traced names it."
     )

@@ -74,7 +74,8 @@ class Scene(eqx.Module):
         **Returns:** the system, a pytree whose leaves are the parameters.
 
         **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given
-        poses, and for constraints that contradict each other; the message names the parts.
+        poses, for constraints that contradict each other, and for singular poses, near which other rows are independent
+        than there; the message names the parts.
         """
         for body in self.bodies:
             _call(body, "check")

@@ -16,13 +16,17 @@ from jaxtyping import ArrayLike
 from ._results import RESULTS
 from ._types import Scalar, State, VectorLike
 from .formulations import AbstractFormulation
+from .formulations.friction import coupled_most
 from .linalg.arrays import as_array, is_traced
-from .manifold import AbstractManifold, default_manifold
+from .linalg.failure import not_a_number_where
+from .manifold import AbstractManifold, default_manifold, find_jump
+from .manifold.diagnosis import diagnose_friction
 from .parts.names import unknown
 from .solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from .solvers._one_step import OneStepController, with_tangents
 from .solvers._scales import RunningScales
 from .solvers._tangent import TangentControl
+from .states.consistency import consistent, contradiction
 from .system import AbstractSystem
 from .system.arguments import check_kind, real_array
 from .system.parameters import parameters, with_parameters
@@ -58,6 +62,7 @@ def simulate(
     atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
+    jumps: ArrayLike | None = None,
     event: diffrax.Event | None = None,
     direction: Mapping[str, VectorLike] | None = None,
     max_steps: int = 65536,
@@ -97,13 +102,23 @@ def simulate(
         them computed twice. For few parameters forward mode is faster and needs no memory: `jax.jacfwd` with
         `adjoint=diffrax.ForwardMode()`.
     - `direction`: parameters by name with a change of each, for runs that are differentiated; see below.
+    - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
+        and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
+        then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
+        does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
+        Without any, a warning tells of a jump or kink of a driver, except under `jit`, `vmap` or a derivative.
     - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work;
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
+    a state that violates the constraints (of other parameters, another system, another time), unless the manifold lets
+    states drift; under a trace such a run fails instead, with `RESULTS.assembly_failed`;
     `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
-    trajectory up to there is kept.
+    trajectory up to there is kept, with times and states of infinity after it. Under `jit`, `vmap` or a derivative,
+    where nothing can be kept for some members of a batch only, a motion that fails is not a number as a whole, and so
+    are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
+    members are as if it were not there.
 
     Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
     ones. A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
@@ -133,11 +148,14 @@ def simulate(
             stepsize_controller = MultistepController(relative, absolute, scales=scales)
         else:
             stepsize_controller = OneStepController.around(diffrax.PIDController(relative, absolute), scales)
+    if jumps is not None:
+        adaptive: Any = stepsize_controller
+        stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=_jump_times(jumps))
     if adjoint is None:
         size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-    saved = _save_at(saveat)
+    saved = _save_at(saveat, options["t0"], options["t1"])
     interpolated = event is not None or (saved.subs is not None and saved.subs.ts is not None)
     options |= {
         "y0": state,
@@ -150,22 +168,32 @@ def simulate(
     }
 
     changes = {} if direction is None else _changes(system, direction)
+    valid = system.parameters_in_range()
 
     def motion(solver):
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
+        jumping = jumps is not None and system.velocity_rows > 0
+        if jumping and not (policy.takes_impulses and system.positive_definite_mass):
+            raise ValueError(
+                "With jumps, a constrained system needs manifold=Partition() or Projection(), and a mass matrix that "
+                f"has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
+                f"{system.positive_definite_mass}."
+            )
         method = policy.default_formulation(system) if formulation is None else formulation
         term, prepared = policy.prepare(system, method, solver, relative)
+        start = consistent(system, options["t0"], state) if policy.restores else state
         along = None
         if direction is not None:
-            moved = lambda step: with_parameters(system, {k: start + step * x for k, (start, x) in changes.items()})
+            moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in changes.items()})
             changed = lambda step: policy.prepare(moved(step), method, solver, relative)[0]
             along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
-        return _integrate(system, method, policy, term, prepared, options, interpolated, along)
+        own = options | {"y0": start}
+        return _integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
 
-    trajectory, failed = motion(solver)
+    trajectory, failed, end, coupling = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        trajectory, failed = motion(Hermite())
+        trajectory, failed, end, coupling = motion(Hermite())
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -173,11 +201,19 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
-    if throw and (isinstance(failed, Tracer) or failed):
-        # The error goes with the value: a gradient that is taken alone would be that of the part before the failure.
-        spoiled = lambda y: y * jnp.where(failed, jnp.nan, 1.0).astype(y.dtype) if eqx.is_inexact_array(y) else y
-        trajectory = eqx.tree_at(lambda trajectory: trajectory.ys, trajectory, jax.tree.map(spoiled, trajectory.ys))
-        trajectory = trajectory.result.error_if(trajectory, failed)
+    if jumps is None and not system.drift_free and not is_traced((system, end, options["t0"], options["t1"])):
+        _warn_of_jumps(system, end[1].q, options["t0"], options["t1"])
+    if throw and not isinstance(failed, Tracer) and failed:
+        reason = _about_friction(system, coupling) if np.any(coupling) else None
+        raise RuntimeError(reason or _reason(system, trajectory.result, options["t1"], *lax.stop_gradient(end)))
+    if is_traced((failed, trajectory.ys)):
+        # A derivative would be that of the part before the failure. The error goes with the value, and not with a
+        # derivative that is taken alone.
+        motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
+        spoiled = not_a_number_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
+        trajectory = eqx.tree_at(motion_of, trajectory, spoiled, is_leaf=lambda leaf: leaf is None)
+        if throw:
+            trajectory = trajectory.result.error_if(trajectory, failed)
     return trajectory.trimmed()
 
 
@@ -194,9 +230,18 @@ def _changes(system: AbstractSystem, direction: Mapping[str, VectorLike]) -> dic
 
 
 @eqx.filter_jit
-def _integrate(system, formulation, manifold, term, solver, options, interpolated, direction):
+def _integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid):
+    start, first = options["y0"], options["saveat"].subs[0]
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
+    # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
+    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
+    options = options | {"t1": at_once(options["t1"])}
+    if times is not None:
+        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(times))
     solution: Any = _solve(term, solver, options, _tangent_control(system, options, direction))
     ts, saved = solution.ts[0], solution.ys[0]
+    if times is not None:
+        ts = jnp.where(finite, ts, jnp.inf)
     correction = manifold.correction(interpolated)
     # `SaveAt(fn=...)` may save something else than states.
     are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
@@ -204,11 +249,14 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         saved = _corrected(system, ts, saved, correction)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
-    start = options["y0"]
-    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u))
-    stuck = _failed(result)
-    result = RESULTS.where(stuck & ~finite, RESULTS.assembly_failed, result)
-    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck & finite)
+    result = RESULTS.where(finite, result, RESULTS.assembly_failed)
+    if valid is not True:
+        result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
+    stuck = _failed(result) & finite
+    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck)
+    coupling = None
+    if system.friction_parts:
+        result, coupling = diagnose_friction(system, formulation, *end, result, stuck)
     stats = dict(solution.stats)
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
@@ -222,7 +270,7 @@ def _integrate(system, formulation, manifold, term, solver, options, interpolate
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, _failed(result)
+    return trajectory, _failed(result), end, coupling
 
 
 @eqx.filter_custom_jvp
@@ -263,8 +311,45 @@ def _running_scales(system, state, options) -> RunningScales:
     return lax.stop_gradient(RunningScales(units, system.nq, 1 / jnp.where(span > 0, span, 1.0)))
 
 
+def _about_friction(system, coupling) -> str:
+    own = system.friction_rows[coupled_most(np.asarray(coupling))]
+    names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in own))
+    return (
+        f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on "
+        "so much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a "
+        "compliant contact has one. With `throw=False` the motion up to there is kept."
+    )
+
+
 def _failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+
+
+def _warn_of_jumps(system, q, t0, t1) -> None:
+    t, row, found = find_jump(system, q, t0, t1)
+    if found:
+        # The rows of ψ, then those of A.
+        name = (*system.rows[: system.velocity_rows], *system.rows)[int(row)][0]
+        warnings.warn(
+            f"The motion that {name!r} prescribes has a jump or a kink at t = {float(t):.6g}, which an integration "
+            f"passes without an impulse or in many steps; simulate(..., jumps=[{float(t):.6g}]) restarts there.",
+            stacklevel=3,
+        )
+
+
+def _reason(system, result, t1, t, y) -> str:
+    """Why a simulation ended at a state, in one line, with what is not finite there or just beyond."""
+    text = RESULTS[result]
+    if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate([y.q, y.u]))):
+        return text
+    if result == RESULTS.inconsistent_constraints:
+        return contradiction(system, t, y)
+    rates = system.rates(t, y.q, y.u)
+    for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
+        wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
+        if wrong:
+            return f"{text.rstrip('.')}: at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
+    return text
 
 
 def _corrected(system, ts, saved, correction):
@@ -307,17 +392,38 @@ def _tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     return relative, relative / 100 if absolute is None else absolute
 
 
-def _save_at(saveat) -> diffrax.SaveAt:
+def _save_at(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
     if saveat is None:
         return diffrax.SaveAt(t1=True)
     if isinstance(saveat, diffrax.SaveAt):
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
+        if saveat.subs is not None and saveat.subs.ts is not None:
+            _check_saved_times(saveat.subs.ts, start, end)
         return saveat
-    ts = real_array("saveat", saveat, jnp.result_type(float), None)
+    return diffrax.SaveAt(ts=jax.device_put(_check_saved_times(saveat, start, end)))
+
+
+def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
+    ts = real_array("saveat", times, jnp.result_type(float), None)
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
-    return diffrax.SaveAt(ts=jax.device_put(ts))
+    if is_traced((ts, start, end)):
+        return ts
+    if not (min(start, end) <= ts.min() and ts.max() <= max(start, end)):
+        raise ValueError(
+            f"saveat must lie between t0 = {start:g} and t1 = {end:g}, got times from {ts.min():g} to {ts.max():g}."
+        )
+    if np.any(np.diff(ts) * (1 if start <= end else -1) < 0):
+        raise ValueError(f"saveat must run from t0 to t1 without turning back, got {ts}.")
+    return ts
+
+
+def _jump_times(jumps: Any) -> Any:
+    times = real_array("jumps", jumps, jnp.result_type(float), None)
+    if times.ndim != 1 or times.shape[0] == 0 or not (is_traced(times) or np.all(np.isfinite(times))):
+        raise ValueError(f"jumps must be a vector of finite times, got {jumps!r}; leave it out if there are none.")
+    return jnp.asarray(times)
 
 
 def _with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:

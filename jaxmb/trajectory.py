@@ -1,5 +1,6 @@
 """A motion, with views by name."""
 
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,8 +46,20 @@ class _ByName(Mapping[str, Any]):
         return len(self._names)
 
 
+def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
+    """A view of one motion as that of any batch of motions, whose arrays all have the batch's axes before their own."""
+
+    @functools.wraps(view)
+    def of_all(trajectory, *arguments):
+        if trajectory.ts.ndim <= 1:
+            return view(trajectory, *arguments)
+        return eqx.filter_vmap(lambda member: of_all(member, *arguments))(trajectory)
+
+    return of_all
+
+
 class Trajectory(eqx.Module):
-    """The motion that `simulate` returns.
+    """The motion that `simulate` returns, or a batch of them.
 
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
@@ -54,6 +67,9 @@ class Trajectory(eqx.Module):
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
     `BodyMotion`; of a system in generalized coordinates it is that of a coordinate, shape (times,).
+
+    In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
+    that are given here.
     """
 
     system: Any
@@ -69,6 +85,10 @@ class Trajectory(eqx.Module):
         names = self.system.motion_names()
         if name not in names:
             raise unknown("body" if self.system.has_bodies else "coordinate", name, names)
+        return self._motion(name)
+
+    @_of_each_member
+    def _motion(self, name):
         return self.system.motion(name, self.ys)
 
     def quantity(self, name: str) -> Array:
@@ -78,15 +98,26 @@ class Trajectory(eqx.Module):
         known = self.system.quantities()
         if name not in known:
             raise unknown("quantity", name, known)
-        return known[name].value(self.ts, self.ys, self.multipliers if known[name].of_forces else None)
+        return self._measured((name,))[name]
+
+    @_of_each_member
+    def _measured(self, names):
+        known = {name: quantity for name, quantity in self.system.quantities().items() if name in names}
+        multipliers = self.multipliers if any(quantity.of_forces for quantity in known.values()) else None
+        return {name: quantity.value(self.ts, self.ys, multipliers) for name, quantity in known.items()}
 
     def at(self, t: ArrayLike) -> State:
-        """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints."""
-        interpolation = self.interpolation
-        if interpolation is None:
+        """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
+        same times of every member.
+        """
+        if self.interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
+        return self._at(t)
+
+    @_of_each_member
+    def _at(self, t):
         t = jnp.asarray(t, self.ys_dtype)
-        out = _between(self.system, interpolation, t.reshape(-1))
+        out = _between(self.system, self.interpolation, t.reshape(-1))
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
 
     @property
@@ -95,12 +126,14 @@ class Trajectory(eqx.Module):
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def kinetic_energy(self) -> Float[Array, "times"]:
         """Kinetic energy [J]."""
         return jax.vmap(lambda t, y: self.system.kinetic_energy(t, y.q, y.u))(self.ts, self.ys)
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
         return jax.vmap(lambda t, y: self.system.potential_energy(t, y.q))(self.ts, self.ys)
@@ -112,17 +145,20 @@ class Trajectory(eqx.Module):
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def linear_momentum(self) -> Float[Array, "times d"]:
         """`Σ m v` [kg m/s], world axes."""
         return jax.vmap(lambda y: self.system.linear_momentum(y.q, y.u))(self.ys)
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def angular_momentum(self) -> Float[Array, "times *d"]:
         """Moment of momentum about the world origin [kg m²/s]."""
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
 
     @property
+    @_of_each_member
     def rates(self) -> Float[Array, "times nq"]:
         """q̇ of every coordinate."""
         return self.system.rates_along(self.ts, self.ys)
@@ -139,31 +175,42 @@ class Trajectory(eqx.Module):
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def _solved(self):
         return jax.vmap(lambda t, y: accelerations(self.system, self.formulation, t, y.q, y.u))(self.ts, self.ys)
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
         """Forces of the joints of rigid bodies by name: `reactions["A"].force`."""
-        value = lambda name: self.system.reaction(name, self.ts, self.ys, self.multipliers)
-        return _ByName("joint", self.system.joint_names(), value)
+        return _ByName("joint", self.system.joint_names(), self._reaction)
+
+    @_of_each_member
+    def _reaction(self, name):
+        return self.system.reaction(name, self.ts, self.ys, self.multipliers)
 
     @property
     def constraint_forces(self) -> Mapping[str, Array]:
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
-        value = lambda name: self.system.generalized_constraint_force(name, self.ts, self.ys, self.multipliers)
-        return _ByName("joint", self.system.constraint_names(), value)
+        return _ByName("joint", self.system.constraint_names(), self._constraint_force)
+
+    @_of_each_member
+    def _constraint_force(self, name):
+        return self.system.generalized_constraint_force(name, self.ts, self.ys, self.multipliers)
 
     @property
     def forces(self) -> Mapping[str, Array]:
         """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
         (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
         """
-        value = lambda name: self.system.applied_wrenches(name, self.ts, self.ys)
-        return _ByName("force", self.system.force_names(), value)
+        return _ByName("force", self.system.force_names(), self._wrenches)
+
+    @_of_each_member
+    def _wrenches(self, name):
+        return self.system.applied_wrenches(name, self.ts, self.ys)
 
     @property
     @eqx.filter_jit
+    @_of_each_member
     def constraint_violation(self) -> ConstraintViolation:
         """Largest scaled residuals of position and velocity constraints at every saved time."""
 
@@ -188,9 +235,8 @@ class Trajectory(eqx.Module):
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
-        for name, quantity in self.system.quantities().items():
-            if not quantity.of_forces:
-                out[name] = np.asarray(quantity.value(self.ts, self.ys, None))
+        free = {name for name, quantity in self.system.quantities().items() if not quantity.of_forces}
+        out |= {name: np.asarray(value) for name, value in self._measured(free).items()}
         out["energy"] = np.asarray(self.energy)
         for name, value in self.stats.items():
             if value is not None:

@@ -160,7 +160,7 @@ PLANAR = [
         preload=5.0,
         travel=0.2,
         stop_stiffness=500.0,
-        transition=0.5,
+        transition_speed=0.5,
         smoothing=0.05,
         free_length=0.3,
     ),
@@ -211,7 +211,9 @@ FUNCTIONS = [
     on_body_2d(mb.Force, "drag", function=drag, parameters={"drag": 0.2}),
     rubbing(lambda n, pin: mb.NonIdeal(n, pin, function=rub, parameters={"share": 1e-3}), "NonIdeal", "share"),
     rubbing(
-        lambda n, pin: planar.Friction(n, pin, coefficient=0.3, radius=0.1, smoothing=0.05), "Friction", "coefficient"
+        lambda n, pin: planar.Friction(n, pin, coefficient=0.3, radius=0.1, transition_speed=0.05),
+        "Friction",
+        "coefficient",
     ),
     program(),
 ]
@@ -258,7 +260,7 @@ def pin_3d(body):
 def rubbing_3d():
     own = body_3d("Friction body", angular_velocity=(1.8, 0.0, 2.4))
     pin = pin_3d(own)
-    part = spatial.Friction("Friction", pin.name, coefficient=0.3, radius=0.1, smoothing=0.05)
+    part = spatial.Friction("Friction", pin.name, coefficient=0.3, radius=0.1, transition_speed=0.05)
     return Example(part, [own], "coefficient", (pin,), (hold_3d(own),), ideal=False)
 
 

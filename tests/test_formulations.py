@@ -235,7 +235,7 @@ def motion_by(system, formulations, q, u):
         jacobian = jax.vmap(lambda q, u: pivoted_jacobian(system, t, q, u))(q, u)
         lane = lambda tree, k: jax.tree.map(lambda x: x[k], tree)
         pairs = [
-            solve_constrained(system, formulation, t, q[k], u[k], lane(jacobian, k))
+            solve_constrained(system, formulation, t, q[k], u[k], lane(jacobian, k))[:2]
             for k, formulation in enumerate(formulations.values())
         ]
         udot, multipliers = (jnp.stack(values) for values in zip(*pairs, strict=True))

@@ -13,7 +13,8 @@ import pytest
 from jax.extend import core
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import lagrangian, planar, spatial
+from jaxmb.formulations import formulation
 from jaxmb.linalg import elimination, rotations
 from jaxmb.manifold import constrained, orthogonal_projection, partition
 from jaxmb.parts import contact
@@ -195,3 +196,18 @@ def test_building_a_scene_compiles_nothing_but_its_analysis():
     assert float(stiffness) == 4.0
     # Whether its joint and its spring turn the point mass is asked of themselves.
     assert names == {"_analyse", "_strength"}
+
+
+def test_forces_that_no_reaction_changes_are_not_solved_for(monkeypatch):
+    refuse(monkeypatch, formulation, "find_multipliers", "root")
+    viscous = lagrangian.LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(v, v),
+        constraints=[lagrangian.Holonomic("ring", lambda t, q, p: 0.5 * (jnp.dot(q, q) - 1.0))],
+        nonideal=[lagrangian.Viscous("ring", "c")],
+        q=(1.0, 0.0),
+        parameters={"c": 0.2},
+    )
+    program(viscous)
+    program(mb.mechanisms.get("four_bar").system)
+    with pytest.raises(AssertionError, match="find_multipliers is traced"):
+        program(mb.mechanisms.get("rough_ring").system)

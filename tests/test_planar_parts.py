@@ -280,7 +280,7 @@ def springs(damping):
             travel=0.2,
             stop_stiffness=50.0,
             damping=0.5 * damping,
-            transition=2.0,
+            transition_speed=2.0,
             smoothing=0.3,
             free_length=0.4,
             **points,

@@ -75,7 +75,7 @@ def test_derivatives_of_the_tension_are_finite_everywhere(extension, rate):
     [
         ({"slack": -0.01}, "slack must be non-negative"),
         ({"unloading": 1.5}, "unloading .* at most 1"),
-        ({"transition": 0.0}, "transition must be positive"),
+        ({"transition_speed": 0.0}, "transition_speed must be positive"),
         ({"smoothing": 0.0}, "smoothing must be positive"),
         ({"travel": 0.0}, "travel must be positive"),
     ],
@@ -175,7 +175,7 @@ def collision():
 
     return peak, {
         f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"]
-        for name in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition")
+        for name in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition_speed")
     }
 
 

@@ -6,17 +6,21 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ..linalg.elimination import eliminate, full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
+from ..linalg.newton import root
 from ..system import AbstractSystem
+from .friction import find_multipliers
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -82,16 +86,33 @@ def accelerations(
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
     """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
-    `A u̇ = γ − gamma_shift`.
+    `A u̇ = γ − gamma_shift`. NaN where friction does not determine them.
 
     **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
     """
     check_mass(system, formulation)
     if system.acceleration_rows == 0:
         return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
+    jacobian = _jacobian(system, formulation, t, q, u)
+    udot, multipliers, failed = solve_constrained(system, formulation, t, q, u, jacobian, gamma_shift)
+    if failed is None:
+        return udot, multipliers
+    return jnp.where(failed, jnp.nan, udot), jnp.where(failed, jnp.nan, multipliers)
+
+
+def _jacobian(system, formulation, t, q, u):
     searches = formulation.partitions or system.acceleration_rank < system.acceleration_rows
-    jacobian = pivoted_jacobian(system, t, q, u) if searches else system.structured_jacobian(t, q, u)
-    return solve_constrained(system, formulation, t, q, u, jacobian, gamma_shift)
+    return pivoted_jacobian(system, t, q, u) if searches else system.structured_jacobian(t, q, u)
+
+
+class Solution(NamedTuple):
+    """Accelerations u̇ and multipliers λ, and whether they `failed` to be determined; None of a system where no force
+    depends on multipliers.
+    """
+
+    udot: Float[Array, "nu"]
+    multipliers: Float[Array, "m"]
+    failed: Bool[Array, ""] | None
 
 
 def solve_constrained(
@@ -102,17 +123,54 @@ def solve_constrained(
     u: Float[Array, "nu"],
     jacobian: AbstractJacobian,
     gamma_shift: Float[Array, "m"] | None = None,
-) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+) -> Solution:
     """The same as `accelerations`, from a Jacobian A that is known already.
 
-    Where constraints are not ideal, their force C follows from the multipliers of ideal ones, and then accelerations
-    from C as from any other force (F. E. Udwadia and P. Phohomsiri, Proc. R. Soc. A 463, 2007): `M u̇ = F + C + Aᵀ λ`.
+    Where constraints are not ideal, `M u̇ = F + C + Aᵀ λ`. A force C that depends on multipliers depends on these λ, not
+    on those of ideal constraints, and is solved for with them. Where it does not determine them, C is that of the
+    multipliers of ideal constraints.
     """
     inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     gamma = gamma if gamma_shift is None else gamma - gamma_shift
     udot, multipliers = formulation.solve(inertia, force, jacobian, gamma)
     if system.ideal:
-        return udot, multipliers
+        return Solution(udot, multipliers, None)
+    failed, rows = None, system.friction_rows
+    if rows.size:
+        found, _, failed = _friction(*lax.stop_gradient((system, t, q, u, inertia, jacobian, multipliers)), formulation)
+
+        def residual(own):
+            law = system.nonideal_force(t, q, u, multipliers.at[rows].set(own))
+            return own - formulation.solve(inertia, force + law, jacobian, gamma)[1][rows]
+
+        multipliers = multipliers.at[rows].set(root(residual, found, lambda _, found: found))
     force = force + system.nonideal_force(t, q, u, multipliers)
-    return formulation.solve(inertia, force, jacobian, gamma)
+    return Solution(*formulation.solve(inertia, force, jacobian, gamma), failed)
+
+
+def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
+    """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined."""
+    rows, none = system.friction_rows, jnp.zeros_like(ideal)
+    law = lambda own: system.nonideal_force(t, q, u, none.at[rows].set(own))
+    respond = lambda force: formulation.solve(inertia, force, jacobian, none)[1][rows]
+    _, pull = jax.vjp(respond, jnp.zeros_like(u))
+    (influence,) = jax.vmap(pull)(jnp.eye(rows.size, dtype=u.dtype))
+    return find_multipliers(law, influence, ideal[rows])
+
+
+def friction_coupling(
+    system: AbstractSystem,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    u: Float[Array, "nu"],
+) -> Float[Array, "k k"]:
+    """How much the multipliers that friction depends on change with themselves, through its force, at a state; see
+    `friction`. Without derivative.
+    """
+    system, t, q, u = lax.stop_gradient((system, t, q, u))
+    jacobian, inertia = _jacobian(system, formulation, t, q, u), system.inertia(t, q, u)
+    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+    _, ideal = formulation.solve(inertia, system.force(t, q, u), jacobian, gamma)
+    return _friction(system, t, q, u, inertia, jacobian, ideal, formulation)[1]

@@ -95,6 +95,10 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         return not self.nonideal
 
     @property
+    def friction_parts(self) -> frozenset[str]:
+        return frozenset(law.constraint for law in self.nonideal if law.of_multipliers)
+
+    @property
     def rates_are_velocities(self) -> bool:
         return self.kinematics.identity
 
@@ -172,10 +176,10 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         total = jnp.zeros_like(q)
         for law in self.nonideal:
             mine = jnp.array([name == law.constraint for name, _ in self.rows])
-            ideal = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
+            reaction = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
             first = [name for name, _ in self.rows].index(law.constraint)
             own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
-            total = total + law.force(t, q, v, ideal, own, self.parameters)
+            total = total + law.force(t, q, v, reaction, own, self.parameters)
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):

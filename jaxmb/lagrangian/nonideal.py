@@ -1,11 +1,8 @@
 """Non-ideal constraint forces, which do virtual work.
 
-A constraint that is not ideal adds a force C, given by its work in displacements w that the constraints allow, `w · C`:
-the components of C along the gradients of constraints have no effect. C may depend on the force that the constraint
-would exert if it were ideal.
-
-Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems", Proc.
-R. Soc. A 463, 2007.
+A constraint that is not ideal exerts the force `Aᵀ λ + C`: its reaction, which does no work in displacements that the
+constraints allow, and a force C, which does. C may depend on the reaction, and is then solved for with it. What C has
+along the gradients of the constraint the reaction balances, and has that much less itself.
 """
 
 import abc
@@ -19,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.rotations import norm
+from ..parts.smooth import dry_friction
 from .kinematics import Parameters
 
 if TYPE_CHECKING:
@@ -30,12 +28,13 @@ else:
 class AbstractNonIdealForce(eqx.Module):
     """The force C of one constraint.
 
-    `constraint` is the name of the constraint, and `coefficients` are the names of the system's parameters that the law
-    uses.
+    `constraint` is the name of the constraint, `coefficients` are the names of the system's parameters that the law
+    uses, and `of_multipliers` says whether C depends on the constraint's multipliers.
     """
 
     constraint: AbstractVar[str]
     coefficients: AbstractVar[tuple[str, ...]]
+    of_multipliers: ClassVar[bool] = True
 
     @abc.abstractmethod
     def force(
@@ -43,14 +42,14 @@ class AbstractNonIdealForce(eqx.Module):
         t: Scalar,
         q: Float[Array, "nq"],
         v: Float[Array, "nq"],
-        ideal: Float[Array, "nq"],
+        reaction: Float[Array, "nq"],
         multipliers: Float[Array, "rows"],
         parameters: Parameters,
     ) -> Float[Array, "nq"]:
         """C as a generalized force on the coordinates.
 
-        **Arguments:** `v`: q̇; `ideal`: the generalized force that the constraint would exert if all were ideal, and
-        `multipliers`: those of its rows then.
+        **Arguments:** `v`: q̇; `reaction`: the constraint's generalized force `Aᵀ λ`, from the `multipliers` λ of its
+        rows.
         """
 
 
@@ -61,14 +60,15 @@ class NonIdealForce(AbstractNonIdealForce):
     function: Callable[..., Array] = eqx.field(static=True)
     coefficients: ClassVar[tuple[str, ...]] = ()
 
-    def force(self, t, q, v, ideal, multipliers, parameters):
+    def force(self, t, q, v, reaction, multipliers, parameters):
         return jnp.asarray(self.function(t, q, v, multipliers, parameters))
 
 
 class CoulombFriction(AbstractNonIdealForce):
-    """Coulomb friction: a force of `coefficient` times the constraint's own ideal force, against the slip s(t, q, q̇).
+    """Coulomb friction: a force of `coefficient` times the constraint's reaction, against the slip s(t, q, q̇).
 
-    Its work is `−μ N s·δs / √(s·s + ε²)`. Near rest it is smooth: full only where the slip is large against ε.
+    Its work is `−μ N s·δs/|s| tanh(|s| / transition_speed)`, which is smooth at rest. If no such N exists, or more than
+    one (Painlevé's paradox), a simulation ends with `singular_configuration`.
 
     **Arguments:**
 
@@ -77,23 +77,23 @@ class CoulombFriction(AbstractNonIdealForce):
         Cartesian coordinates.
     - `normal(t, q, multipliers, parameters)`: the normal force N [N]; default the length of the constraint's
         generalized force, that of a particle in Cartesian coordinates.
-    - `smoothing`: ε [m/s].
+    - `transition_speed` [m/s], the slip at which 76 % of the friction acts.
     """
 
     constraint: str = eqx.field(static=True)
     coefficient: str = eqx.field(static=True)
     slip: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
     normal: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
-    smoothing: float = eqx.field(static=True, default=1e-6, kw_only=True)
+    transition_speed: float = eqx.field(static=True, default=1e-4, kw_only=True)
 
     @property
     def coefficients(self):
         return (self.coefficient,)
 
-    def force(self, t, q, v, ideal, multipliers, parameters):
+    def force(self, t, q, v, reaction, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
-        normal = norm(ideal) if self.normal is None else jnp.abs(self.normal(t, q, multipliers, parameters))
-        return -parameters[self.coefficient] * normal * pull(s / jnp.sqrt(s @ s + self.smoothing**2))[0]
+        normal = norm(reaction) if self.normal is None else jnp.abs(self.normal(t, q, multipliers, parameters))
+        return pull(dry_friction(parameters[self.coefficient] * normal, s, self.transition_speed))[0]
 
 
 class Viscous(AbstractNonIdealForce):
@@ -105,12 +105,13 @@ class Viscous(AbstractNonIdealForce):
     constraint: str = eqx.field(static=True)
     coefficient: str = eqx.field(static=True)
     slip: Callable[..., Array] | None = eqx.field(static=True, default=None, kw_only=True)
+    of_multipliers: ClassVar[bool] = False
 
     @property
     def coefficients(self):
         return (self.coefficient,)
 
-    def force(self, t, q, v, ideal, multipliers, parameters):
+    def force(self, t, q, v, reaction, multipliers, parameters):
         s, pull = jax.vjp(lambda v: _slip(self.slip, t, q, v, parameters), v)
         return -parameters[self.coefficient] * pull(s)[0]
 

@@ -14,6 +14,7 @@ from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
+from ..states.redundancy import check_gradients, check_implied
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
@@ -113,6 +114,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     if not np.all(np.isfinite(found.jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
     position, velocity, acceleration, *others = map(int, found.row_ranks)
+    check_gradients(system, found.jacobian)
     linear = system.kinematics.linear and all(c.is_linear(q, p) for c in system.constraints)
     drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
     if linear:
@@ -121,6 +123,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
     rows = slice(system.velocity_rows, system.acceleration_rows)
     _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
+    check_implied(system, found.q, found.row_orders[0, :position], found.row_orders[2, :acceleration])
     _check_nonideal(system, acceleration, others)
     diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
     sizes = np.linalg.eigvalsh(found.inertia)
@@ -134,11 +137,12 @@ def find_structure(system: AbstractLagrangian) -> Structure:
 
 
 class _Numbers(NamedTuple):
-    """Rates, second derivatives of L and mass matrix at the guess, second derivatives with other parameters; slopes of
-    the constraints between velocities; the residual that remains of the constraints between positions; A, γ, ψ, and
-    the ranks of some rows of A.
+    """A configuration on the constraints; rates, second derivatives of L and mass matrix at the guess, second
+    derivatives with other parameters; slopes of the constraints between velocities; the residual that remains of the
+    constraints between positions; A, γ, ψ, and of some sets of rows of A the ranks and the orders of elimination.
     """
 
+    q: Any
     rates: Any
     mass: Any
     inertia: Any
@@ -150,6 +154,7 @@ class _Numbers(NamedTuple):
     right: Any
     unmet: Any
     row_ranks: Any
+    row_orders: Any
 
 
 @eqx.filter_jit
@@ -169,8 +174,9 @@ def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
         residual = residual_size(system, t, q, linearized)
         coordinate_rank = full_pivot(system.coordinate_jacobian(t, q)).rank
     jacobian = system.jacobian(t, q, u)
-    rank = lambda own: full_pivot(jnp.where(own[:, None], jacobian, 0.0)).rank
+    pivots = jax.vmap(lambda own: full_pivot(jnp.where(own[:, None], jacobian, 0.0)))(_row_sets(system))
     return _Numbers(
+        q=q,
         rates=v,
         mass=mass,
         inertia=inertia,
@@ -181,7 +187,8 @@ def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
         jacobian=jacobian,
         right=-system.acceleration_residual(t, q, u, jnp.zeros_like(u)),
         unmet=system.velocity_residual(t, q, u),
-        row_ranks=jax.vmap(rank)(_row_sets(system)),
+        row_ranks=pivots.rank,
+        row_orders=pivots.order.packed,
     )
 
 

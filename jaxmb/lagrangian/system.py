@@ -55,8 +55,9 @@ class LagrangianSystem(AbstractLagrangian):
     - `length`: the size that residuals of positions are relative to.
 
     **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
-    that no positions satisfy near the guess, constraints on velocities or accelerations that contradict others,
-    friction of a constraint that others imply, and names that are not unique.
+    that no positions satisfy near the guess, constraints on velocities or accelerations that contradict others, a guess
+    at a singular position, where a row has no gradient or is implied by others, but not near it, friction of a
+    constraint that others imply, and names that are not unique.
     """
 
     diagonal: bool = eqx.field(static=True)

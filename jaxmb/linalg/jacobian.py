@@ -36,6 +36,10 @@ class AbstractJacobian(eqx.Module):
         """`Aᵀ λ`."""
 
     @abc.abstractmethod
+    def row_norms(self, scale: Float[Array, "n"]) -> Float[Array, "m"]:
+        """The norm of each row, its columns multiplied by a scale."""
+
+    @abc.abstractmethod
     def gather_rows(self, values: Float[Array, "m"]) -> Float[Array, "*r"]:
         """The values of the independent rows, in the shape that `gram` takes."""
 
@@ -106,6 +110,9 @@ class DenseJacobian(AbstractJacobian):
 
     def transpose_product(self, multipliers):
         return self.matrix.T @ multipliers
+
+    def row_norms(self, scale):
+        return jnp.linalg.norm(self.matrix * scale[None, :], axis=1)
 
     def gather_rows(self, values):
         return values if self.factor is None else values[self.factor.rows]
@@ -181,6 +188,9 @@ class BlockJacobian(AbstractJacobian):
             for side, joint in ((self.before, order.joint_before), (self.after, order.joint_after))
         ]
         return self._of_velocities((forces[0] + forces[1])[:, :, None])[:, 0]
+
+    def row_norms(self, scale):
+        return jnp.sqrt(BlockJacobian(self.before**2, self.after**2, self.order).product(scale**2))
 
     def gather_rows(self, values):
         return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)

@@ -4,6 +4,8 @@ Source: J. Baumgarte, "Stabilization of constraints and integrals of motion in d
 Mech. Eng. 1, 1972.
 """
 
+from typing import ClassVar
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,10 +29,13 @@ class Baumgarte(AbstractManifold):
     """
 
     rate: float = eqx.field(static=True, default=10.0)
+    restores: ClassVar[bool] = False
 
     def __check_init__(self):
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ValueError(f"Baumgarte: rate must be positive and finite, got {self.rate}.")
+
+    takes_impulses: ClassVar[bool] = False
 
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)

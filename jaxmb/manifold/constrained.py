@@ -42,11 +42,14 @@ class ChartIndices(eqx.Module):
 
 
 class ConstrainedAcceleration(eqx.Module):
-    """Velocities on the manifold of their coordinates, accelerations, and the factor of the velocities' Jacobian."""
+    """Velocities on the manifold of their coordinates, accelerations, the factor of the velocities' Jacobian, and
+    whether friction `failed` to determine the accelerations; None of a system without.
+    """
 
     u: Float[Array, "nu"]
     udot: Float[Array, "nu"]
     factor: Factor
+    failed: Bool[Array, ""] | None = None
 
 
 class RestoredState(eqx.Module):
@@ -137,8 +140,8 @@ def general_acceleration(
         u = u - solved.right_inverse @ system.velocity_residual(t, q, u)
     jacobian = system.jacobian(t, q, u)
     every = solved if split.acceleration is None else eliminate(jacobian, split.acceleration, system.acceleration_rank)
-    udot, _ = solve_constrained(system, formulation, t, q, u, DenseJacobian(jacobian, every))
-    return ConstrainedAcceleration(u, udot, solved)
+    out = solve_constrained(system, formulation, t, q, u, DenseJacobian(jacobian, every))
+    return ConstrainedAcceleration(u, out.udot, solved, out.failed)
 
 
 @eqx.filter_jit

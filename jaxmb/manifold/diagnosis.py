@@ -1,25 +1,30 @@
-"""The reason why a simulation on independent coordinates failed."""
+"""The reason why a simulation failed."""
 
 from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from .._results import RESULTS
 from .._types import Scalar, State
-from ..formulations.formulation import row_levels
+from ..formulations import AbstractFormulation
+from ..formulations.formulation import friction_coupling, row_levels
+from ..formulations.friction import contracts
 from ..linalg.elimination import full_pivot
 from ..system import AbstractSystem
 
 # A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
 _SINGULAR_PIVOT = 1e-3
+# The same for the coupling of friction with its own reactions, which it is this close to a singular one.
+_SINGULAR_COUPLING = 1e-3
 
 
 def diagnose(
     system: AbstractSystem, t: Scalar, y: State, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]
 ) -> Any:
-    """Tell singular configurations, and failures of Newton's method, from other failures.
+    """Tell singular configurations, and failures of Newton's method, from other failures of a simulation on independent
+    coordinates.
 
     **Arguments:** `t`, `y`: the last state; `singular`: whether the chart there has lost rank already; `result`: a
     `RESULTS`; `failed`: whether it is a failure.
@@ -37,3 +42,23 @@ def diagnose(
     newton = failed & ~singular & (result == RESULTS.dt_min_reached)
     result = RESULTS.where(singular, RESULTS.singular_configuration, result)
     return RESULTS.where(newton, RESULTS.newton_failed, result)
+
+
+def diagnose_friction(
+    system: AbstractSystem,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    y: State,
+    result: Any,
+    failed: Bool[Array, ""],
+) -> tuple[Any, Float[Array, "k k"]]:
+    """Tell failures where friction has no solution, or more than one.
+
+    **Arguments:** as in `diagnose`.
+
+    **Returns:** the result, and the coupling of friction with its own reactions; zero where it is not the reason.
+    """
+    none = jnp.zeros((system.friction_rows.size,) * 2, y.q.dtype)
+    coupling = lax.cond(failed, lambda: friction_coupling(system, formulation, t, y.q, y.u), lambda: none)
+    singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
+    return RESULTS.where(singular, RESULTS.singular_configuration, result), jnp.where(singular, coupling, none)

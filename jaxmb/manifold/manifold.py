@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -14,11 +14,23 @@ from ..formulations import AbstractFormulation, Multipliers, NullSpace
 from ..linalg.arrays import as_array, namespace
 from ..system import AbstractSystem
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 Correction = Callable[[AbstractSystem, Scalar, State], State]
 
 
 class AbstractManifold(eqx.Module):
-    """A policy that turns a system into a term, and a solver into one that respects the constraints."""
+    """A policy that turns a system into a term, and a solver into one that respects the constraints.
+
+    `restores` says whether every step ends on the constraints, `takes_impulses` whether velocities follow a jump of
+    prescribed rates.
+    """
+
+    restores: AbstractVar[bool]
+    takes_impulses: ClassVar[bool] = True
 
     @abc.abstractmethod
     def prepare(

@@ -44,7 +44,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
         t = jnp.asarray(t, q.dtype)
         square = system.coordinate_scale() ** 2
         jacobian = system.coordinate_jacobian(t, q)
-        rows = _independent(jacobian, system.coordinate_scale(), system.coordinate_rank)
+        rows = independent_rows(jacobian, system.coordinate_scale(), system.coordinate_rank)
         ahead = jacobian[rows] * square[None, :]
         gram = ahead @ jacobian[rows].T
         moved = lambda multipliers: q - ahead.T @ multipliers
@@ -55,13 +55,14 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
         square = system.velocity_scale() ** 2
         for _ in range(1 if system.linear else 3):
             jacobian = system.velocity_jacobian(t, q, u)
-            rows = _independent(jacobian, system.velocity_scale(), system.velocity_rank)
+            rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)
             ahead = jacobian[rows] * square[None, :]
             u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
     return State(q, u)
 
 
-def _independent(jacobian: Array, scale: Array, rank: int) -> Any:
+def independent_rows(jacobian: Array, scale: Array, rank: int) -> Any:
+    """Indices of as many independent rows as the rank."""
     return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
 
 

@@ -1,20 +1,32 @@
 """Integration of all coordinates, with a projection on the constraints after every step."""
 
+from typing import ClassVar
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
+from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
+from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
+from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
+
+# Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
+_FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+# Redundant rows may be violated by this multiple of the pivots that count as zero.
+_ALLOWED = 8.0
 
 
 class Projection(AbstractManifold):
@@ -36,6 +48,7 @@ class Projection(AbstractManifold):
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)
+    restores: ClassVar[bool] = True
 
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
@@ -58,7 +71,16 @@ class Projection(AbstractManifold):
         return {}
 
     def diagnose(self, system, t, y, solver_state, result, failed):
-        return result
+        if not drops_rows(system):
+            return result
+        violated = _violated(*lax.stop_gradient((system, t, y)))
+        return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
+
+
+@eqx.filter_jit
+def _violated(system, t, y):
+    """Whether redundant rows are violated at a state on the others."""
+    return violation_of_dropped_rows(system, t, y, row_sizes(system, t, y)) > _ALLOWED * jnp.finfo(y.q.dtype).eps ** 0.5
 
 
 def _check_multistep(system, formulation):
@@ -119,6 +141,9 @@ class ProjectionTerm(AbstractManifoldTerm):
         udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
         return State(system.rates(t, y.q, y.u), udot)
 
+    def after_jump(self, t, y, args):
+        return after_impulse(self.system, t, y)
+
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
 
@@ -140,6 +165,14 @@ class ProjectedSolver(WrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         direction = getattr(terms, "direction", 1)
-        return project(self.system, t1 * direction, y1), error, dense_info, solver_state, result
+        if made_jump is not False:
+            y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
+        y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        t1 = t1 * direction
+        y1 = project(self.system, t1, y1)
+        if drops_rows(self.system):
+            # diffrax forgets the result of a step that is rejected.
+            violated = _violated(*lax.stop_gradient((self.system, t1, y1)))
+            result = diffrax.RESULTS.where(violated, _FAILED, result)
+        return y1, error, dense_info, solver_state, result

@@ -1,5 +1,7 @@
 """No constraints at all: the plain equations of motion."""
 
+from typing import ClassVar
+
 import diffrax
 
 from .manifold import AbstractManifold, all_rows_formulation
@@ -13,6 +15,9 @@ class Unconstrained(AbstractManifold):
     The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
     that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
     """
+
+    restores: ClassVar[bool] = False
+    takes_impulses: ClassVar[bool] = False
 
     def prepare(self, system, formulation, solver, rtol):
         return diffrax.ODETerm(VectorField(system, formulation)), solver

@@ -82,6 +82,7 @@ class RelativeTrain(AbstractGeneralizedSystem):
     velocity_rows: ClassVar[int] = 0
     acceleration_rows: ClassVar[int] = 0
     ideal: ClassVar[bool] = True
+    friction_parts: ClassVar[frozenset[str]] = frozenset()
     positive_definite_mass: ClassVar[bool] = True
     rates_are_velocities: ClassVar[bool] = True
     linear: ClassVar[bool] = True

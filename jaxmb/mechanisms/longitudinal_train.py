@@ -32,7 +32,7 @@ def longitudinal_train(
     brake: VectorLike = 8e4,
     brake_rise: float = 2.0,
     wave_speed: float = 250.0,
-    transition: float = 0.1,
+    transition_speed: float = 0.1,
     gravity: float = 9.81,
     t1: float = 3.0,
 ) -> Mechanism:
@@ -55,7 +55,7 @@ def longitudinal_train(
 
     **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.
     """
-    check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
+    check_train(n, spacing=spacing, brake_rise=brake_rise, wave_speed=wave_speed, transition_speed=transition_speed)
     mass, speed, brake = (
         as_jax(of_each(name, value, n)) for name, value in (("mass", mass), ("speed", speed), ("brake", brake))
     )
@@ -63,12 +63,12 @@ def longitudinal_train(
     apart: Any = np.zeros((2, 3))
     gear = coupler("coupler", "front", "rear", free_length=spacing).resolve(PLANE, apart)
     numbers = {
-        "resistance": davis(resistance) | {"transition": transition},
+        "resistance": davis(resistance) | {"transition_speed": transition_speed},
         "brake": {
             "force": brake,
             "start": spacing * np.arange(n) / wave_speed,
             "rise": brake_rise,
-            "transition": transition,
+            "transition_speed": transition_speed,
         },
         "pull": {"force": pull},
     }

@@ -14,7 +14,7 @@ from ..parts.base import AbstractForce
 from ..parts.fields import as_jax, as_parameter
 from ..parts.forces import Gravity
 from ..parts.functions import Force
-from ..parts.smooth import step
+from ..parts.smooth import sign, step
 from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 
@@ -39,7 +39,7 @@ def train(
     brake: VectorLike = 8e4,
     brake_rise: float = 2.0,
     wave_speed: float = 250.0,
-    transition: float = 0.1,
+    transition_speed: float = 0.1,
     gravity: float = 9.81,
     t1: float = 3.0,
 ) -> Mechanism:
@@ -71,12 +71,12 @@ def train(
         none.
     - `pull` [N] on the leading vehicle.
     - `brake` [N], of all vehicles or of each, built up over `brake_rise` [s]; `wave_speed` [m/s].
-    - `transition` [m/s], the speed at which resistance and brakes have three quarters of their force.
+    - `transition_speed` [m/s], the speed at which resistance and brakes have 76 % of their force.
 
     **Labels:** `x1`, `x2`, … [m], `pitch1`, … [rad], `v1`, … [m/s] of the vehicles; `F1`, … [N], the force of the
     couplers on the vehicles behind them, forwards: positive in draft, negative in buff.
     """
-    check_train(n, brake_rise=brake_rise, wave_speed=wave_speed, transition=transition)
+    check_train(n, brake_rise=brake_rise, wave_speed=wave_speed, transition_speed=transition_speed)
     if coupler_length is None:
         coupler_length = 0.0 if coupler is planar.Revolute else 1.0
     mass, inertia, speed, brake = (
@@ -120,10 +120,10 @@ def train(
             for end, point in (("a", ahead), ("b", behind))
         ]
     if np.any(resistance):
-        numbers = shared(as_jax, **davis(resistance), transition=transition)
+        numbers = shared(as_jax, **davis(resistance), transition_speed=transition_speed)
         forces += [Force(f"resistance{k}", name, _resistance, parameters=numbers) for k, name in enumerate(names, 1)]
     if np.any(brake):
-        numbers = shared(as_jax, rise=brake_rise, transition=transition)
+        numbers = shared(as_jax, rise=brake_rise, transition_speed=transition_speed)
         forces += [
             Force(
                 f"brake{k}",
@@ -174,12 +174,12 @@ def check_train(n: int, **positive: float) -> None:
 
 def running_resistance(v, p):
     """The force [N] of running resistance at a speed [m/s]."""
-    return -(p["w0"] + p["w1"] * jnp.abs(v) + p["w2"] * v**2) * jnp.tanh(v / p["transition"])
+    return -(p["w0"] + p["w1"] * jnp.abs(v) + p["w2"] * v**2) * sign(v, p["transition_speed"])
 
 
 def braking(t, v, p):
     """The force [N] of the brakes at a time [s] and speed [m/s]."""
-    return -p["force"] * step((t - p["start"]) / p["rise"]) * jnp.tanh(v / p["transition"])
+    return -p["force"] * step((t - p["start"]) / p["rise"]) * sign(v, p["transition_speed"])
 
 
 def _resistance(poses, velocities, t, p):

@@ -240,8 +240,9 @@ class AbstractPotentialForce(AbstractForce):
 class AbstractNonIdeal(AbstractPart):
     """A non-ideal constraint force: it does virtual work.
 
-    `joint` is the joint's name. The force may depend on the reactions that the joint would exert if all joints were
-    ideal. Its components in directions that the joints block have no effect.
+    `joint` is the joint's name. The joint exerts its reactions and this force. The force may depend on the reactions,
+    and is solved for with them. What it has in directions that the joint blocks the reactions balance, and have that
+    much less themselves.
     """
 
     joint: AbstractVar[str]
@@ -262,7 +263,7 @@ class AbstractNonIdeal(AbstractPart):
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: Scalar
     ) -> Wrenches:
-        """The wrench on each of the joint's bodies; `reactions`: those of the ideal joint."""
+        """The wrench on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
 
 
 def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:

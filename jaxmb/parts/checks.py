@@ -2,7 +2,10 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from ..linalg.arrays import is_traced
 from .fields import Declaration, declarations
@@ -44,6 +47,24 @@ def _is_number(value: Any) -> bool:
     return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
 
 
+def in_range(declared: Declaration, values: Float[Array, "..."]) -> Bool[Array, ""]:
+    """Whether numbers that are traced, perhaps of several parts, are finite, of the declared sign, and unit vectors."""
+    values, sign = lax.stop_gradient(values), declared.sign
+    ok = jnp.all(jnp.isfinite(values))
+    if sign == "nonzero":
+        ok &= jnp.all(values != 0)
+    elif sign == "positive":
+        ok &= jnp.all(values > 0)
+    elif sign == "non-negative":
+        ok &= jnp.all(values >= 0)
+    elif sign == "positive definite":
+        minors = [jnp.linalg.det(values[..., :k, :k]) for k in range(1, values.shape[-1] + 1)]
+        ok &= jnp.all(jnp.stack(minors) > 0)
+    if declared.is_direction or declared.is_attitude:
+        ok &= jnp.all(jnp.abs(jnp.linalg.norm(values, axis=-1) - 1.0) <= _UNIT)
+    return ok
+
+
 def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
     """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
     vectors, in the part and its laws.
@@ -55,7 +76,7 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
                 check_numbers(value, label, dimension, f"{shown}.")
         elif declared.kind == "numbers":
             for key, number in value.items():
-                if not np.all(np.isfinite(number)):
+                if not is_traced(number) and not np.all(np.isfinite(number)):
                     raise ValueError(f"{label}: {prefix}{key} must be finite, got {np.asarray(number)}.")
         elif declared.is_number and value is not None and not is_traced(value):
             _check_number(declared, label, shown, np.asarray(value), dimension)

@@ -15,7 +15,7 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
-from .smooth import ramp, step
+from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain
 
 Number = Float[Array, ""]
@@ -115,12 +115,7 @@ class Coulomb(AbstractFrictionLaw):
 
     def force(self, load, engaged, slip, travel):
         del engaged, travel
-        s = slip / self.transition_speed
-        square = jnp.dot(s, s)
-        small = square < 1e-3
-        size = jnp.sqrt(jnp.where(small, 1.0, square))
-        series = 1 - square * (1 / 3 - square * (2 / 15 - square * (17 / 315)))
-        return -self.coefficient * load * jnp.where(small, series, jnp.tanh(size) / size) * s
+        return dry_friction(self.coefficient * load, slip, self.transition_speed)
 
 
 class Janosi(AbstractFrictionLaw):

@@ -312,26 +312,29 @@ def anonymous(part: Any) -> Any:
     return out
 
 
-def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Sign | None]]:
+def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
     """For every parameter of a part: its path of keys, the same path without the names of dictionaries, as in the
-    parameter's name, and its sign.
+    parameter's name, and its declaration, which for an entry of a dictionary says nothing.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
-        own = declared.get(field)
-        if own is None or own.kind != "state":
-            yield from _paths(getattr(part, field), (field,), (field,), None if own is None else own.sign)
+        own = declared.get(field, _ANY_NUMBER)
+        if own.kind != "state":
+            yield from _paths(getattr(part, field), (field,), (field,), own)
 
 
-def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], sign: Sign | None):
+_ANY_NUMBER = Declaration("number")
+
+
+def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: Declaration):
     if eqx.is_inexact_array(value):
-        yield keys, shown, sign
+        yield keys, shown, declared
     elif isinstance(value, dict):
         for key, entry in value.items():
-            yield from _paths(entry, (*keys, key), (*shown[:-1], key), None)
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _ANY_NUMBER)
     elif isinstance(value, eqx.Module):
-        for inner, name, inner_sign in paths(value):
-            yield (*keys, *inner), (*shown, *name), inner_sign
+        for inner, name, own in paths(value):
+            yield (*keys, *inner), (*shown, *name), own
 
 
 def entry(value: Any, keys: tuple[str, ...]) -> Any:

@@ -7,6 +7,7 @@ import numpy as np
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractCompound, AbstractNonIdeal, rows_of
+from .smooth import dry_friction
 
 
 class Friction(AbstractNonIdeal):
@@ -14,9 +15,9 @@ class Friction(AbstractNonIdeal):
 
     The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
     ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
-    force conjugate to s is `−μ N s / √(s·s + smoothing²)`, which is smooth and approaches full friction for slip that
-    is large compared with `smoothing`. N is the magnitude of the reaction force that the joint would exert if all
-    joints were ideal; reaction moments do not contribute.
+    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude of
+    the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
+    such N exists, or more than one (Painlevé's paradox), the simulation ends with `singular_configuration`.
 
     **Arguments:**
 
@@ -25,10 +26,7 @@ class Friction(AbstractNonIdeal):
     - `radius` [m] ≥ 0 of the pin or ball, default zero: sliding only.
     - `point` [m]: the point of sliding, fixed in the joint's last body; default the joint's point there, or the mass
         centre if it has none.
-    - `smoothing` [m/s].
-
-    Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",
-    Proc. R. Soc. A 463, 2007.
+    - `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
 
     name: str = fields.name()
@@ -36,7 +34,7 @@ class Friction(AbstractNonIdeal):
     coefficient: fields.Number = fields.parameter(sign="non-negative")
     radius: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.0)
     point: fields.Number = fields.point(body=None, optional=True)
-    smoothing: fields.Number = fields.parameter(unit="m/s", sign="positive", default=1e-4)
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=1e-4)
 
     def complete(self, space, joint, poses):
         k = poses.shape[0] - 1
@@ -74,4 +72,4 @@ class Friction(AbstractNonIdeal):
     def wrenches(self, space, poses, velocities, reactions, t):
         slip, pull = jax.vjp(lambda v: self.slip(space, poses, v), velocities)
         normal = norm(reactions[-1, : space.dimension])
-        return pull(-self.coefficient * normal * slip / jnp.sqrt(slip @ slip + self.smoothing**2))[0]
+        return pull(dry_friction(self.coefficient * normal, slip, self.transition_speed))[0]

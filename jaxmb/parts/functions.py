@@ -106,12 +106,9 @@ class NonIdeal(AbstractNonIdeal):
 
     - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
     - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the wrenches that the joint
-        would exert on them if all joints were ideal, in the same axes. Wrench components in directions that the joints
-        block have no effect.
+        exerts on them besides, in the same axes, in the presence of all these forces. What the function returns in
+        directions that the joint blocks the reactions balance, and have that much less themselves.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
-
-    Source: F. E. Udwadia and P. Phohomsiri, "Explicit Poincaré equations of motion for general constrained systems",
-    Proc. R. Soc. A 463, 2007.
     """
 
     name: str = fields.name()

@@ -6,6 +6,23 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 
 
+def sign(speed: Float[Array, "*n"], transition_speed: Scalar) -> Float[Array, "*n"]:
+    """`tanh(v / transition_speed)`, the sign of a speed v, regularised at rest. It is 76 % of it at `transition_speed`
+    and all of it but a part in 1e8 at ten times as much.
+    """
+    return jnp.tanh(speed / transition_speed)
+
+
+def dry_friction(limit: Float[Array, ""], slip: Float[Array, "d"], transition_speed: Scalar) -> Float[Array, "d"]:
+    """A force against a velocity of slip, as large as `limit` times the `sign` of the speed."""
+    s = slip / transition_speed
+    square = jnp.dot(s, s)
+    small = square < 1e-3
+    size = jnp.sqrt(jnp.where(small, 1.0, square))
+    series = 1 - square * (1 / 3 - square * (2 / 15 - square * (17 / 315)))
+    return -limit * jnp.where(small, series, jnp.tanh(size) / size) * s
+
+
 def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
     """`½ (d + √(d² + width²))`, a smooth and always positive `max(d, 0)`."""
     root = jnp.sqrt(d * d + width * width)

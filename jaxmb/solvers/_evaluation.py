@@ -77,6 +77,18 @@ def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: A
     return None if manifold is None else freeze(manifold.update_chart(t * term.direction, y, chart, args))
 
 
+def refused(term: Any, chart: Chart | None) -> Any:
+    """Whether the step that led to a chart must be retried with a smaller one."""
+    manifold = _manifold(term)
+    return False if manifold is None else manifold.refuses(chart)
+
+
+def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
+    """The state just after a jump; `y` for a plain vector field."""
+    manifold = _manifold(term)
+    return y if manifold is None else manifold.after_jump(t * term.direction, y, args)
+
+
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
     """Evaluate the vector field; `like` has the structure of the state before raveling."""
     manifold = _manifold(term)

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ._evaluation import check_real, check_term, derivative, first_chart, next_chart
-from ._order import StepEstimate
+from ._evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
+from ._order import StepEstimate, refuse
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Args, Chart, Y
@@ -70,11 +70,15 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], Any, diffrax.RESULTS]:
         def restart():
-            chart = next_chart(terms, t0, y0, solver_state.chart, args)
-            return self._initial_state(terms, t0, t1, y0, args, chart, solver_state)
+            after = after_jump(terms, t0, y0, args)
+            chart = next_chart(terms, t0, after, solver_state.chart, args)
+            return after, self._initial_state(terms, t0, t1, after, args, chart, solver_state)
 
-        state = _restart_after(made_jump, restart, solver_state)
+        y0, state = _restart_after(made_jump, restart, (y0, solver_state))
         y1, estimate, dense_info, state, failed = self._advance(terms, t1, y0, args, state)
+        off = refused(terms, state.chart)
+        if off is not False:
+            failed, estimate = failed | off, refuse(estimate, off)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
@@ -175,7 +179,7 @@ def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], An
 
 
 def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
-    """The state of a solver, restarted after a jump and otherwise unchanged."""
+    """The state, and that of the solver, restarted after a jump and otherwise unchanged."""
     if made_jump is False:
         return state
 

@@ -40,6 +40,13 @@ class StepEstimate(eqx.Module):
     work: Float[Array, "2"]
 
 
+def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
+    """The estimate of a step that must not be accepted, where `off`."""
+    values = ((estimate.error, jnp.inf), (estimate.growth, 0.0), (estimate.retry, 0.0))
+    changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
+    return eqx.tree_at(lambda e: (e.error, e.growth, e.retry), estimate, changed)
+
+
 def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:
     """Factors by which steps may grow to reach the target error; zero where the error is not finite."""
     errors = jnp.where(jnp.isfinite(errors), errors, jnp.asarray(jnp.inf, errors.dtype))

@@ -247,7 +247,9 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         # The local error of order one is h^2/2 times the change of the derivative.
         change = norm_of(self.norm, (f[1] - f[0]) / scale, y0) / (reach / 100)
         step = jnp.minimum(1 / jnp.sqrt(change), reach)
-        return jnp.where(jnp.isfinite(step), step, span / 1000).astype(t0.dtype)
+        # Without a derivative at the start no step succeeds: none is the shortest.
+        otherwise = jnp.where(jnp.all(jnp.isfinite(f[0])), span / 1000, 0)
+        return jnp.where(jnp.isfinite(step), step, otherwise).astype(t0.dtype)
 
 
 def _is_known(x: Any) -> bool:

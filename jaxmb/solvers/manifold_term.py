@@ -80,6 +80,14 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         out = self.project_near(t, y, linearized_at, args)
         return out._replace(failed=out.failed | linearized_at.failed)
 
+    def after_jump(self, t: Any, y: Y, args: Args) -> Y:
+        """The state just after a time at which the field or the manifold jumps; by default it has not changed.
+
+        A manifold whose states jump with it overrides this method.
+        """
+        del t, args
+        return y
+
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
         """A mask with the structure of `y`: true for the components that the local error is measured on."""
@@ -94,6 +102,13 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
         The result is used only if the step to this state is accepted. It is also called before a restart after a jump.
         """
+
+    def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
+        """Whether the state at which a chart was updated is none of the manifold; the step to it is then retried with a
+        smaller one.
+        """
+        del chart
+        return False
 
 
 def stop(x: Any) -> Any:

@@ -8,13 +8,13 @@ name, the second the velocities closest to the guess that satisfy `ψ(t, q, u) =
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
+from ..linalg.failure import not_a_number_where
 from ..system import AbstractSystem
 from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
@@ -71,7 +71,7 @@ def assemble(
             q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are violated."
         )
     state = State(q, u)
-    return state if throw else jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), state)
+    return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
 
 
 def configuration(

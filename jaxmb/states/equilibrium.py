@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
+from ..linalg.failure import not_a_number_where
 from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..system import AbstractSystem
@@ -89,7 +90,7 @@ def equilibrium(
         q = eqx.error_if(
             q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see the unbalanced coordinates."
         )
-    return State(q if throw else jnp.where(ok, q, jnp.nan), u)
+    return State(q if throw else not_a_number_where(jnp.logical_not(ok), q, (system, guess, fix, time)), u)
 
 
 @eqx.filter_jit

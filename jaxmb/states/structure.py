@@ -22,6 +22,7 @@ from .closest import (
     residual_size,
     tolerance,
 )
+from .redundancy import check_gradients, check_implied
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
 # bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
@@ -37,7 +38,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     given poses and eliminating on concrete numbers; afterwards they are static.
 
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
-    accelerations.
+    accelerations, or if the given pose is singular.
     """
     order, rows = elimination_order(system), system.velocity_rows
     structured = dataclasses.replace(system, elimination=order)
@@ -65,11 +66,20 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         _check_left_over(system, what, *map(np.asarray, found[what]))
     jacobian, scale = np.asarray(found["jacobian"]), np.asarray(found["scale"])
     _check_locked(system, jacobian[: system.position_rows] * scale)
+    check_gradients(system, np.asarray(found["A"]) * scale)
     position, velocity = int(found["position rank"]), int(found["rank"])
     coordinate = position + system.coordinate_rows - system.position_rows
-    implied = _implied(system, jacobian, np.asarray(found["rows"]), velocity)
+    implied = _implied(system, jacobian, np.asarray(found["order"]), velocity)
     _check_determined(system, implied)
-    ranks = Ranks(position, coordinate, velocity, int(found["acceleration rank"]))
+    acceleration = int(found["acceleration rank"])
+    check_implied(
+        system,
+        found["q"],
+        np.asarray(found["position order"])[:position],
+        np.asarray(found["acceleration order"])[:acceleration],
+        _bodies_of_joints(system),
+    )
+    ranks = Ranks(position, coordinate, velocity, acceleration)
     # Block elimination drops no rows.
     order = order if velocity == rows else None
     return dataclasses.replace(system, ranks=ranks, implied=implied, elimination=order)
@@ -100,6 +110,8 @@ def _analyse(system):
     every = full_pivot(jacobian, scale=scale, level=level)
     holonomic = system.velocity_rows == system.position_rows
     positions = every if holonomic else full_pivot(jacobian[: system.position_rows], scale=scale)
+    A = system.jacobian(t, q, u) if system.servos else jacobian
+    accelerations = full_pivot(A, scale=scale) if system.servos else every
     out = {
         "q": q,
         "residual": residual,
@@ -107,13 +119,14 @@ def _analyse(system):
         "scale": scale,
         "position rank": positions.rank,
         "rank": every.rank,
-        "rows": every.order.rows,
+        "acceleration rank": accelerations.rank,
+        "position order": positions.order.rows,
+        "order": every.order.rows,
+        "acceleration order": accelerations.order.rows,
+        "A": A,
         "velocities": (jnp.zeros(0), jnp.zeros(0)),
         "accelerations": (jnp.zeros(0), jnp.zeros(0)),
     }
-    out["acceleration rank"] = every.rank
-    if system.servos:
-        out["acceleration rank"] = full_pivot(system.jacobian(t, q, u), scale=scale).rank
     if system.linear and (system.servos or not system.drift_free):
         # Implied rows must be consistent with the rows that imply them: a least-squares residual is a contradiction.
         if system.velocity_rows:
@@ -195,6 +208,13 @@ def _connected(system):
             rows[root(moving[0])] += own
             driven[root(moving[0])].append(rheonomic)
     return [(b, r) for b, r, d in zip(bodies, rows, driven, strict=True) if d and not any(d)]
+
+
+def _bodies_of_joints(system):
+    """Names of the bodies of each joint, without the ground."""
+    bodies = lambda own: tuple(system.body_names[k] for k in own if k < system.layout.bodies)
+    groups = [g.group for g in system.joints]
+    return {name: bodies(own) for g in groups for name, own in zip(g.names, g.bodies, strict=True)}
 
 
 def _check_determined(system, implied):

@@ -1,5 +1,6 @@
 """Systems of bodies: sizes, kinematics, names, and views of a motion, for a scene whose parts are stacked."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..linalg.arrays import unchecked_take
+from ..linalg.arrays import is_traced, unchecked_take
 from ..linalg.jacobian import EliminationOrder
 from ..linalg.rotations import normalize
+from ..parts.forces import Gravity
 from .body_motion import attachments, body_motion, body_quantities, outline
 from .coordinates import coordinate_names, rate_names
 from .describe import describe_scene
@@ -26,6 +28,7 @@ from .groups import (
     VelocityConstraintGroup,
 )
 from .layout import Layout
+from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
 from .quantities import Quantity
 from .reactions import applied_wrenches, reaction
@@ -107,6 +110,10 @@ class AbstractBodySystem(AbstractSystem):
         return not self.nonideal
 
     @property
+    def friction_parts(self) -> frozenset[str]:
+        return frozenset(name for g in self.nonideal for name in g.joints)
+
+    @property
     def positive_definite_mass(self) -> bool:
         return True
 
@@ -140,6 +147,21 @@ class AbstractBodySystem(AbstractSystem):
 
     def positive_parameters(self):
         return frozenset(positive_parameters(self._groups))
+
+    def check_parameters(self, names):
+        parts = {name.split(".")[0] for name in names}
+        dimension = self.layout.space.dimension
+        if self.gravity is not None and self.gravity_name in parts and not is_traced(self.gravity):
+            self._gravity.check(dimension)
+        check_parts(itertools.chain(*self._groups.values()), parts, dimension)
+
+    def parameters_in_range(self):
+        gravity = () if self.gravity is None else (self._gravity,)
+        return are_in_range((*gravity, *map(stacked_part, itertools.chain(*self._groups.values()))))
+
+    @property
+    def _gravity(self):
+        return Gravity(self.gravity, name=self.gravity_name)
 
     @property
     def _groups(self):
@@ -215,6 +237,31 @@ class AbstractBodySystem(AbstractSystem):
         points = attachments(groups, self.layout.bodies)
         poses = jax.vmap(self.poses)(ys.q)
         return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
+
+    def not_finite(self, t, q, u):
+        values = self._of_parts(jnp.asarray(t, q.dtype), q, u)
+        kinds = zip(
+            ("residual", "residual", "force"), (self.constraints, self.joints, self.forces), values, strict=True
+        )
+        return tuple(
+            dict.fromkeys(
+                f"the {kind} of {name!r}"
+                for kind, of_kind, of_parts in kinds
+                for group, own in zip(of_kind, of_parts, strict=True)
+                for name, value in zip(group.group.names, np.asarray(own), strict=True)
+                if not np.all(np.isfinite(value))
+            )
+        )
+
+    @eqx.filter_jit
+    def _of_parts(self, t, q, u):
+        """Residuals of positions, those of accelerations, and wrenches, group by group."""
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return (
+            [g.residual(t, poses) for g in self.constraints],
+            [g.acceleration(t, poses, velocities, jnp.zeros_like(velocities)) for g in self.joints],
+            [g.wrenches(t, poses, velocities) for g in self.forces],
+        )
 
     # Bodies
 

@@ -11,14 +11,14 @@ work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, State
 from ..linalg.inertia import AbstractInertia
@@ -55,8 +55,8 @@ class AbstractSystem(eqx.Module):
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
     - `acceleration_rows`, `acceleration_rank`: rows of A and the number of independent ones.
-    - `ideal`: whether C is zero; `positive_definite_mass`: whether M is positive definite for all velocities, also
-        those that violate constraints.
+    - `ideal`: whether C is zero; `friction_parts`: names of the parts that C depends on the multipliers of.
+    - `positive_definite_mass`: whether M is positive definite for all velocities, also those that violate constraints.
     - `rates_are_velocities`: whether q̇ = u.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
     - `has_bodies`: whether the system has bodies; `Trajectory[name]` is the motion of a body if so, otherwise of a
@@ -73,6 +73,7 @@ class AbstractSystem(eqx.Module):
     velocity_rows: AbstractVar[int]
     acceleration_rows: AbstractVar[int]
     ideal: AbstractVar[bool]
+    friction_parts: AbstractVar[frozenset[str]]
     positive_definite_mass: AbstractVar[bool]
     rates_are_velocities: AbstractVar[bool]
     linear: AbstractVar[bool]
@@ -101,6 +102,16 @@ class AbstractSystem(eqx.Module):
         """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
 
     @abc.abstractmethod
+    def check_parameters(self, names: Collection[str]) -> None:
+        """Raise a `ValueError` for values of these parameters that are out of range; traced ones are left to
+        `parameters_in_range`.
+        """
+
+    @abc.abstractmethod
+    def parameters_in_range(self) -> bool | Bool[Array, ""]:
+        """Whether all parameters that are traced are in their ranges; True if none are traced."""
+
+    @abc.abstractmethod
     def describe(self) -> Description:
         """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
 
@@ -127,6 +138,10 @@ class AbstractSystem(eqx.Module):
         """The points that a picture of each body shows along a motion, world axes [m]: its mass centre, and the points
         where joints and forces act on it. Empty for a system without bodies.
         """
+
+    @abc.abstractmethod
+    def not_finite(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> tuple[str, ...]:
+        """What is not finite at a state, forces and residuals, by the names of the parts; for messages."""
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:
@@ -176,9 +191,7 @@ class AbstractSystem(eqx.Module):
     def nonideal_force(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
-        """`C`, from the multipliers of the ideal constraints; components that do no work in admissible displacements
-        have no effect.
-        """
+        """`C`, from the multipliers λ of the same equation."""
 
     @abc.abstractmethod
     def acceleration_residual(
@@ -258,6 +271,11 @@ class AbstractSystem(eqx.Module):
     @property
     def acceleration_rank(self) -> int:
         return self.ranks.acceleration
+
+    @property
+    def friction_rows(self) -> Int[np.ndarray, "k"]:
+        """Numbers of the rows of A that C depends on the multipliers of."""
+        return np.array([k for k, (name, _) in enumerate(self.rows) if name in self.friction_parts], int)
 
     @property
     def ideal_on_velocities(self) -> bool:

@@ -2,6 +2,10 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+import numpy as np
+
+from ..linalg.arrays import is_traced
 from ..linalg.jacobian import DenseJacobian
 from .equation import AbstractSystem
 from .quantities import Quantity
@@ -45,6 +49,28 @@ class AbstractGeneralizedSystem(AbstractSystem):
 
     def outline(self, ys):
         return {}
+
+    def check_parameters(self, names):
+        for name in self.positive_parameters() & set(names):
+            value = self._parameter(name)
+            if not is_traced(value) and not np.all(np.asarray(value) > 0):
+                raise ValueError(f"Parameter {name!r} must be positive, got {np.asarray(value)}.")
+
+    def parameters_in_range(self):
+        values = [self._parameter(name) for name in sorted(self.positive_parameters())]
+        traced = [jnp.all(value > 0) for value in values if is_traced(value)]
+        return jnp.all(jnp.stack(traced)) if traced else True
+
+    def _parameter(self, name):
+        where, index = self.parameter_paths()[name][0]
+        return where(self) if index is None else where(self)[index]
+
+    def not_finite(self, t, q, u):
+        t, rows = jnp.asarray(t, q.dtype), self.rows
+        residuals = (self.position_residual(t, q), self.acceleration_residual(t, q, u, jnp.zeros_like(u)))
+        wrong = [rows[k][0] for residual in residuals for k in np.flatnonzero(~np.isfinite(np.asarray(residual)))]
+        forces = () if np.all(np.isfinite(self.force(t, q, u))) else ("the force on the coordinates",)
+        return (*forces, *dict.fromkeys(f"the residual of {name!r}" for name in wrong))
 
     # There are no bodies to act on.
 

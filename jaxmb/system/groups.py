@@ -281,6 +281,6 @@ class NonIdealGroup(eqx.Module):
         velocities: Float[Array, "b_ground v"],
         reactions: Float[Array, "parts k v"],
     ) -> Float[Array, "parts k v"]:
-        """Wrenches of the laws on the bodies of their joints; `reactions`: those of the ideal joints."""
+        """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
         single = lambda part, x, v, own: part.wrenches(self.group.layout.space, x, v, own, t)
         return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities), reactions)

@@ -37,8 +37,8 @@ def positive_parameters(groups: Mapping[str, Sequence[Any]]) -> Iterator[str]:
     """Names of the parameters that parts declare to be positive, or positive definite."""
     for of_kind in groups.values():
         for group in of_kind:
-            for _, shown, sign in paths(group.group.part):
-                if sign in ("positive", "positive definite"):
+            for _, shown, declared in paths(group.group.part):
+                if declared.sign in ("positive", "positive definite"):
                     yield from (f"{name}.{'.'.join(shown)}" for name in group.group.names)
 
 

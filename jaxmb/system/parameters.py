@@ -38,7 +38,9 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
 
     **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones.
 
-    **Raises:** `ValueError` for an unknown name (with the nearest ones) or a wrong shape.
+    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, and numbers with which the
+    scene would not compile. Under `jit`, `vmap` or a derivative the numbers are not known yet; `simulate` then ends
+    with `RESULTS.invalid_parameters`, before the first step.
     """
     paths = system.parameter_paths()
     for name, value in values.items():
@@ -51,6 +53,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
             if value.shape != shape:
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
+    system.check_parameters(values)
     return system
 
 

@@ -140,7 +140,9 @@ def test_work_of_constraint_forces(formulation):
     system = ring(wild)
     q, u = system.guess.q, system.guess.u
     udot, _ = accelerations(system, formulation, ZERO, q, u)
-    np.testing.assert_allclose(along @ udot, along @ np.array([0.7, -0.4]), rtol=0, atol=1e-14)
+    # On a ring of radius one at speed one the constraint's λ and the part of C along it, 0.1 λ², add up to −1.
+    multiplier = (-1 + np.sqrt(0.6)) / 0.2
+    np.testing.assert_allclose(along @ udot, along @ np.array([0.7, -0.4]) * multiplier**2, rtol=0, atol=1e-14)
     np.testing.assert_allclose(system.acceleration_residual(ZERO, q, u, udot), 0.0, atol=1e-14)
     # What is normal to the ring has no effect.
     normal = ring(NonIdealForce("ring", lambda t, q, v, multipliers, p: 5.0 * q))

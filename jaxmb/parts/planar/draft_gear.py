@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
-from ..smooth import quintic
+from ..smooth import quintic, sign
 from ..space import force_pair, separation, separation_rate
 
 
@@ -34,8 +34,8 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     - `preload` S₀ [N] ≥ 0; `slack` [m] ≥ 0, to either side.
     - `travel` x_max [m] > 0, the stroke at which the stop is reached, and its `stop_stiffness` k_s [N/m] ≥ 0.
     - `damping` c [N s/m] ≥ 0, acting outside the slack.
-    - `transition` v₀ [m/s] > 0, the speed at which friction has reached three quarters of its value; `smoothing` [m]
-        > 0. The smaller they are, the shorter the steps.
+    - `transition_speed` v₀ [m/s] > 0, the speed at which 76 % of the friction acts; `smoothing` [m] > 0. The smaller
+        they are, the shorter the steps.
     - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the mass
         centres.
     """
@@ -47,7 +47,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     travel: fields.Number = fields.parameter(unit="m", sign="positive", default=0.11)
     stop_stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e8)
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    transition: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=0.005)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
     point_a: fields.Number = fields.point(body=0, default="mass centre")
@@ -85,7 +85,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     def _against(self, stroke, rate):
         engaged, ramp, _ = self._engaged(stroke)
         spring = self.preload * engaged + self.stiffness * ramp
-        friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * jnp.tanh(rate / self.transition)
+        friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * sign(rate, self.transition_speed)
         _, stop, _ = self._engaged(stroke - self.travel)
         return spring * friction + self.stop_stiffness * stop + self.damping * engaged * rate
 

@@ -1,0 +1,76 @@
+"""Forces of constraints that depend on the constraints' own multipliers, such as Coulomb friction.
+
+Such a force C changes the multipliers that it depends on: with friction the normal force is not that of the joint
+without. Of the rows that C depends on, the multipliers x solve
+
+    x = x⁰ + P C(x)
+
+where x⁰ are the multipliers without C, and P the influence on them of a force on the velocities. Newton's method starts
+from x⁰; Coulomb's law is piecewise linear where a reaction has one component, and one correction then solves it.
+
+The solution is the only one wherever `x ↦ x⁰ + P C(x)` contracts, component by component: the spectral radius of
+`|P ∂C/∂x|` is below 1. For one Coulomb law on one row this is exact: at 1, Painlevé's paradox, a solution ceases to
+exist or another one appears (P. Painlevé, "Sur les lois du frottement de glissement", C. R. Acad. Sci. 121, 1895). For
+several it is sufficient, and for laws that are not linear in the size of a single component it holds near the solution.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg.elimination import gauss_jordan
+from ..linalg.newton import newton
+
+_CORRECTIONS = 16
+
+
+def find_multipliers(
+    law: Callable[[Array], Array], influence: Float[Array, "k n"], start: Float[Array, "k"]
+) -> tuple[Float[Array, "k"], Float[Array, "k k"], Bool[Array, ""]]:
+    """Solve `x = start + influence law(x)`.
+
+    **Returns:** x; the coupling `|influence ∂law/∂x|` there; and whether the equation failed to have one solution and
+    no other, in which case x is `start`.
+    """
+    one = jnp.eye(start.size, dtype=start.dtype)
+
+    def correct(carry):
+        x, _ = carry
+        force, push = jax.linearize(law, x)
+        slope = influence @ jax.vmap(push, out_axes=1)(one)
+        step = _solve(one - slope, start + influence @ force - x)
+        # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
+        size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
+        return (x + step, slope), jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
+
+    # Corrections shrink quadratically in the end: the next one is below rounding errors.
+    tol = jnp.finfo(start.dtype).eps ** 0.625
+    far = lambda _, size: ~(size <= tol)
+    first = start, jnp.zeros_like(one)
+    (x, slope), size = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
+    coupling = jnp.abs(slope)
+    failed = far(x, size) | ~contracts(coupling)
+    return jnp.where(failed, start, x), coupling, failed
+
+
+def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
+    """Whether the spectral radius of a matrix T ≥ 0 is below 1."""
+    # Only then is I − T an M-matrix: some y > 0 has (I − T) y > 0.
+    n = coupling.shape[0]
+    y = _solve(jnp.eye(n, dtype=coupling.dtype) - coupling, jnp.ones(n, coupling.dtype))
+    return jnp.all((y > 0) & jnp.isfinite(y))
+
+
+def _solve(matrix, b):
+    # Where the coupling contracts, the diagonal dominates in some units, and its pivots need no search.
+    return gauss_jordan(matrix, b.size) @ b
+
+
+def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:
+    """The rows of T ≥ 0 that its spectral radius comes from."""
+    values, vectors = np.linalg.eig(coupling)
+    share = np.abs(vectors[:, np.argmax(np.abs(values))])
+    return share > 1e-3 * np.max(share)

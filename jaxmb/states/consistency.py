@@ -1,0 +1,72 @@
+"""Whether a state satisfies the constraints of its system, before a motion starts from it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .._types import State
+from ..linalg.arrays import is_traced
+from ..system import AbstractSystem
+from ..system.violation import row_sizes, violations
+
+# The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
+# at least this power of eps, 3e-4 in single precision.
+_TOLERANCE = 1e-5
+_ROUNDING = 0.5
+
+
+def consistent(system: AbstractSystem, t: Any, state: State) -> State:
+    """The state, if it satisfies the constraints.
+
+    **Raises:** `ValueError` naming the joints with their residuals, if it does not. Under a trace the state is NaN
+    instead, so that a simulation from it fails.
+    """
+    if system.velocity_rows == 0:
+        return state
+    rows = _violated(*lax.stop_gradient((system, t, state)))
+    if is_traced(rows):
+        off = jnp.any(rows[0]) | jnp.any(rows[1])
+        return jax.tree.map(lambda x: jnp.where(off, jnp.nan, x), state)
+    positions, velocities = map(np.asarray, rows)
+    cure = (
+        f"at t0 = {float(t):g}. Other parameters, another system or another time need another state: "
+        "state = jaxmb.assemble(system, state, t=t0) makes this one consistent."
+    )
+    if np.any(positions):
+        listed = _listed(system, positions, system.position_residual(t, state.q))
+        raise ValueError(f"The state violates the constraints {listed} {cure}")
+    if np.any(velocities):
+        listed = _listed(system, velocities, system.velocity_residual(t, state.q, state.u))
+        raise ValueError(f"The velocities of the state violate the constraints {listed} {cure}")
+    return state
+
+
+def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
+    """A message about implied rows that are violated at the end of a motion."""
+    residual = np.abs(np.asarray(system.velocity_residual(t, state.q, state.u)))
+    residual[: system.position_rows] = np.abs(np.asarray(system.position_residual(t, state.q)))
+    names = _listed(system, residual > 1e-3 * np.max(residual), residual)
+    return (
+        f"At t = {float(t):g} the constraints {names} contradict the others: rows of them, which others implied when "
+        "the system was compiled, are violated. Remove them, or make dimensions and prescribed motions agree."
+    )
+
+
+@eqx.filter_jit
+def _violated(system, t, y) -> Any:
+    y = State(system.normalize(y.q), y.u)
+    tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
+    return jax.tree.map(lambda of_rows: of_rows > tol, violations(system, t, y, row_sizes(system, t, y)))
+
+
+def _listed(system, violated, residual):
+    """The constraints of some rows with their largest residuals, the largest first."""
+    worst: dict[str, float] = {}
+    for (name, _), bad, value in zip(system.rows, violated, np.abs(np.asarray(residual)), strict=False):
+        if bad:
+            worst[name] = max(worst.get(name, 0.0), float(value))
+    return ", ".join(f"{name} ({value:.3g})" for name, value in sorted(worst.items(), key=lambda item: -item[1])[:8])

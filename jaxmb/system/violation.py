@@ -1,0 +1,42 @@
+"""How far a state is off its constraints, in units that do not depend on how they are written."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar, State
+from .equation import AbstractSystem
+
+
+def drops_rows(system: AbstractSystem) -> bool:
+    """Whether rows of ψ are left out because others imply them."""
+    return system.velocity_rank < system.velocity_rows
+
+
+def row_sizes(system: AbstractSystem, t: Scalar, y: State) -> Float[Array, "velocity_rows"]:
+    """The norm of the gradient of each row of ψ, in the scales of the velocities."""
+    sizes = system.structured_jacobian(t, y.q, y.u).row_norms(system.velocity_scale())[: system.velocity_rows]
+    return jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps ** 0.75 * jnp.max(sizes) + jnp.finfo(sizes.dtype).tiny)
+
+
+def violations(
+    system: AbstractSystem, t: Scalar, y: State, sizes: Float[Array, "velocity_rows"]
+) -> tuple[Float[Array, "position_rows"], Float[Array, "velocity_rows"]]:
+    """For each row of Φ the change of the coordinates, in their scales, that restores it; for each row of ψ the change
+    of the velocities that does, relative to the largest velocity.
+    """
+    speed = jnp.max(jnp.abs(y.u) / system.velocity_scale())
+    rate = jnp.abs(system.velocity_residual(t, y.q, y.u)) / sizes
+    positions = jnp.abs(system.position_residual(t, y.q)) / sizes[: system.position_rows]
+    # At rest there are only rounding errors to compare.
+    return positions, jnp.where(rate > jnp.finfo(rate.dtype).eps ** 0.75, rate / speed, 0.0)
+
+
+def violation_of_dropped_rows(
+    system: AbstractSystem, t: Scalar, y: State, sizes: Float[Array, "velocity_rows"]
+) -> Float[Array, ""]:
+    """The largest violation of a state that satisfies the independent rows: that of rows that are left out."""
+    positions, velocities = violations(system, t, y, sizes)
+    # Where all rows left out are of positions, their velocities follow.
+    follow = system.velocity_rank - system.position_rank == system.velocity_rows - system.position_rows
+    largest = jnp.max(positions, initial=0.0)
+    return largest if follow else jnp.maximum(largest, jnp.max(velocities))

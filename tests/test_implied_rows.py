@@ -1,0 +1,262 @@
+"""Rows that are implied by others at the given pose stay so, or the user is told: when a scene is compiled, when a
+motion starts, and along the motion. Scripts of a user's kind.
+"""
+
+import os
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import lagrangian, mechanisms, planar
+from jaxmb.manifold import Baumgarte
+
+GRAVITY = mb.Gravity((0.0, -9.81))
+
+
+def bar(name, start, end, mass=1.0):
+    """A slender bar between two points."""
+    start, end = np.asarray(start), np.asarray(end)
+    length = float(np.linalg.norm(end - start))
+    angle = float(np.arctan2(*(end - start)[::-1]))
+    return planar.Body(name, mass=mass, inertia=planar.rod(mass, length), position=(start + end) / 2, angle=angle)
+
+
+def chain(points, lengths):
+    """Bars from point to point, pinned to each other and to the ground at both ends."""
+    names = [f"bar{k}" for k in range(len(lengths))]
+    ends = [("ground", points[0]), *((n, (l / 2, 0.0)) for n, l in zip(names, lengths, strict=True))]
+    joints = [
+        planar.Revolute(f"pin{k}", ends[k][0], names[k], point_a=ends[k][1], point_b=(-lengths[k] / 2, 0.0))
+        for k in range(len(names))
+    ]
+    joints.append(planar.Revolute("last", ends[-1][0], "ground", point_a=ends[-1][1], point_b=points[-1]))
+    bodies = [bar(n, a, b) for n, a, b in zip(names, points, points[1:], strict=False)]
+    return mb.Scene(bodies, joints=joints, forces=[GRAVITY])
+
+
+def crank(*drivers, **options):
+    body = planar.Body("crank", mass=1.0, inertia=0.1, **options)
+    return mb.Scene([body], joints=[planar.Revolute("pivot", "ground", "crank", point=(0.0, 0.0)), *drivers])
+
+
+def driver(name, angle):
+    return planar.Driver(name, "ground", "crank", quantity="angle", motion=lambda t, p: angle(t))
+
+
+# Singular poses
+
+
+def particle(*constraints):
+    kinetic = lambda t, q, v, p: 0.5 * v @ v
+    own = [lagrangian.Holonomic(f"c{k}", f) for k, f in enumerate(constraints)]
+    return lagrangian.LagrangianSystem(kinetic=kinetic, q=np.zeros(2), constraints=own)
+
+
+SINGULAR = {
+    "two bars of 1 m between pins 2 m apart": (
+        lambda: chain([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)], [1.0, 1.0]).compile(),
+        r"pose of bar0, bar1 is singular: row 0 of pin1 is implied by pin0, last there, but not near it.*off this pos",
+    ),
+    "a flat four-bar": (
+        lambda: chain([(0.0, 0.0), (1.0, 0.0), (3.0, 0.0), (2.0, 0.0)], [1.0, 2.0, 1.0]).compile(),
+        r"pose of .*bar1.* is singular: row 0 of pin2 is implied by pin0, last, pin1 there, but not near it",
+    ),
+    "a flat parallelogram that is redundant besides": (
+        lambda: mechanisms.get("parallelogram", angle=0.0),
+        r"pose of .*coupler.* is singular: row 0 of head\d",
+    ),
+    "a product": (lambda: particle(lambda t, q, p: q[0] * q[1]), r"gradient of row 0 of c0 is zero.*singular"),
+    "a line and its tangent parabola": (
+        lambda: particle(lambda t, q, p: q[1], lambda t, q, p: q[1] - q[0] ** 2),
+        r"singular: row 0 of c1 is implied by c0 there, but not near it",
+    ),
+    "the square of an angle": (
+        lambda: crank(mb.Constraint("square", ["crank"], lambda x, t, p: x[0, 2] ** 2, rheonomic=False)).compile(),
+        r"gradient of row 0 of square is zero.*singular",
+    ),
+    "an angle times its rate": (
+        lambda: crank(
+            mb.VelocityConstraint("w", ["crank"], lambda x, v, t, p: x[0, 2] * v[0, 2], linear=True)
+        ).compile(),
+        r"gradient of row 0 of w is zero",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SINGULAR)
+def test_singular_poses_are_refused(case):
+    make, message = SINGULAR[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_four_bar_near_its_flat_pose_is_accepted():
+    lifted = [(0.0, 0.0), (np.cos(0.01), np.sin(0.01)), (2.0 + np.cos(0.01), np.sin(0.01)), (2.0, 0.0)]
+    system = chain(lifted, [1.0, 2.0, 1.0]).compile()
+    assert system.velocity_rank == 8
+
+
+# Prescribed motions
+
+
+def test_drivers_that_agree_now_only_are_refused():
+    with pytest.raises(ValueError, match=r"row 0 of second is implied by first at t = 0, but no more at t = "):
+        crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
+
+
+def test_drivers_that_agree_are_accepted():
+    system = crank(driver("first", jnp.sin), driver("second", lambda t: jnp.sin(t))).compile()
+    (implied,) = system.implied
+    assert (implied.name, implied.by) in (("second", ("first",)), ("first", ("second",)))
+    end = mb.simulate(system, mb.assemble(system), t1=2.0)
+    np.testing.assert_allclose(end["crank"].angle[-1], np.sin(2.0), atol=1e-9)
+
+
+def parting(t):
+    """Equal to t up to half a second."""
+    return t + jnp.maximum(t - 0.5, 0.0) ** 3
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5()])
+def test_drivers_that_part_later_end_the_motion(solver):
+    system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
+    state = mb.assemble(system)
+    with pytest.raises(RuntimeError, match=r"At t = [01].* the constraints (first|second) \(.*contradict the others"):
+        mb.simulate(system, state, t1=2.0, solver=solver)
+    motion = mb.simulate(system, state, t1=2.0, solver=solver, throw=False)
+    assert motion.result == mb.RESULTS.inconsistent_constraints
+
+
+def test_the_motion_that_is_kept_ends_where_the_drivers_part():
+    system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
+    saveat = diffrax.SaveAt(steps=True)
+    motion = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=saveat, throw=False)
+    # A violation of 1e-7 rad is allowed.
+    assert 0.5 <= motion.ts[-1] <= 0.5 + 1.2e-7 ** (1 / 3)
+    assert abs(motion["crank"].angle[-1] - parting(motion.ts[-1])) <= 1.2e-7
+
+
+@pytest.mark.long
+def test_a_member_of_a_batch_whose_drivers_part_spoils_no_other():
+    late = lambda t, p: t + p["rate"] * jnp.maximum(t - 0.5, 0.0) ** 3
+    second = planar.Driver("second", "ground", "crank", quantity="angle", motion=late, parameters={"rate": 0.0})
+    system = crank(driver("first", lambda t: t), second).compile()
+    state = mb.assemble(system)
+
+    def run(rate):
+        motion = mb.simulate(mb.with_parameters(system, {"second.rate": rate}), state, t1=1.0, throw=False)
+        return motion.result == mb.RESULTS.inconsistent_constraints, motion["crank"].angle[-1]
+
+    wrong, angle = jax.jit(jax.vmap(run))(jnp.array([0.0, 1.0]))
+    assert wrong.tolist() == [False, True]
+    np.testing.assert_allclose(angle[0], 1.0, atol=1e-9)
+
+
+@pytest.mark.long
+def test_redundancy_at_a_coarse_tolerance_is_no_singularity():
+    bricard = mechanisms.get("bricard")
+    motion = mb.simulate(bricard.system, bricard.state, t1=0.5, rtol=1e-4)
+    assert motion.result == mb.RESULTS.successful
+
+
+# States off the constraints
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    return mechanisms.get("four_bar")
+
+
+def test_a_moved_pin_needs_another_state(four_bar):
+    moved = mb.with_parameters(four_bar.system, {"D.point_a": jnp.array([2.6, 0.0])})
+    with pytest.raises(ValueError, match=r"state violates the constraints D \(0\.1\) at t0 = 0\..*jaxmb\.assemble"):
+        mb.simulate(moved, four_bar.state, t1=0.1)
+    mb.simulate(moved, mb.assemble(moved, four_bar.state), t1=0.1)
+
+
+def test_the_state_of_another_system_is_refused(four_bar):
+    other = mechanisms.get("four_bar", base=2.4)
+    with pytest.raises(ValueError, match=r"state violates the constraints .*D \("):
+        mb.simulate(four_bar.system, other.state, t1=0.1)
+
+
+def test_wrong_velocities_are_refused(four_bar):
+    state = four_bar.state
+    with pytest.raises(ValueError, match=r"velocities of the state violate the constraints .*B \("):
+        mb.simulate(four_bar.system, mb.State(state.q, state.u.at[0].add(0.1)), t1=0.1)
+    # Motions that drift on purpose may start anywhere.
+    mb.simulate(
+        four_bar.system,
+        mb.State(state.q, state.u.at[0].add(0.1)),
+        t1=0.01,
+        manifold=Baumgarte(),
+        solver=diffrax.Tsit5(),
+    )
+
+
+def test_the_state_of_another_time_is_refused():
+    system = crank(driver("drive", lambda t: t)).compile()
+    with pytest.raises(ValueError, match=r"state violates the constraints drive \(1\) at t0 = 1\."):
+        mb.simulate(system, mb.assemble(system), t0=1.0, t1=1.1)
+
+
+def test_traced_parameters_with_an_old_state_fail(four_bar):
+    def run(x):
+        system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
+        motion = mb.simulate(system, four_bar.state, t1=0.1, throw=False)
+        return motion["crank"].angle[-1], motion.result == mb.RESULTS.assembly_failed
+
+    ends, failed = jax.jit(jax.vmap(run))(jnp.array([2.5, 2.6]))
+    assert failed.tolist() == [False, True]
+    assert np.isfinite(ends[0]) and np.isnan(ends[1])
+
+
+@pytest.mark.long
+def test_derivatives_through_a_state_that_is_assembled_again(four_bar):
+    def end(x):
+        system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
+        state = mb.assemble(system, fix={"crank.angle": 1.6}, rates={"crank.angle": 4.0})
+        return mb.simulate(system, state, t1=0.3, rtol=1e-10)["crank"].angle[-1]
+
+    value, slope = jax.jit(jax.value_and_grad(end))(2.6)
+    plus, minus = jax.jit(jax.vmap(end))(jnp.array([2.6 + 1e-5, 2.6 - 1e-5]))
+    assert np.isfinite(value)
+    np.testing.assert_allclose(slope, (plus - minus) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("four_bar", {}),
+        pytest.param("spatial_slider_crank", {}, marks=pytest.mark.long),
+        pytest.param("spatial_slider_crank", {"solver": diffrax.Tsit5()}, marks=pytest.mark.long),
+    ],
+)
+def test_a_motion_at_a_coarse_tolerance_can_be_continued(name, options):
+    mechanism = mechanisms.get(name)
+    saveat = np.linspace(0.05, 0.4, 8)
+    coarse = mb.simulate(mechanism.system, mechanism.state, t1=0.4, rtol=1e-3, saveat=saveat, **options)
+    for k in range(8):
+        state = jax.tree.map(lambda y, k=k: y[k], coarse.ys)
+        mb.simulate(mechanism.system, state, t0=saveat[k], t1=saveat[k] + 1e-3)
+
+
+@pytest.mark.long
+def test_single_precision_states_are_accepted():
+    """In a program of its own: the precision is chosen before anything else."""
+    code = """
+import jaxmb as mb
+from jaxmb import mechanisms
+for name in ("four_bar", "bricard"):
+    m = mechanisms.get(name)
+    assert m.state.q.dtype == "float32"
+    motion = mb.simulate(m.system, m.state, t1=0.3, rtol=1e-4)
+    mb.simulate(m.system, mb.State(motion.ys.q[-1], motion.ys.u[-1]), t0=0.3, t1=0.4, rtol=1e-4)
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, env=os.environ)

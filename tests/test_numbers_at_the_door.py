@@ -1,0 +1,155 @@
+"""Numbers that no scene would be compiled with, and times at which nothing can be simulated."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+
+SIZE = (0.1, 0.2, 0.25)
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A rod of 2 m on a pin at the origin, with a bump stop and a servo-driven second rod."""
+    bodies = [
+        planar.Body("rod", mass=3.0, inertia=1.0, position=(1.0, 0.0)),
+        planar.Body("other", mass=1.0, inertia=1.0, position=(5.0, 0.0)),
+    ]
+    program = planar.Driver(
+        "drive", "ground", "other", quantity="angle", motion=lambda t, p: p["w"] * t, parameters={"w": 1.0}
+    )
+    joints = [planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)), mb.Servo(program, 1.0, 1.0)]
+    stop = planar.BumpStop("stop", "ground", "rod", stiffness=1.0, lower=-1.0, upper=1.0)
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81)), stop]).compile()
+
+
+@pytest.fixture(scope="module")
+def top():
+    body = spatial.Body("top", mass=1.0, inertia=SIZE)
+    hinge = spatial.Revolute("hinge", "ground", "top", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    return mb.Scene([body], joints=[hinge]).compile()
+
+
+PLANAR = {
+    "negative mass": ({"rod.mass": -1.0}, "Body 'rod': mass must be positive, got -1.0"),
+    "no mass": ({"other.mass": 0.0}, "Body 'other': mass must be positive"),
+    "NaN": ({"rod.inertia": np.nan}, "Body 'rod': inertia must be finite"),
+    "endless gravity": ({"gravity.acceleration": [0.0, -np.inf]}, "Gravity 'gravity': acceleration must be finite"),
+    "negative gain": ({"drive.damping": -1.0}, "Servo 'drive': damping must be non-negative"),
+    "number of a user's function": ({"drive.w": np.nan}, "Servo 'drive': program.w must be finite"),
+    "limits in the wrong order": ({"stop.lower": 2.0}, "BumpStop 'stop': lower must be less than upper"),
+}
+SPATIAL = {
+    "flat body": ({"top.inertia": np.diag([1.0, 1.0, 3.0])}, "Body 'top': inertia violates the triangle inequality"),
+    "negative moment": ({"top.inertia": np.diag([1.0, 1.0, -1.0])}, "Body 'top': inertia must be positive definite"),
+    "direction of no unit length": (
+        {"hinge.axis_a": [0.0, 0.0, 2.0]},
+        "Revolute 'hinge': axis_a must be a unit vector",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PLANAR | SPATIAL)
+def test_with_parameters_refuses_what_compile_refuses(rod, top, case):
+    values, message = (PLANAR | SPATIAL)[case]
+    with pytest.raises(ValueError, match=message):
+        mb.with_parameters(rod if case in PLANAR else top, values)
+
+
+def test_both_limits_may_be_moved_at_once(rod):
+    assert mb.parameters(mb.with_parameters(rod, {"stop.lower": 2.0, "stop.upper": 3.0}))["stop.lower"] == 2.0
+
+
+def test_cars_of_a_train_weigh_something():
+    train = mb.mechanisms.get("longitudinal_train").system
+    with pytest.raises(ValueError, match=r"'car1.mass' must be positive, got -1"):
+        mb.with_parameters(train, {"car1.mass": -1.0})
+    inside = jax.jit(lambda mass: mb.with_parameters(train, {"car1.mass": mass}).parameters_in_range())
+    assert inside(1.0) and not inside(-1.0)
+
+
+def test_a_traced_number_out_of_range_is_the_result(rod):
+    start, names = mb.assemble(rod), ("rod.mass", "rod.inertia", "stop.smoothing")
+
+    def end(values):
+        changed = mb.with_parameters(rod, dict(zip(names, values, strict=True)))
+        motion = mb.simulate(changed, start, t1=0.1, max_steps=64, throw=False)
+        return motion.ys.q[-1], motion.stats["num_steps"], motion.result == mb.RESULTS.invalid_parameters
+
+    members = jnp.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, np.nan, 1.0], [1.0, 1.0, 0.0]])
+    q, steps, invalid = map(np.asarray, jax.jit(jax.vmap(end))(members))
+    np.testing.assert_array_equal(invalid, [False, True, True, True])
+    np.testing.assert_array_equal(np.isnan(q).all(axis=1), invalid)
+    assert steps[0] > 0 and np.all(steps[1:] == 0)
+
+
+@pytest.mark.parametrize(
+    "value", [np.diag([1.0, 1.0, -1.0]), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])]
+)
+def test_traced_moments_of_inertia_are_positive_definite(top, value):
+    inside = jax.jit(lambda inertia: mb.with_parameters(top, {"top.inertia": inertia}).parameters_in_range())
+    assert inside(np.diag(SIZE)) and not inside(value)
+    assert mb.with_parameters(top, {"top.inertia": np.diag(SIZE)}).parameters_in_range() is True
+
+
+TIMES = {
+    "after the end": ({"saveat": [0.5, 2.0]}, "saveat must lie between t0 = 0 and t1 = 1, got times from 0.5 to 2"),
+    "before the start": ({"saveat": diffrax.SaveAt(ts=[-0.5, 0.5])}, "saveat must lie between t0 = 0 and t1 = 1"),
+    "of a run back": ({"t1": -1.0, "saveat": [0.0, 0.5]}, "saveat must lie between t0 = 0 and t1 = -1"),
+    "back and forth": ({"saveat": [0.5, 0.2]}, "saveat must run from t0 to t1 without turning back"),
+    "against a run back": ({"t1": -1.0, "saveat": [-0.5, -0.2]}, "saveat must run from t0 to t1"),
+    "NaN in a SaveAt": ({"saveat": diffrax.SaveAt(ts=[0.5, np.nan])}, "saveat must not be NaN"),
+}
+
+
+@pytest.mark.parametrize("case", TIMES)
+def test_times_to_save_at(rod, case):
+    changes, message = TIMES[case]
+    with pytest.raises(ValueError, match=message):
+        mb.simulate(rod, mb.assemble(rod), **({"t1": 1.0} | changes))
+
+
+def pushed_until(end):
+    law = lambda poses, velocities, t, p: jnp.stack([jnp.sqrt(p["end"] - t), 0.0 * t, 0.0 * t])[None]
+    forces = [mb.Force("push", "body", law, parameters={"end": end}), mb.Gravity((0.0, -9.81))]
+    return mb.Scene([planar.PointMass("body", mass=1.0)], forces=forces).compile()
+
+
+def driven_until(end):
+    """An angle whose second derivative grows beyond bounds."""
+    turn = lambda t, p: -((p["end"] - t) ** 1.5)
+    drive = planar.Driver("drive", "ground", "body", quantity="angle", motion=turn, parameters={"end": end})
+    return mb.Scene([planar.Body("body", mass=1.0, inertia=1.0)], joints=[drive]).compile()
+
+
+def in_coordinates(end):
+    kinetic, potential = lambda t, q, v, p: 0.5 * v @ v, lambda t, q, p: jnp.sqrt(p["end"] - q[0]) ** 3
+    numbers = {"q": [0.0], "u": [1.0], "parameters": {"end": end}}
+    return mb.lagrangian.LagrangianSystem(kinetic=kinetic, potential=potential, **numbers)
+
+
+WRONG = {
+    "force": (pushed_until, 0.5, "at t = 0.5 the force of 'push' is not finite"),
+    "driver": (driven_until, 0.3, "at t = 0.3 the residual of 'drive' is not finite"),
+    "potential": (in_coordinates, 0.1, "at t = 0.0[0-9]* the force on the coordinates is not finite"),
+}
+
+
+@pytest.mark.parametrize("case", ["force", pytest.param("driver", marks=pytest.mark.long), "potential"])
+def test_an_error_names_what_is_not_finite_in_one_line(case):
+    build, end, message = WRONG[case]
+    system = build(end)
+    with pytest.raises(RuntimeError, match=message) as failed:
+        mb.simulate(system, mb.assemble(system), t1=1.0)
+    assert len(str(failed.value)) < 300 and "\n" not in str(failed.value)
+
+
+def test_an_error_of_another_kind_is_one_line():
+    system = pushed_until(2.0)
+    with pytest.raises(RuntimeError) as failed:
+        mb.simulate(system, mb.assemble(system), t1=1.0, max_steps=3)
+    assert str(failed.value) == "The maximum number of solver steps was reached. Try increasing `max_steps`."
