@@ -1,6 +1,6 @@
 """Integration of all coordinates, with a projection on the constraints after every step."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
