@@ -69,7 +69,7 @@ class Trajectory(eqx.Module):
     `BodyMotion`; of a system in generalized coordinates it is that of a coordinate, shape (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
-    that are given here.
+    that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
     """
 
     system: Any
@@ -80,6 +80,7 @@ class Trajectory(eqx.Module):
     result: RESULTS
     interpolation: diffrax.AbstractPath | None
     event_mask: Any
+    closer: "Trajectory | None" = None
 
     def __getitem__(self, name: str) -> Any:
         names = self.system.motion_names()
@@ -99,6 +100,18 @@ class Trajectory(eqx.Module):
         if name not in known:
             raise unknown("quantity", name, known)
         return self._measured((name,))[name]
+
+    @property
+    def error(self) -> "GlobalError":
+        """An estimate of the global error of this motion, after `simulate(..., error=True)`."""
+        if self.closer is None:
+            raise ValueError("error needs simulate(..., error=True).")
+        result = self.closer.result
+        if not isinstance(self.ts, Tracer) and self.closer.ts.shape != self.ts.shape:
+            raise ValueError(
+                f"There is no error estimate, since the run at a tenth of the tolerances failed: {RESULTS[result]}"
+            )
+        return GlobalError(self, self.closer)
 
     @_of_each_member
     def _measured(self, names):
@@ -246,6 +259,34 @@ class Trajectory(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`."""
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
+
+
+class GlobalError(NamedTuple):
+    """The estimated global error of a motion: how far it is from the same one at a tenth of the tolerances.
+
+    The error of the closer motion is smaller by about the same factor, so the distance is nearly the error itself.
+    Errors of the model, and rounding errors that both motions share, are not seen.
+    """
+
+    motion: Trajectory
+    closer: Trajectory
+
+    @property
+    def ys(self) -> Any:
+        """Of every saved state, in the units of each coordinate and velocity."""
+        return _distance(self.motion.ys, self.closer.ys)
+
+    def quantity(self, name: str) -> Array:
+        """Of a quantity, by the name that `Trajectory.quantity` takes."""
+        return self.of(lambda trajectory: trajectory.quantity(name))
+
+    def of(self, observed: Callable[[Trajectory], Any]) -> Any:
+        """Of anything that is computed from a trajectory: `error.of(lambda trajectory: trajectory.energy)`."""
+        return _distance(observed(self.motion), observed(self.closer))
+
+
+def _distance(a, b):
+    return jax.tree.map(lambda a, b: jnp.abs(a - b), a, b)
 
 
 @eqx.filter_jit

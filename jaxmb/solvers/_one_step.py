@@ -16,7 +16,7 @@ from ._multistep import AbstractMultistep
 from ._scales import RunningScales
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
 from ._tolerances import MultistepNorm, Tolerances
-from ._wrapped import WrappedSolver
+from ._wrapped import WrappedSolver, with_loops
 
 
 class WithTangents(WrappedSolver):
@@ -24,9 +24,19 @@ class WithTangents(WrappedSolver):
 
     control: TangentControl
     rtol: Any
+    # What `solver` is wrapped in, if anything: diffrax looks for Runge–Kutta methods in one wrapper only.
+    outer: WrappedSolver | None = None
+
+    @property
+    def inner(self) -> Any:
+        return self._whole(self.scan_kind)
+
+    def _whole(self, kind):
+        solver = self.solver if self.outer is None else eqx.tree_at(lambda s: s.solver, self.outer, self.solver)
+        return with_loops(solver, kind)
 
     def init(self, terms, t0, t1, y0, args):
-        start = lambda terms, y0: self.solver.init(terms, t0, t1, y0, args)
+        start = lambda terms, y0: self.inner.init(terms, t0, t1, y0, args)
         tangents = []
         for of_terms, w in zip(self.control.of_terms(terms), self.control.starts(), strict=True):
             memory = pushed_only(start, (terms, y0), (of_terms, unravel_like(y0, w)))
@@ -41,7 +51,7 @@ class WithTangents(WrappedSolver):
         of_terms = self.control.of_terms(terms)
         along = tuple((of, unravel_like(y0, x.w), x.memory) for of, x in zip(of_terms, before, strict=True))
         # Loops over stages in the form of the adjoint have no forward derivatives.
-        out, along = pushed(step(self.with_loops("lax")), (terms, y0, state), along, step(self.inner))
+        out, along = pushed(step(self._whole("lax")), (terms, y0, state), along, step(self.inner))
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
         for tangent, (dy1, derror, _, memory, _) in zip(before, along, strict=True):
@@ -74,7 +84,9 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
         return solver, controller, lambda state: state
     watched = lambda x: dataclasses.replace(x if hasattr(x, "scales") else OneStepController.around(x), tangents=True)
     controller = jax.tree.map(lambda x: watched(x) if is_known(x) else x, controller, is_leaf=is_known)
-    return WithTangents(solver, control, found[0].rtol), controller, lambda state: state[0]
+    inner = getattr(solver, "solver", None)
+    outer = None if inner is None else solver
+    return WithTangents(inner or solver, control, found[0].rtol, outer), controller, lambda state: state[0]
 
 
 class ErrorWithTangents(NamedTuple):

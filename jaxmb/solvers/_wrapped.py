@@ -41,10 +41,11 @@ class WrappedSolver(diffrax.AbstractWrappedSolver):
     @property
     def inner(self) -> Any:
         """The solver, with the loops that the adjoint asked for."""
-        return self.with_loops(self.scan_kind)
+        return with_loops(self.solver, self.scan_kind)
 
-    def with_loops(self, kind: Any) -> Any:
-        """The solver with loops of a kind over its stages."""
-        if kind is None or not hasattr(self.solver, "scan_kind"):
-            return self.solver
-        return eqx.tree_at(lambda s: s.scan_kind, self.solver, kind, is_leaf=lambda x: x is None)
+
+def with_loops(solver: Any, kind: Any) -> Any:
+    """A solver with loops of a kind over its stages."""
+    if kind is None or not hasattr(solver, "scan_kind"):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
