@@ -19,10 +19,14 @@ from .formulations import AbstractFormulation, accelerations
 from .manifold import project_normalized
 from .parts.names import unknown
 from .system import Reaction
+from .system.violation import row_sizes
 
 
 class ConstraintViolation(NamedTuple):
-    """Largest residuals, scaled by the system's size; shape (times,). `position` of Φ, `velocity` of ψ [1/s]."""
+    """Largest residuals, shape (times,), in units that do not depend on how constraints are written: the changes that
+    restore them, of coordinates in the system's size and radians (`position`), and of velocities in these per second
+    (`velocity`).
+    """
 
     position: Float[Array, "times"]
     velocity: Float[Array, "times"]
@@ -228,10 +232,13 @@ class Trajectory(eqx.Module):
         """Largest scaled residuals of position and velocity constraints at every saved time."""
 
         def at(t, y):
-            length = self.system.length
-            position = jnp.max(jnp.abs(self.system.coordinate_residual(t, y.q)), initial=0.0) / length
-            velocity = jnp.max(jnp.abs(self.system.velocity_residual(t, y.q, y.u)), initial=0.0)
-            return ConstraintViolation(position, velocity / length)
+            rows = self.system.position_rows
+            position = jnp.abs(self.system.coordinate_residual(t, y.q))
+            velocity = jnp.abs(self.system.velocity_residual(t, y.q, y.u))
+            if velocity.size:
+                sizes = row_sizes(self.system, t, y)
+                position, velocity = position.at[:rows].divide(sizes[:rows]), velocity / sizes
+            return ConstraintViolation(jnp.max(position, initial=0.0), jnp.max(velocity, initial=0.0))
 
         return jax.vmap(at)(self.ts, self.ys)
 

@@ -52,10 +52,12 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
     return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
 
 
-def probed_derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
-    """The same, with a warning if differences of f contradict its derivative."""
+def probed_derivatives(
+    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None
+) -> Derivatives:
+    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known."""
     eps = jnp.finfo(y.dtype).eps
-    size = jnp.abs(y) + jnp.mean(jnp.abs(y))
+    size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
     signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
     aside = lax.stop_gradient(eps ** (1 / 3) * signs * jnp.where(size > 0, size, jnp.ones_like(size)))
 

@@ -123,12 +123,18 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
             return first, (state, None)
         flat = ravel(y0)
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
-        # In units of these sizes the absolute tolerance is the same for all components.
-        unit = self.scales.of_components(sizes)
-        scaled = lambda y: unravel_like(y0, ravel(y) / unit)
-        field = lambda terms, t, y, args: scaled(func(terms, t, unravel_like(y0, ravel(y) * unit), args))
-        first, state = self.controller.init(terms, t0, t1, scaled(y0), dt0, args, field, error_order)
-        return first, (state, sizes)
+        # The first step is chosen in units of these sizes, and of the time that they change in: it then depends on no
+        # others, and the absolute tolerance is the same for all components.
+        unit, rate = self.scales.of_components(sizes), (sizes[1] / sizes[0]).astype(t0.dtype)
+
+        def field(terms, t, y, args):
+            f = func(terms, t / rate, unravel_like(y0, ravel(y) * unit), args)
+            return unravel_like(y0, ravel(f) / (unit * rate))
+
+        y0 = unravel_like(y0, flat / unit)
+        dt0 = None if dt0 is None else dt0 * rate
+        first, state = self.controller.init(terms, t0 * rate, t1 * rate, y0, dt0, args, field, error_order)
+        return t0 + (first - t0 * rate) / rate, (state, sizes)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         state, sizes = controller_state

@@ -185,7 +185,12 @@ class Hermite(AbstractMultistep):
 
     def _initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
-        first = (probed_derivatives if before is None else derivatives)(field_of(terms, t0, y0, chart, args), t0, flat)
+        field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
+        if before is None:
+            size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
+            first = probed_derivatives(field, t0, flat, size)
+        else:
+            first = derivatives(field, t0, flat)
         chart, failed = first.rest
         # The NaN reaches the error estimate, so the step is rejected.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
