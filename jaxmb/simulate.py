@@ -193,7 +193,15 @@ def simulate(
             changed = lambda step: policy.prepare(moved(step), method, solver, relative)[0]
             along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
         own = options | {"y0": start}
-        return _integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
+        try:
+            return _integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
+        except TypeError as error:
+            if "custom_vjp" not in str(error):
+                raise
+            raise TypeError(
+                "The default adjoint serves reverse mode only: for jvp, jacfwd and linearize call "
+                "simulate(..., adjoint=diffrax.ForwardMode())."
+            ) from None
 
     used = solver
     trajectory, failed, end, coupling = motion(solver)

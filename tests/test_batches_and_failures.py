@@ -142,3 +142,11 @@ def test_derivatives_of_a_state_that_was_not_found():
     lengths = jnp.array([3.0, 40.0])
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_array_equal(np.isnan(jax.jit(jax.vmap(derivative(angle)))(lengths)), [False, True])
+
+
+def test_forward_mode_under_the_default_adjoint_says_what_to_do():
+    mechanism = mb.mechanisms.get("pendulum")
+    run = lambda q: mb.simulate(mechanism.system, mb.State(q, mechanism.state.u), t1=0.1).ys.q
+    for transform in (lambda q: jax.jvp(run, (q,), (q,)), jax.jacfwd(run)):
+        with pytest.raises(TypeError, match=r"adjoint=diffrax.ForwardMode\(\)"):
+            transform(mechanism.state.q)
