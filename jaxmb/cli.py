@@ -2,7 +2,6 @@
 
 import argparse
 import ast
-import dataclasses
 import json
 import os
 import sys
@@ -141,7 +140,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     print("\nError against run time:")
     chosen = {name: solver for name, solver in default_solvers().items() if name != "Tsit5"}
-    precision = work_precision(mechanism, chosen, _TOLERANCES)
+    precision = work_precision(mechanism, solvers=chosen, tolerances=_TOLERANCES)
     print(precision)
 
     _fit(mechanism, trajectory)
@@ -205,15 +204,11 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
         given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
         reason = str(error).split("\n")[0]
         raise ValueError(f"{arguments.mechanism} cannot be built with --set {given}: {reason}") from error
-    t1, known = arguments.t1, mechanism.references
-    if t1 is None:
+    if arguments.t1 is None:
         return mechanism
-    if not 0 < t1 < float("inf"):
-        raise ValueError(f"--t1 must be positive and finite, got {t1:g}.")
-    if known is not None:
-        keep = known.times <= t1
-        known = dataclasses.replace(known, times=known.times[keep], values=known.values[keep]) if keep.any() else None
-    return dataclasses.replace(mechanism, t1=t1, references=known)
+    if not 0 < arguments.t1 < float("inf"):
+        raise ValueError(f"--t1 must be positive and finite, got {arguments.t1:g}.")
+    return mechanism.until(arguments.t1)
 
 
 def _simulate(mechanism: "Mechanism", rtol: float) -> "tuple[Trajectory, float]":
