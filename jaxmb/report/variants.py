@@ -94,8 +94,6 @@ def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSy
     kind = "constraints" if isinstance(joint.part, AbstractConstraint) else "velocity_constraints"
     part = jax.tree.map(lambda x: x[:1], joint.part)
     if shift is not None:
-        if getattr(part, "point_a", None) is None:
-            raise ValueError(f"{joint.names[0]!r} has no point")
         part = eqx.tree_at(lambda p: p.point_a, part, part.point_a + shift)
     both = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), joint.part, part)
     names, bodies = (*joint.names, f"{joint.names[0]} again"), (*joint.bodies, joint.bodies[0])
