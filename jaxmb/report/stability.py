@@ -101,12 +101,15 @@ _WORDS = {
 
 
 class _Trial(NamedTuple):
-    """A variant: `build()` returns system, state and t1; `truth` its motion in natural units, if it is known."""
+    """A variant: `build()` returns system, state and t1.
+
+    `truth`, where the motion is that of the given system, is a tuple of one entry, as `_truth` returns it.
+    """
 
     case: str
     build: Callable[[], tuple[Any, State, float]]
     rtol: float
-    truth: Any = None
+    truth: tuple[Any] | None = None
 
 
 def stability(
@@ -173,7 +176,7 @@ class _Base(NamedTuple):
 
 def _tolerances(base: _Base) -> Iterator[_Trial]:
     for rtol in 10.0 ** -np.arange(3.0, 13.0):
-        yield base.trial(f"{rtol:.0e}", rtol=rtol, truth=base.truth)
+        yield base.trial(f"{rtol:.0e}", rtol=rtol, truth=(base.truth,))
 
 
 def _horizon(base: _Base) -> Iterator[_Trial]:
@@ -220,7 +223,7 @@ def _lengths(base: _Base) -> Iterator[_Trial]:
             scaled = scaled_lengths(own.system, own.state, factor)
         except ValueError as reason:
             raise _NotHereError(f"left out, {reason}") from None
-        yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=base.truth)
+        yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
 
 
 def _speeds(base: _Base) -> Iterator[_Trial]:
@@ -246,7 +249,7 @@ def _doubled(base: _Base) -> Iterator[_Trial]:
     own = base.mechanism
     if not (own.system.has_bodies and own.system.velocity_rows):
         raise _NotHereError("left out, there are no joints of bodies")
-    yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=base.truth)
+    yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
     if getattr(own.system.joints[0].group.part, "point_a", None) is None:
         raise _NotHereError(
             f"a nearly redundant one is left out, {own.system.joints[0].group.names[0]!r} has no points of two bodies"
@@ -277,7 +280,7 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> Case:
     steps = int(trajectory.stats["num_steps"])
     if not bool(trajectory.result == RESULTS.successful):
         return refused(outcome(trajectory.result), steps)
-    known = _truth(system, state, t1) if trial.truth is None else trial.truth
+    known = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
     if known is None:
         return Case(kind, trial.case, None, None, steps)
     truth, difference = known

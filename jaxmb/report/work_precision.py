@@ -19,6 +19,7 @@ from ..viz.figure import new_figure
 from .evaluations import evaluations
 from .reference import MARGIN, reference
 from .subject import subject
+from .table import aligned
 from .timing import interleaved, timed_compile
 
 if TYPE_CHECKING:
@@ -84,8 +85,7 @@ class WorkPrecision:
         if any(run.error is None for run in self.runs):
             lines += [f"  small: below the reference's accuracy, {MARGIN * self.disagreement:.0e}"]
         rows = [_HEADER, *map(_cells, self.runs)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        lines += aligned(rows, words=0)
         return "\n".join(lines + [f"{run.solver} at {run.rtol:.0e}: {run.message}" for run in self.runs if run.message])
 
     def _repr_html_(self) -> str:
