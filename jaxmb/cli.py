@@ -3,6 +3,7 @@
 import argparse
 import ast
 import dataclasses
+import importlib.util
 import json
 import os
 import sys
@@ -23,6 +24,8 @@ _FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
 
 # Variants of a mechanism that a report without --set also covers.
 _REPORT_VARIANTS = {"tracked_vehicle": ({"units": 2},)}
+# Words before the mechanism of a report, each for one report alone.
+_REPORTS = ("formulations", "work_precision", "stability", "left_out")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,11 +72,15 @@ def _parser() -> argparse.ArgumentParser:
 
     report = commands.add_parser(
         "report",
-        help="measure error against run time for several solvers and ways to integrate, or what each formulation costs",
+        help="measure error against run time, stability, what a scene leaves out, or what formulations cost",
         epilog="Without --set, a report on tracked_vehicle also covers two coupled vehicles.",
     )
     report.add_argument(
-        "mechanism", nargs="+", help="a name from `jaxmb mechanisms`; after the word `formulations`, the cost of those"
+        "mechanism",
+        nargs="+",
+        help="a name from `jaxmb mechanisms`, or your own scene as module:function or file.py:function, which returns "
+        "a scene, a mechanism, or system, state and perhaps t1; before it, for one report alone, one of the words "
+        + ", ".join(_REPORTS),
     )
     report.add_argument("--tolerances", type=float, nargs="+", metavar="RTOL", help="default 1e-4 1e-6 1e-8 1e-10")
     report.add_argument("--repeats", type=_count, default=5, help="timed runs of each solver (default %(default)d)")
@@ -141,7 +148,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     print("\nError against run time:")
     chosen = {name: solver for name, solver in default_solvers().items() if name != "Tsit5"}
-    precision = work_precision(mechanism, chosen, _TOLERANCES)
+    precision = work_precision(mechanism, solvers=chosen, tolerances=_TOLERANCES)
     print(precision)
 
     _fit(mechanism, trajectory)
@@ -156,15 +163,19 @@ def _report(arguments: argparse.Namespace) -> None:
     from .report import formulation_costs
 
     *words, arguments.mechanism = arguments.mechanism
-    if words not in ([], ["formulations"]):
+    if words not in ([], *([word] for word in _REPORTS)):
         raise ValueError(
-            f"A report is of one mechanism, or of `formulations` and one; got {' '.join(words)!r} before it."
+            f"A report is of one mechanism, or of one of the words {', '.join(_REPORTS)} and one; got "
+            f"{' '.join(words)!r} before it."
         )
-    if words:
+    if words == ["formulations"]:
         print(formulation_costs(_mechanism(arguments), repeats=arguments.repeats))
         return
     _check_out(arguments)
     mechanism, out = _mechanism(arguments), _folder(arguments)
+    if words:
+        _report_alone(words[0], mechanism, arguments, out)
+        return
     _measure(mechanism, arguments, out)
     if not arguments.set:
         for parameters in _REPORT_VARIANTS.get(mechanism.name, ()):
@@ -173,6 +184,24 @@ def _report(arguments: argparse.Namespace) -> None:
             print(f"\nThe same with {shown}:\n")
             (out / shown).mkdir(exist_ok=True)
             _measure(_mechanism(arguments), arguments, out / shown)
+
+
+def _report_alone(name: str, mechanism: "Mechanism", arguments: argparse.Namespace, out: Path) -> None:
+    from . import report
+
+    options = {
+        "work_precision": {"tolerances": arguments.tolerances, "repeats": arguments.repeats},
+        "left_out": {"repeats": arguments.repeats},
+    }
+    made = getattr(report, name)(mechanism, **options.get(name, {}))
+    print(made)
+    (out / f"{name}.json").write_text(json.dumps(made.to_dict(), indent=1))
+    print(f"\nWrote {out / name}.json")
+    try:
+        made.figure(out / f"{name}.png")
+        print(f"Wrote {out / name}.png")
+    except ImportError as error:
+        print(error)
 
 
 def _measure(mechanism: "Mechanism", arguments: argparse.Namespace, out: Path) -> None:
@@ -196,8 +225,9 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
     from . import mechanisms
 
     parameters = dict(arguments.set)
+    own = _function(arguments.mechanism) if ":" in arguments.mechanism else None
     try:
-        mechanism = mechanisms.get(arguments.mechanism, **parameters)
+        mechanism = mechanisms.get(arguments.mechanism, **parameters) if own is None else _made(own, arguments)
     except Exception as error:
         if not parameters:
             raise
@@ -205,15 +235,44 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
         given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
         reason = str(error).split("\n")[0]
         raise ValueError(f"{arguments.mechanism} cannot be built with --set {given}: {reason}") from error
-    t1, known = arguments.t1, mechanism.references
-    if t1 is None:
+    if arguments.t1 is None:
         return mechanism
-    if not 0 < t1 < float("inf"):
-        raise ValueError(f"--t1 must be positive and finite, got {t1:g}.")
-    if known is not None:
-        keep = known.times <= t1
-        known = dataclasses.replace(known, times=known.times[keep], values=known.values[keep]) if keep.any() else None
-    return dataclasses.replace(mechanism, t1=t1, references=known)
+    if not 0 < arguments.t1 < float("inf"):
+        raise ValueError(f"--t1 must be positive and finite, got {arguments.t1:g}.")
+    return mechanism.until(arguments.t1)
+
+
+def _function(where: str):
+    """A function from `module:function` or `file.py:function`."""
+    source, _, name = where.rpartition(":")
+    try:
+        if source.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(Path(source).stem, source)
+            assert spec is not None and spec.loader is not None
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+        else:
+            sys.path.insert(0, "")
+            module = importlib.import_module(source)
+        return getattr(module, name)
+    except (ImportError, FileNotFoundError, AttributeError) as error:
+        raise ValueError(f"{where}: {error}; give module:function or file.py:function.") from error
+
+
+def _made(function, arguments: argparse.Namespace) -> "Mechanism":
+    """The motion of a user's function: a scene, a mechanism, or system, state and perhaps t1."""
+    from .report.subject import subject
+    from .states.assembly import assemble
+
+    given, *rest = made if isinstance(made := function(**dict(arguments.set)), tuple) else (made,)
+    system = given.compile() if hasattr(given, "compile") else given
+    if hasattr(system, "references"):
+        return system
+    state = rest[0] if rest else assemble(system)
+    t1 = arguments.t1 if arguments.t1 is not None else rest[1] if len(rest) > 1 else None
+    if t1 is None:
+        raise ValueError(f"{arguments.mechanism} gives no end of the motion; add --t1 [s].")
+    return dataclasses.replace(subject(system, state, t1), name=function.__name__)
 
 
 def _simulate(mechanism: "Mechanism", rtol: float) -> "tuple[Trajectory, float]":
@@ -332,7 +391,7 @@ def _most_sensitive(mechanism: "Mechanism", ts) -> str | None:
 
 
 def _out(arguments: argparse.Namespace) -> Path:
-    return Path("jaxmb-output") / arguments.mechanism if arguments.out is None else arguments.out
+    return Path("jaxmb-output") / arguments.mechanism.split(":")[-1] if arguments.out is None else arguments.out
 
 
 def _check_out(arguments: argparse.Namespace) -> None:

@@ -30,7 +30,8 @@ def pendulum():
 
 @pytest.fixture(scope="module")
 def precision(pendulum):
-    return work_precision(pendulum, {"Adams": Adams(), "Dopri8": diffrax.Dopri8()}, (1e-5, 1e-9), repeats=3)
+    solvers = {"Adams": Adams(), "Dopri8": diffrax.Dopri8()}
+    return work_precision(pendulum, solvers=solvers, tolerances=(1e-5, 1e-9), repeats=3)
 
 
 def test_errors_fall_with_the_tolerance(precision):
@@ -68,7 +69,7 @@ def test_computed_reference(pendulum):
 
 def test_failed_run_keeps_its_row(pendulum):
     lost = dataclasses.replace(pendulum, state=jax.tree.map(lambda x: x * jnp.nan, pendulum.state))
-    failed = work_precision(lost, {"Tsit5": diffrax.Tsit5()}, (1e-5,), repeats=1)
+    failed = work_precision(lost, solvers={"Tsit5": diffrax.Tsit5()}, tolerances=(1e-5,), repeats=1)
     (run,) = failed.runs
     assert np.isnan(run.error) and run.message
     assert "failed" in str(failed) and run.message in str(failed)

@@ -37,6 +37,7 @@ class References:
     - `values`: shape (times, labels), in SI units.
     - `source`: where they come from.
     - `tolerance`: the relative error up to which the values can be trusted.
+    - `sizes` of the labels that errors are relative to, shape (labels,); default the largest value of each.
     """
 
     times: np.ndarray
@@ -44,6 +45,7 @@ class References:
     values: np.ndarray
     source: str
     tolerance: float
+    sizes: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "labels", tuple(self.labels))
@@ -62,8 +64,8 @@ class References:
 
     @property
     def scales(self) -> np.ndarray:
-        """The scale of the errors of each label: its largest value, or 1 if that is zero; shape (labels,)."""
-        largest = np.max(np.abs(self.values), axis=0)
+        """The scale of the errors of each label: its size, or 1 if that is zero; shape (labels,)."""
+        largest = np.max(np.abs(self.values), axis=0) if self.sizes is None else self.sizes
         return np.where(largest > 1e-12, largest, 1.0)
 
 
@@ -119,6 +121,17 @@ class Mechanism:
             label: np.abs(np.asarray(observed[label])[where] - self.references.values[own, k]) / scale
             for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
         }
+
+    def until(self, t1: float) -> "Mechanism":
+        """The same motion with another end `t1` [s], and the reference values up to there."""
+        if not 0 < t1 < float("inf"):
+            raise ValueError(f"t1 must be positive and finite, got {t1:g}.")
+        known = self.references
+        if known is not None:
+            keep = known.times <= t1
+            own = dataclasses.replace(known, times=known.times[keep], values=known.values[keep])
+            known = own if keep.any() else None
+        return dataclasses.replace(self, t1=float(t1), references=known)
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
         """The same mechanism with some parameters replaced and the state computed anew near the present one; also

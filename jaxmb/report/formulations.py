@@ -18,6 +18,7 @@ from ..linalg.elimination import PivotOrder, eliminate, full_pivot
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
+from .table import aligned
 from .timing import interleaved
 
 # Consecutive evaluations in one timed run.
@@ -74,9 +75,7 @@ class FormulationCosts:
             "deviation",
         )
         rows = [head, *map(_cells, self.costs)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-        return "\n".join([f"{self.mechanism}: accelerations at the start, by formulation", *map(text, rows)])
+        return "\n".join([f"{self.mechanism}: accelerations at the start, by formulation", *aligned(rows)])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, for JSON."""

@@ -21,6 +21,7 @@ from ..trajectory import Trajectory
 from .evaluations import evaluations
 from .reference import reference
 from .stabilised_dae import applies_to, stabilised_dae
+from .table import aligned
 from .timing import interleaved
 
 ERRORS = (1e-3, 1e-5, 1e-7)
@@ -62,10 +63,8 @@ class MethodCosts:
 
     def __str__(self) -> str:
         rows = [_HEADER, *map(_cells, self.costs)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        text = lambda row: "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
         title = f"{self.mechanism}, {self.t1:g} s: cost of an error at the end below each bound"
-        return "\n".join([title, *map(text, rows), *self.remarks])
+        return "\n".join([title, *aligned(rows), *self.remarks])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, for JSON."""

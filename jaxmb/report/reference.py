@@ -5,27 +5,40 @@ import numpy as np
 
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
+from .subject import natural_coordinates
+
+# An error is only known where it is this much larger than that of the reference.
+MARGIN = 10.0
 
 # Below this tolerance round-off dominates.
 _TIGHTEST = 1e-13
+# Times at which the sizes of quantities are looked for.
+_TIMES = 21
 
 
 def reference(mechanism: Mechanism, tolerance: float) -> References:
     """Values at the end of a mechanism's motion: published ones, or those of a run two orders tighter than `tolerance`.
 
     The run is checked by a second method, Dormand–Prince 8, with projection if there are constraints; the largest
-    relative difference of the two is the `tolerance` of the result.
+    relative difference of the two is the `tolerance` of the result. Sizes are the largest values along the motion.
     """
     if mechanism.references is not None:
         return mechanism.references
     rtol = max(tolerance / 100, _TIGHTEST)
-    run = lambda solver: simulate(mechanism.system, mechanism.state, t1=mechanism.t1, rtol=rtol, solver=solver)
+    ts = np.linspace(0.0, mechanism.t1, _TIMES)
+
+    def run(solver):
+        return simulate(mechanism.system, mechanism.state, t1=mechanism.t1, rtol=rtol, solver=solver, saveat=ts)
+
     observed, checked = (mechanism.observe(run(solver)) for solver in (None, diffrax.Dopri8()))
     labels = tuple(label for label, value in observed.items() if value.ndim == 1)
-    values = np.array([[float(observed[label][-1]) for label in labels]])
-    check = np.array([[float(checked[label][-1]) for label in labels]])
+    values, check = (np.stack([np.asarray(seen[label]) for label in labels], 1) for seen in (observed, checked))
+    sizes = np.max(np.abs(values), axis=0)
+    if mechanism.observe is natural_coordinates:
+        # One size of all coordinates, and one of all velocities.
+        sizes = np.array([max(size for size, own in zip(sizes, labels, strict=True) if own[0] == x[0]) for x in labels])
     projected = " with projection" if mechanism.system.acceleration_rows else ""
     source = f"Adams at rtol {rtol:.0e}, checked by Dopri8{projected}"
-    own = References(np.array([mechanism.t1]), labels, values, source, 0.0)
-    difference = float(np.max(np.abs(values - check) / own.scales))
-    return References(own.times, labels, values, source, difference)
+    known = References(ts[-1:], labels, values[-1:], source, 0.0, sizes)
+    difference = float(np.max(np.abs(values - check)[-1] / known.scales))
+    return References(known.times, labels, known.values, source, difference, sizes)

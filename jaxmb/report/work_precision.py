@@ -1,6 +1,7 @@
 """Error against run time and against evaluations, over solvers and tolerances."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,12 +10,16 @@ import diffrax
 import numpy as np
 
 from .._results import RESULTS
+from .._types import State
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 from ..solvers import Adams
+from ..system import AbstractSystem
 from ..viz.figure import new_figure
 from .evaluations import evaluations
-from .reference import reference
+from .reference import MARGIN, reference
+from .subject import subject
+from .table import aligned
 from .timing import interleaved, timed_compile
 
 if TYPE_CHECKING:
@@ -32,14 +37,15 @@ def default_solvers() -> dict[str, diffrax.AbstractSolver]:
 class Run:
     """One solver at one tolerance.
 
-    **Fields:** `solver`; `rtol`; `error`: the largest relative error at the end, NaN if the run failed; `times` [s] of
-    the warm runs; `compile_time` [s]; `steps`, accepted and rejected together, and `rejected`; `evaluations` of the
-    accelerations, None if unknown; `message`: why the run failed, or empty.
+    **Fields:** `solver`; `rtol`; `error`: the largest relative error at the end, NaN if the run failed, and None where
+    it is below the accuracy of the reference, so that it is not known; `times` [s] of the warm runs; `compile_time` [s]
+    of the solver's program, which serves all its tolerances; `steps`, accepted and rejected together, and `rejected`;
+    `evaluations` of the accelerations, None if unknown; `message`: why the run failed, or empty.
     """
 
     solver: str
     rtol: float
-    error: float
+    error: float | None
     times: tuple[float, ...]
     compile_time: float
     steps: int
@@ -76,9 +82,10 @@ class WorkPrecision:
     def __str__(self) -> str:
         lines = [f"{self.mechanism}, {self.t1:g} s; largest relative error at the end, against reference values:"]
         lines += [f"  {self.source}; good to {self.disagreement:.0e}"]
+        if any(run.error is None for run in self.runs):
+            lines += [f"  small: below the reference's accuracy, {MARGIN * self.disagreement:.0e}"]
         rows = [_HEADER, *map(_cells, self.runs)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        lines += aligned(rows, words=0)
         return "\n".join(lines + [f"{run.solver} at {run.rtol:.0e}: {run.message}" for run in self.runs if run.message])
 
     def _repr_html_(self) -> str:
@@ -106,7 +113,7 @@ def _cells(run: Run) -> tuple[str, ...]:
     return (
         run.solver,
         f"{run.rtol:.0e}",
-        "failed" if run.message else f"{run.error:.1e}",
+        "failed" if run.message else "small" if run.error is None else f"{run.error:.1e}",
         f"{1e3 * run.shortest:.2f}",
         f"{1e3 * run.median:.2f}",
         f"{run.compile_time:.1f}",
@@ -117,37 +124,46 @@ def _cells(run: Run) -> tuple[str, ...]:
 
 
 def work_precision(
-    mechanism: Mechanism,
+    system: AbstractSystem | Mechanism,
+    state: State | None = None,
+    *,
+    t1: float | None = None,
     solvers: Mapping[str, diffrax.AbstractSolver] | None = None,
     tolerances: Sequence[float] | None = None,
-    *,
     repeats: int = 5,
 ) -> WorkPrecision:
-    """Measure the errors of solvers on a mechanism, and their cost.
+    """Measure the errors of solvers on a motion, and their cost.
 
-    Every run is compiled before it is timed; then all of them run in turns `repeats` times. Only the end of the motion
-    is saved, so that no run includes interpolation.
+    Errors are those of the quantities that a mechanism observes, relative to their sizes; of other systems those of all
+    coordinates, relative to the largest, and of all velocities, in units of the system's size or radians. Reference
+    values are the published ones of a mechanism, or computed by two methods. Every run is compiled before it is timed;
+    then all of them run in turns `repeats` times. Only the end of the motion is saved, so that no run includes
+    interpolation.
 
-    **Arguments:** `mechanism`: of the library; `solvers` by name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax
-    with projection; `tolerances`: values of `rtol`, with `atol` one hundredth of it, default 1e-4 … 1e-10; `repeats`:
-    at least 1.
+    **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`; or a mechanism of the library alone; `solvers` by
+    name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax with projection; `tolerances`: values of `rtol`, default
+    1e-4 … 1e-10; `repeats`: at least 1.
 
     **Returns:** a `WorkPrecision`. A failed run keeps its row, with a message.
 
-    **Raises:** `ValueError` for no solvers, no tolerances or no repeats.
+    **Raises:** `ValueError` for no solvers, no tolerances or no repeats, and for a system without state or `t1`.
     """
+    mechanism = subject(system, state, t1)
     solvers = default_solvers() if solvers is None else solvers
     tolerances = TOLERANCES if tolerances is None else tolerances
     if not solvers or not tolerances or repeats < 1:
         raise ValueError("work_precision needs at least one solver, one tolerance and one repeat.")
+    if not all(0 < rtol < 1 for rtol in tolerances):
+        raise ValueError(f"The tolerances must be between 0 and 1, got {', '.join(f'{x:g}' for x in tolerances)}.")
     known = reference(mechanism, min(tolerances))
     t1 = float(known.times[-1])
     compiled, costs = [], []
     for solver in solvers.values():
-        for rtol in tolerances:
-            fn, seconds = timed_compile(_simulation(solver, rtol, t1), mechanism.system, mechanism.state)
-            compiled.append(lambda fn=fn: fn(mechanism.system, mechanism.state))
-            costs.append(seconds)
+        # Tolerances are an argument of one program for each solver.
+        start, values = (mechanism.system, mechanism.state), np.asarray(tolerances, mechanism.state.q.dtype)
+        fn, seconds = timed_compile(_simulation(solver, t1), *start, values[0])
+        compiled += [functools.partial(fn, *start, rtol) for rtol in values]
+        costs += [seconds] * len(tolerances)
     times = interleaved(compiled, repeats)
     cases = [(name, rtol) for name in solvers for rtol in tolerances]
     runs = []
@@ -164,23 +180,25 @@ def work_precision(
                 steps=int(trajectory.stats["num_steps"]),
                 rejected=int(trajectory.stats["num_rejected_steps"]),
                 evaluations=evaluations(solvers[name], trajectory.stats),
-                message="" if ok else _text(trajectory.result),
+                message="" if ok else outcome(trajectory.result),
             )
         )
     return WorkPrecision(mechanism.name, t1, tuple(runs), known.source, known.tolerance)
 
 
-def _text(result: RESULTS) -> str:
+def outcome(result: RESULTS) -> str:
+    """The text of a result."""
     return RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
 
 
-def _simulation(solver, rtol, t1):
-    return lambda system, state: simulate(system, state, t1=t1, rtol=rtol, solver=solver, throw=False)
+def _simulation(solver, t1):
+    return lambda system, state, rtol: simulate(system, state, t1=t1, rtol=rtol, solver=solver, throw=False)
 
 
-def _error(mechanism: Mechanism, known: References, trajectory) -> float:
+def _error(mechanism: Mechanism, known: References, trajectory) -> float | None:
     errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
-    return max(float(error[-1]) for error in errors.values())
+    largest = max(float(error[-1]) for error in errors.values())
+    return None if largest < MARGIN * known.tolerance else largest
 
 
 def _plot(report: WorkPrecision) -> "Figure":
@@ -193,11 +211,11 @@ def _plot(report: WorkPrecision) -> "Figure":
     for axes, (label, quantity) in zip(panels, quantities, strict=True):
         for k, solver in enumerate(dict.fromkeys(run.solver for run in report.runs)):
             points = [(quantity(run), run.error) for run in report.runs if run.solver == solver and not run.message]
-            points = [(x, error) for x, error in points if x is not None]
+            points = [(x, error) for x, error in points if x is not None and error is not None]
             if points:
                 axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
         if report.disagreement > 0:
-            axes.axhline(report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
+            axes.axhline(MARGIN * report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
         axes.set_xlabel(label)
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

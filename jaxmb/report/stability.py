@@ -1,0 +1,352 @@
+"""Stiff and extreme variants of a motion, with the true error of each or the reason why it is refused."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._results import RESULTS
+from .._types import State, VectorLike
+from ..mechanisms import Mechanism
+from ..parts.names import unknown
+from ..simulate import simulate
+from ..solvers import Adams, Hermite
+from ..states.assembly import assemble
+from ..system import AbstractSystem, parameters, with_parameters
+from ..viz.figure import new_figure
+from .reference import MARGIN
+from .subject import subject
+from .table import aligned
+from .variants import doubled, scaled_lengths, units
+from .work_precision import outcome
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Tolerances of references, the second where round-off does not allow the first; and the times that are saved.
+_TIGHT = (1e-13, 1e-11)
+_TIMES = 21
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One variant of a motion.
+
+    **Fields:** `kind` and `case`; `error` at the end, relative to the largest coordinate and the largest velocity: None
+    if it is not known, and `known_to`, the error that the reference can tell, None without one; `steps`, accepted and
+    rejected; `message`: why the variant was refused, or empty.
+    """
+
+    kind: str
+    case: str
+    error: float | None
+    known_to: float | None
+    steps: int
+    message: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The error, or a word instead."""
+        if self.message or self.error is not None:
+            return "refused" if self.message else f"{self.error:.1e}"
+        return "unknown" if self.known_to is None else "small"
+
+
+@dataclasses.dataclass(frozen=True)
+class Stability:
+    """The result of `stability`; `print` shows a table. `remarks`: cases that do not apply, and why."""
+
+    mechanism: str
+    t1: float
+    rtol: float
+    solver: str
+    cases: tuple[Case, ...]
+    remarks: tuple[str, ...]
+
+    def __str__(self) -> str:
+        head = ("variant", "", "error", "known to", "steps")
+        known = lambda c: "–" if c.known_to is None else f"{c.known_to:.0e}"
+        rows = [(c.kind, c.case, c.verdict, known(c), str(c.steps)) for c in self.cases]
+        lines = [f"{self.mechanism}, {self.t1:g} s, {self.solver} at rtol {self.rtol:g}: relative error at the end"]
+        lines += aligned([head, *rows], words=2)
+        words = {c.verdict for c in self.cases}
+        lines += [text for word, text in _WORDS.items() if word in words]
+        refused: dict[str, list[str]] = {}
+        for c in self.cases:
+            if c.message:
+                refused.setdefault(c.message, []).append(f"{c.kind} {c.case}")
+        return "\n".join([*lines, *(f"{', '.join(own)}: {text}" for text, own in refused.items()), *self.remarks])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists, for JSON."""
+        return dataclasses.asdict(self)
+
+    def figure(self, path: str | Path) -> None:
+        """Write a picture (PNG, SVG or PDF by the path's ending): the error of each variant.
+
+        **Raises:** `ImportError` that names the extra to install if matplotlib is missing.
+        """
+        _plot(self).savefig(path, dpi=150)
+
+
+_WORDS = {
+    "small": "small: below what the reference can tell, ten times the difference of its two methods",
+    "unknown": "unknown: of Adams, Dopri8 and Hermite at a tight tolerance no two came to the end",
+}
+
+
+class _Trial(NamedTuple):
+    """A variant: `build()` returns system, state and t1.
+
+    `truth`, where the motion is that of the given system, is a tuple of one entry, as `_truth` returns it.
+    """
+
+    case: str
+    build: Callable[[], tuple[Any, State, float]]
+    rtol: float
+    truth: tuple[Any] | None = None
+
+
+def stability(
+    system: AbstractSystem | Mechanism,
+    state: State | None = None,
+    *,
+    t1: float | None = None,
+    rtol: float = 1e-8,
+    solver: diffrax.AbstractSolver | None = None,
+    singular: Mapping[str, VectorLike] | None = None,
+    only: Collection[str] | None = None,
+) -> Stability:
+    """Simulate stiff and extreme variants of a motion, and measure the true error of each.
+
+    The error is relative to a known motion where there is one: that of the given system for other tolerances, other
+    lengths (by dimensional analysis) and doubled joints. Otherwise two of the methods `Adams`, `Dopri8` and `Hermite`
+    at a tight tolerance give a reference, and errors below ten times their difference are not known. Variants in which
+    only numbers change share one compiled program.
+
+    **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,
+    default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which the
+    motion is started as well; `only`: the kinds of variants to try, default all of `KINDS`.
+
+    **Returns:** a `Stability`. A variant that cannot be built, or whose run fails, keeps its row, with a message.
+    """
+    mechanism = subject(system, state, t1)
+    solver = Adams() if solver is None else solver
+    wrong = [name for name in only or () if name not in KINDS]
+    if wrong:
+        raise unknown("kind of variant", wrong[0], KINDS)
+    base = _Base(mechanism, rtol, singular or {}, _truth(mechanism.system, mechanism.state, mechanism.t1))
+    cases, remarks = [], []
+    for kind, trials in KINDS.items():
+        if only is not None and kind not in only:
+            continue
+        try:
+            for trial in trials(base):
+                cases.append(_judge(kind, trial, solver))
+        except _NotHereError as reason:
+            remarks.append(f"{kind}: {reason}.")
+    name = type(solver).__name__
+    return Stability(mechanism.name, mechanism.t1, rtol, name, tuple(cases), tuple(remarks))
+
+
+class _NotHereError(Exception):
+    """Why a kind of variant does not apply."""
+
+
+class _Base(NamedTuple):
+    mechanism: Mechanism
+    rtol: float
+    singular: Mapping[str, VectorLike]
+    truth: Any
+
+    def trial(self, case, *, system=None, state=None, t1=None, rtol=None, build=None, truth=None) -> _Trial:
+        own = self.mechanism
+        given = (
+            own.system if system is None else system,
+            own.state if state is None else state,
+            own.t1 if t1 is None else t1,
+        )
+        return _Trial(case, build or (lambda: given), self.rtol if rtol is None else rtol, truth)
+
+
+def _tolerances(base: _Base) -> Iterator[_Trial]:
+    for rtol in 10.0 ** -np.arange(3.0, 13.0):
+        yield base.trial(f"{rtol:.0e}", rtol=rtol, truth=(base.truth,))
+
+
+def _horizon(base: _Base) -> Iterator[_Trial]:
+    yield base.trial("10 t1", t1=10 * base.mechanism.t1)
+
+
+def _scaled(base: _Base, names: Collection[str], factors: Collection[float]) -> Iterator[_Trial]:
+    """Some parameters times several factors."""
+    system = base.mechanism.system
+    values = {name: np.asarray(value) for name, value in parameters(system).items() if name in names}
+    for factor in factors:
+        changed = {name: factor * value for name, value in values.items()}
+        yield base.trial(f"× {factor:.0e}", build=lambda own=changed: _with(base, with_parameters(system, own)))
+
+
+def _with(base: _Base, system: Any) -> tuple[Any, State, float]:
+    return system, base.mechanism.state, base.mechanism.t1
+
+
+def _stiffness(base: _Base) -> Iterator[_Trial]:
+    values = parameters(base.mechanism.system)
+    springs = [
+        n for n, unit in units(base.mechanism.system).items() if n.endswith("stiffness") and (unit or "")[:1] == "N"
+    ]
+    if not any(np.any(values[name]) for name in springs):
+        raise _NotHereError("left out, there are no springs")
+    yield from _scaled(base, springs, 10.0 ** np.arange(2, 15, 2))
+
+
+def _masses(base: _Base) -> Iterator[_Trial]:
+    system = base.mechanism.system
+    body = system.motion_names()[0]
+    masses = [n for n, unit in units(system).items() if n.startswith(f"{body}.") and "kg" in (unit or "").split()]
+    if not masses:
+        raise _NotHereError("left out, there is no body whose mass is a parameter")
+    for trial in _scaled(base, masses, 10.0 ** np.array([-8, -4, -2, 2, 4, 8])):
+        yield trial._replace(case=f"{body} {trial.case}")
+
+
+def _lengths(base: _Base) -> Iterator[_Trial]:
+    own = base.mechanism
+    for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6):
+        try:
+            scaled = scaled_lengths(own.system, own.state, factor)
+        except ValueError as reason:
+            raise _NotHereError(f"left out, {reason}") from None
+        yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
+
+
+def _speeds(base: _Base) -> Iterator[_Trial]:
+    own = base.mechanism
+    if not (np.any(np.asarray(own.state.u)) and own.system.linear and own.system.drift_free):
+        raise _NotHereError("left out, the motion starts from rest, or velocities are prescribed")
+    for factor in (1e-6, 1e-3, 10.0, 1e3):
+        fast = State(own.state.q, factor * own.state.u)
+        yield base.trial(f"× {factor:.0e}", state=fast, t1=own.t1 / max(factor, 1.0))
+
+
+def _near_singular(base: _Base) -> Iterator[_Trial]:
+    own = base.mechanism
+    if not base.singular:
+        raise _NotHereError("left out, no singular position was named; singular={'crank.angle': …} does")
+    for off in 10.0 ** -np.arange(3.0, 13.0, 3.0):
+        fix = {name: np.asarray(value) + off for name, value in base.singular.items()}
+        build = lambda fix=fix: (own.system, assemble(own.system, own.state, fix=fix), own.t1)
+        yield base.trial(f"{off:.0e} off", build=build)
+
+
+def _doubled(base: _Base) -> Iterator[_Trial]:
+    own = base.mechanism
+    if not (own.system.has_bodies and own.system.velocity_rows):
+        raise _NotHereError("left out, there are no joints of bodies")
+    yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
+    if getattr(own.system.joints[0].group.part, "point_a", None) is None:
+        raise _NotHereError(
+            f"a nearly redundant one is left out, {own.system.joints[0].group.names[0]!r} has no points of two bodies"
+        )
+    off = 1e-6 * float(own.system.length)
+    yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
+
+
+KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
+    "rtol": _tolerances,
+    "long horizon": _horizon,
+    "stiffness": _stiffness,
+    "mass": _masses,
+    "lengths": _lengths,
+    "initial speed": _speeds,
+    "near-singular": _near_singular,
+    "doubled joint": _doubled,
+}
+
+
+def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> Case:
+    refused = lambda message, steps=0: Case(kind, trial.case, None, None, steps, message)
+    try:
+        system, state, t1 = trial.build()
+    except ValueError as error:
+        return refused(str(error).split("\n")[0])
+    trajectory = _run(system, state, t1, trial.rtol, solver)
+    steps = int(trajectory.stats["num_steps"])
+    if not bool(trajectory.result == RESULTS.successful):
+        return refused(outcome(trajectory.result), steps)
+    known = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
+    if known is None:
+        return Case(kind, trial.case, None, None, steps)
+    truth, difference = known
+    error, known_to = _distance(_natural(system, trajectory.ys), truth), MARGIN * difference
+    return Case(kind, trial.case, None if error < known_to else error, known_to, steps)
+
+
+def _truth(system: Any, state: State, t1: float) -> Any:
+    """The motion in natural units and the difference of two methods; None if no two come to the end."""
+    for rtol in _TIGHT:
+        found = []
+        for solver in (Adams(), diffrax.Dopri8(), Hermite()):
+            trajectory = _run(system, state, t1, rtol, solver)
+            if bool(trajectory.result == RESULTS.successful):
+                found.append(_natural(system, trajectory.ys))
+            if len(found) == 2:
+                return found[0], _distance(*found)
+    return None
+
+
+def _run(system, state, t1, rtol, solver):
+    # Arrays, so that other numbers do not compile anew.
+    t1, rtol = (jnp.asarray(x, state.q.dtype) for x in (t1, rtol))
+    return _compiled(system, state, t1, rtol, solver)
+
+
+@eqx.filter_jit
+def _compiled(system, state, t1, rtol, solver):
+    saved = t1 * jnp.linspace(0.0, 1.0, _TIMES, dtype=t1.dtype)
+    # Nothing is differentiated, and forward mode keeps no steps.
+    return simulate(
+        system, state, t1=t1, rtol=rtol, solver=solver, saveat=saved, throw=False, adjoint=diffrax.ForwardMode()
+    )
+
+
+def _natural(system: Any, ys: State) -> tuple[np.ndarray, np.ndarray]:
+    scaled = lambda values, scale: np.asarray(values) / np.asarray(scale)
+    return scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
+
+
+def _distance(motion: Any, truth: Any) -> float:
+    """The largest difference at the end, relative to the largest value along the motion."""
+    size = lambda x: max(float(np.max(np.abs(x), initial=0.0)), np.finfo(float).tiny)
+    return max(float(np.max(np.abs((x - y)[-1]), initial=0.0)) / size(y) for x, y in zip(motion, truth, strict=True))
+
+
+def _plot(report: Stability) -> "Figure":
+    """The error of every variant, from top to bottom; refusals and unknown errors at the right."""
+    figure = new_figure(7.5, 1.4 + 0.2 * len(report.cases))
+    axes = figure.subplots()
+    styles = {"error": "C0o", "small, at most": "C2<", "unknown": "C1D", "refused": "C3x"}
+    points: dict[str, list[tuple[float, int]]] = {name: [] for name in styles}
+    numbers = [x for c in report.cases for x in (c.error, c.known_to) if x]
+    right = 10 * max([1.0, *numbers])
+    for k, c in enumerate(report.cases):
+        name = {"small": "small, at most"}.get(c.verdict, c.verdict if c.verdict in styles else "error")
+        small = max(c.known_to or 0.0, np.finfo(float).eps)
+        points[name].append((c.error or (small if name == "small, at most" else right), k))
+    for name, style in styles.items():
+        if points[name]:
+            axes.semilogx(*zip(*points[name], strict=True), style, label=name)
+    axes.axvline(report.rtol, color="0.5", linestyle=":", label="rtol")
+    axes.set_yticks(range(len(report.cases)), [f"{c.kind}  {c.case}" for c in report.cases], fontsize="small")
+    axes.set_ylim(len(report.cases) - 0.5, -0.5)
+    axes.set_xlabel("relative error at the end")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=5, fontsize="small")
+    figure.suptitle(f"{report.mechanism}, {report.t1:g} s, {report.solver} at rtol {report.rtol:g}")
+    return figure

@@ -1,0 +1,39 @@
+"""What a report is about: a mechanism of the library, or a system and a state of a user's."""
+
+from typing import Any
+
+from .._types import State
+from ..mechanisms import Mechanism
+from ..mechanisms.observe import Observation, columns
+from ..system import AbstractSystem
+from ..trajectory import Trajectory
+
+
+def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: float | None = None) -> Mechanism:
+    """The motion of a report.
+
+    **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism, with its own.
+
+    **Raises:** `ValueError` where one of them is missing or not needed.
+    """
+    if isinstance(system, AbstractSystem):
+        if state is None or t1 is None:
+            raise ValueError(
+                "A report on a system needs a state, from jaxmb.assemble, and t1=, the end of the motion [s]."
+            )
+        return Mechanism("scene", None, system, state, 0.0, None, natural_coordinates, "").until(t1)
+    own: Any = system
+    if not hasattr(own, "references") or state is not None:
+        raise ValueError(
+            "A report is about a compiled system and a state, from scene.compile() and jaxmb.assemble, or about a "
+            f"mechanism of the library alone; got {type(system).__name__}{'' if state is None else ' and a state'}."
+        )
+    return own if t1 is None else own.until(t1)
+
+
+def natural_coordinates(trajectory: Trajectory) -> Observation:
+    """All coordinates and velocities in units of the system's size, or radians, and seconds."""
+    system, ys = trajectory.system, trajectory.ys
+    q, u = ys.q / system.coordinate_scale()[None], ys.u / system.velocity_scale()[None]
+    names = lambda letter, values: (f"{letter}{k}" for k in range(values.shape[1]))
+    return columns(names("q", q), q) | columns(names("u", u), u)

@@ -1,0 +1,177 @@
+"""Variants of a system whose exact motion is known, or which have more than the system needs."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import State
+from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
+from ..parts.fields import field_names, paths
+from ..parts.forces import Damper
+from ..states.structure import with_structure
+from ..system import AbstractSystem, parameters, with_parameters
+from ..system.groups import ConstraintGroup, ForceGroup, Group, VelocityConstraintGroup, stack
+
+# Powers of the length in the units of parameters.
+_LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}
+
+
+def units(system: AbstractSystem) -> dict[str, str | None]:
+    """The units of all parameters by name; None where a user's function gives a number its meaning."""
+    out: dict[str, str | None] = dict.fromkeys(parameters(system))
+    for g in _groups(system):
+        for _, shown, declared in paths(g.group.part):
+            known = declared.unit if declared.unit or declared.shape is not None else None
+            out |= {f"{name}.{'.'.join(shown)}": known for name in g.group.names}
+    gravity = f"{getattr(system, 'gravity_name', '')}.acceleration"
+    return out | ({gravity: "m/s²"} if gravity in out else {})
+
+
+def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
+    """All lengths of a system times a factor, with masses and times as they are.
+
+    Every parameter is scaled by its unit, so the motion is the same in units of the system's size.
+
+    **Raises:** `ValueError` where a length may hide in a function, or a unit is not known.
+    """
+    functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
+    powers = {name: _powers(unit) for name, unit in units(system).items()}
+    unknown = [*functions, *(name for name, own in powers.items() if own is None)]
+    if unknown or not system.has_bodies:
+        raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
+    values = {}
+    for name, value in parameters(system).items():
+        own = np.array(powers[name])
+        # With two units, that of translations and that of rotations.
+        repeats = (1,) if own.size == 1 else (value.size - value.size // 2, value.size // 2)
+        exponents = np.repeat(own, repeats) if own.size > 1 else own[0]
+        values[name] = np.asarray(value) * float(factor) ** exponents
+    scaled = with_parameters(system, values)
+    scaled = eqx.tree_at(lambda s: s.length, scaled, system.length * factor)
+    natural = lambda s: (s.coordinate_scale(), s.velocity_scale())
+    own = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
+    return scaled, State(state.q * own[0], state.u * own[1])
+
+
+def _powers(unit: str | None) -> tuple[int, ...] | None:
+    """The power of the length in a unit, or in two of them."""
+    if unit is None:
+        return None
+    out = []
+    for one in unit.replace(" (3)", "").split(", "):
+        power = 0
+        for sign, side in zip((1, -1), one.split("/"), strict=False):
+            for word in side.split():
+                base = word.rstrip("²")
+                if base not in _LENGTH and not base.startswith("rad"):
+                    return None
+                power += sign * _LENGTH.get(base, 0) * (1 + word.endswith("²"))
+        out.append(power)
+    return tuple(out)
+
+
+def _has_function(part: Any) -> bool:
+    values = [getattr(part, name) for name in field_names(type(part))]
+    return any(_has_function(value) if isinstance(value, eqx.Module) else callable(value) for value in values)
+
+
+def _groups(system: Any) -> Iterator[Any]:
+    for field in ("bodies", "constraints", "velocity_constraints", "servos", "nonideal", "forces"):
+        yield from getattr(system, field, ()) if system.has_bodies else ()
+
+
+def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSystem:
+    """A scene with its first joint twice; with `shift` [m] the second has its first point off by that along each axis.
+
+    **Raises:** `ValueError` for a scene without joints, and where the scene with both does not compile.
+    """
+    joint = _first_joint(system)
+    kind = "constraints" if isinstance(joint.part, AbstractConstraint) else "velocity_constraints"
+    part = jax.tree.map(lambda x: x[:1], joint.part)
+    if shift is not None:
+        part = eqx.tree_at(lambda p: p.point_a, part, part.point_a + shift)
+    both = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), joint.part, part)
+    names, bodies = (*joint.names, f"{joint.names[0]} again"), (*joint.bodies, joint.bodies[0])
+    groups = getattr(system, kind)
+    first = dataclasses.replace(groups[0], group=Group(both, names, bodies, joint.layout))
+    return _compiled(system, state, **{kind: (first, *groups[1:])})
+
+
+def in_time(system: Any, state: State) -> AbstractSystem:
+    """A scene whose first joint has a term in time of amplitude zero."""
+    joint = _first_joint(system)
+    if not isinstance(joint.part, AbstractConstraint):
+        raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
+    part = _InTime("", (), joint.part, jnp.zeros(len(joint.names)))
+    first = ConstraintGroup(Group(part, joint.names, joint.bodies, joint.layout))
+    return _compiled(system, state, constraints=(first, *system.constraints[1:]))
+
+
+def nonholonomic(system: Any, state: State) -> AbstractSystem:
+    """A scene with the rates of its first joint as constraints between velocities, which the joint implies."""
+    joint = _first_joint(system)
+    if not isinstance(joint.part, AbstractConstraint):
+        raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
+    part = _Rate("", (), jax.tree.map(lambda x: x[:1], joint.part))
+    own = Group(part, (f"rate of {joint.names[0]}",), joint.bodies[:1], joint.layout)
+    return _compiled(system, state, velocity_constraints=(*system.velocity_constraints, VelocityConstraintGroup(own)))
+
+
+def with_damper(system: Any, state: State) -> AbstractSystem:
+    """A scene with a force element that exerts no force, a damper between its first body and the ground."""
+    if not system.has_bodies:
+        raise ValueError("there are no bodies")
+    layout = system.layout
+    origin = np.zeros(layout.space.dimension)
+    part = Damper("a damper of zero", "ground", system.body_names[0], damping=0.0, point_a=origin, point_b=origin)
+    own = stack([(part, (layout.bodies, 0))], layout)
+    return _compiled(system, state, forces=(*system.forces, *map(ForceGroup, own)))
+
+
+def _first_joint(system: Any) -> Group:
+    if not (system.has_bodies and system.velocity_rows):
+        raise ValueError("there are no joints of bodies")
+    return system.joints[0].group
+
+
+def _compiled(system: Any, state: State, **groups: Any) -> AbstractSystem:
+    return with_structure(dataclasses.replace(system, guess=state, **groups))
+
+
+class _InTime(AbstractConstraint):
+    name: str = eqx.field(static=True)
+    bodies: tuple = eqx.field(static=True)
+    part: Any
+    amplitude: Any
+    rheonomic = True
+
+    @property
+    def rows(self):
+        return self.part.rows
+
+    def residual(self, space, poses, t):
+        return self.part.residual(space, poses, t) + self.amplitude * jnp.sin(t)
+
+
+class _Rate(AbstractVelocityConstraint):
+    name: str = eqx.field(static=True)
+    bodies: tuple = eqx.field(static=True)
+    part: Any
+    linear = True
+
+    @property
+    def rows(self):
+        return self.part.rows
+
+    @property
+    def homogeneous(self):
+        return not self.part.rheonomic
+
+    def residual(self, space, poses, velocities, t):
+        rates, t = jax.vmap(space.rates)(poses, velocities), jnp.asarray(t, poses.dtype)
+        return jax.jvp(lambda t, x: self.part.residual(space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
