@@ -216,7 +216,8 @@ def simulate(
             "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
             stacklevel=2,
         )
-    if jumps is None and not system.drift_free and not is_traced((system, end, options["t0"], options["t1"])):
+    prescribed = system.acceleration_rows > 0 and not system.drift_free
+    if jumps is None and prescribed and not is_traced((system, end, options["t0"], options["t1"])):
         _warn_of_jumps(system, end[1].q, options["t0"], options["t1"])
     if throw and not isinstance(failed, Tracer) and failed:
         reason = _about_friction(system, coupling) if np.any(coupling) else None

@@ -219,15 +219,15 @@ def test_traced_parameters_with_an_old_state_fail(four_bar):
 
 @pytest.mark.long
 def test_derivatives_through_a_state_that_is_assembled_again(four_bar):
-    def end(x):
+    def end(x, rtol):
         system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
         state = mb.assemble(system, fix={"crank.angle": 1.6}, rates={"crank.angle": 4.0})
-        return mb.simulate(system, state, t1=0.3, rtol=1e-10)["crank"].angle[-1]
+        return mb.simulate(system, state, t1=0.3, rtol=rtol)["crank"].angle[-1]
 
-    value, slope = jax.jit(jax.value_and_grad(end))(2.6)
-    plus, minus = jax.jit(jax.vmap(end))(jnp.array([2.6 + 1e-5, 2.6 - 1e-5]))
+    value, slope = jax.jit(jax.value_and_grad(end))(2.6, 1e-10)
+    tight = jax.jit(lambda x: end(x, 1e-13))
     assert np.isfinite(value)
-    np.testing.assert_allclose(slope, (plus - minus) / 2e-5, rtol=1e-6)
+    np.testing.assert_allclose(slope, (tight(2.6 + 1e-4) - tight(2.6 - 1e-4)) / 2e-4, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -144,6 +144,6 @@ def test_a_train():
     value, slope = jax.jit(observed), jax.jit(jax.grad(observed))
     central = lambda h: (value(mass + h, 1e-13) - value(mass - h, 1e-13)) / (2 * h)
     difference = (4 * central(1e-5 * mass) - central(2e-5 * mass)) / 3
-    # The difference itself is right to about 1e-5.
-    for rtol, error in ((1e-4, 2e-2), (1e-6, 1e-3), (1e-8, 1e-4), (1e-10, 3e-5)):
+    # The difference itself is right to about 5e-5.
+    for rtol, error in ((1e-4, 2e-2), (1e-6, 1e-3), (1e-8, 1e-4), (1e-10, 1e-4)):
         np.testing.assert_allclose(slope(mass, rtol), difference, rtol=error)

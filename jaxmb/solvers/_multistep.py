@@ -110,7 +110,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
     def _first_tangents(
         self, numbers: Callable[..., tuple[Array, PyTree]], terms, flat: Float[Array, " n"], before: Any
-    ) -> tuple[Tangent, ...]:
+    ) -> tuple[Tangent, ...] | None:
         """The tangents at a start whose errors are controlled.
 
         **Arguments:** `numbers(terms, flat)`: the state on the manifold and the memory of a solver that starts there;
@@ -118,7 +118,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         """
         control = self.tangent_control
         if control is None:
-            return ()
+            return None
         starts = control.starts() if before is None else [tangent.w for tangent in before.tangents]
         pushes = [pushed_only(numbers, (terms, flat), at) for at in zip(control.of_terms(terms), starts, strict=True)]
         return tuple(Tangent(w, memory, control.largest(w)) for w, memory in pushes)
@@ -133,12 +133,12 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return pushed(step, (terms, before, self._memory(state)), along)
 
     def _tangents_after(
-        self, tangents: tuple[Tangent, ...], along: list[Any]
-    ) -> tuple[tuple[Tangent, ...], list[Float[Array, " n"]]]:
+        self, tangents: tuple[Tangent, ...] | None, along: list[Any]
+    ) -> tuple[tuple[Tangent, ...] | None, list[Float[Array, " n"]]]:
         """The tangents at the end of a step, from the derivatives of its numbers, and the errors tolerated in them."""
         control = self.tangent_control
-        if control is None:
-            return (), []
+        if control is None or tangents is None:
+            return None, []
         out, scales = [], []
         for tangent, end in zip(tangents, along, strict=True):
             peak = jnp.maximum(tangent.peak, control.largest(end.after))

@@ -75,7 +75,7 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
         if solver.tolerances.fixed:
             return solver, controller, lambda state: state
         solver = eqx.tree_at(lambda s: s.tangent_control, solver, control, is_leaf=lambda x: x is None)
-        return solver, controller, lambda state: eqx.tree_at(lambda s: s.tangents, state, ())
+        return solver, controller, lambda state: eqx.tree_at(lambda s: s.tangents, state, None)
     kinds = (diffrax.PIDController, OneStepController)
     # A concrete class, since a controller may be wrapped in others that diffrax has.
     is_known = lambda x: isinstance(x, kinds)
@@ -117,7 +117,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         controller: Any = self.controller.wrap(direction)
         return dataclasses.replace(self, controller=controller)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         if self.scales is None:
             first, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
             return first, (state, None)

@@ -53,7 +53,7 @@ class AdamsState(eqx.Module):
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
-    - `tangents`: those whose errors are controlled beside that of the state.
+    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
     """
 
     history: History
@@ -62,7 +62,7 @@ class AdamsState(eqx.Module):
     chart: Chart | None
     stiffness: Stiffness | None
     sizes: Float[Array, "2"] | None
-    tangents: tuple[Tangent, ...]
+    tangents: tuple[Tangent, ...] | None
 
 
 class _Step(NamedTuple):

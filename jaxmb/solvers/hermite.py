@@ -47,7 +47,7 @@ class HermiteState(eqx.Module):
         in `step_counts`, those of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
-    - `tangents`: those whose errors are controlled beside that of the state.
+    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
     """
 
     history: History
@@ -58,7 +58,7 @@ class HermiteState(eqx.Module):
     work: Int[Array, "2"]
     chart: Chart | None
     sizes: Float[Array, "2"] | None
-    tangents: tuple[Tangent, ...]
+    tangents: tuple[Tangent, ...] | None
 
 
 class _Step(NamedTuple):

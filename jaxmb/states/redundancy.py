@@ -75,7 +75,10 @@ def _nearby(system, q, positions) -> Iterator[tuple[float, Any, Any]]:
     """
     shifts = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSES, q.size)) * np.finfo(q.dtype).eps ** _DISPLACEMENT
     times = () if system.drift_free else _TIMES
-    kept = np.append(positions, np.arange(system.position_rows, system.coordinate_rows))
+    _, of_coordinates, _ = map(np.asarray, _evaluate(system, np.asarray(0.0, q.dtype), q, np.zeros_like(q)))
+    # Coordinates may need more rows than velocities: those that keep invariants of the coordinates come last.
+    own = np.append(positions, np.arange(system.position_rows, system.coordinate_rows))
+    kept = _independent_rows(of_coordinates, [*own, *np.setdiff1d(np.arange(system.coordinate_rows), own)])
     small = np.finfo(q.dtype).eps ** 0.75
     for t, shift in [*((0.0, shift) for shift in shifts), *((t, 0.0) for t in times)]:
         at = lambda moved, t=t: map(np.asarray, _evaluate(system, np.asarray(t, q.dtype), q, moved))
@@ -90,6 +93,16 @@ def _nearby(system, q, positions) -> Iterator[tuple[float, Any, Any]]:
             if np.max(np.abs(step)) <= small:
                 yield t, unmet[: system.position_rows], jacobian
                 break
+
+
+def _independent_rows(jacobian, order):
+    """Rows that do not depend on those before them, in an order."""
+    kept, basis = [], np.zeros((0, jacobian.shape[1]), jacobian.dtype)
+    for k in order:
+        own = jacobian[k] - basis.T @ (basis @ jacobian[k])
+        if np.linalg.norm(own) > np.finfo(jacobian.dtype).eps ** 0.5 * np.linalg.norm(jacobian[k]):
+            kept, basis = [*kept, k], np.vstack([basis, own / np.linalg.norm(own)])
+    return np.array(kept, int)
 
 
 @eqx.filter_jit
