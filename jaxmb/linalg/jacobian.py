@@ -20,6 +20,7 @@ from .blocks import matrix_products
 from .elimination import Factor
 from .inertia import AbstractInertia
 from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor, DensePositiveDefinite
+from .rotations import norm
 
 
 class AbstractJacobian(eqx.Module):
@@ -112,7 +113,7 @@ class DenseJacobian(AbstractJacobian):
         return self.matrix.T @ multipliers
 
     def row_norms(self, scale):
-        return jnp.linalg.norm(self.matrix * scale[None, :], axis=1)
+        return norm(self.matrix * scale[None, :])
 
     def gather_rows(self, values):
         return values if self.factor is None else values[self.factor.rows]
