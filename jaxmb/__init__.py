@@ -23,11 +23,17 @@ from .parts.functions import (
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
 )
+from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
 from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
 from .studies.identify import Identification as Identification, identify as identify
-from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
+from .system import (
+    RigidBodySystem as RigidBodySystem,
+    parameters as parameters,
+    with_inputs as with_inputs,
+    with_parameters as with_parameters,
+)
 from .trajectory import Trajectory as Trajectory, load as load

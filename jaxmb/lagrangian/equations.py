@@ -19,5 +19,5 @@ class Projected(AbstractEquations):
         v, pull = jax.vjp(lambda u: system.rates(t, q, u), u)
         momentum = lambda t, q: system.momentum(t, q, system.rates(t, q, u))
         _, rate = jax.jvp(momentum, (t, q), (jnp.ones_like(t), v))
-        total = jax.grad(system.lagrangian, 1)(t, q, v, system.parameters) - rate
+        total = jax.grad(system.lagrangian, 1)(t, q, v, system.parameters_at(t)) - rate
         return pull(total + system.applied_force(t, q, v))[0]

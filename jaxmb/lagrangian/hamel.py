@@ -58,9 +58,8 @@ class Hamel(AbstractEquations):
 
     def force(self, system, t, q, u):
         frame: Any = system.kinematics
-        p = system.parameters
         one = jnp.ones_like(t)
-        columns = lambda t, q: frame.columns_of(t, q, p)
+        columns = lambda t, q: frame.columns_of(t, q, system.parameters_at(t))
         X, v = columns(t, q), system.rates(t, q, u)
         sigma = u.size
         # [X_b, X_c] for all columns c, summed over the velocities of b with the drift: d X_c / dt − ∂v/∂q X_c.
@@ -69,7 +68,7 @@ class Hamel(AbstractEquations):
         inverse = inverse_of(complete(X))
         structure = inverse @ (moved - turned)
 
-        ell = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), p)
+        ell = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), system.parameters_at(t))
         momenta = system.momentum(t, q, v) @ complete(X)
         W = self._transposed(system, t, q, v, X, structure, sigma)
         transitivity = structure + inverse @ W
@@ -83,7 +82,7 @@ class Hamel(AbstractEquations):
         share = share_of_suslov(self.transposition)
         if share is None:
             transposition: Any = self.transposition
-            along = lambda x: jnp.asarray(transposition(t, q, v, x, system.parameters))
+            along = lambda x: jnp.asarray(transposition(t, q, v, x, system.parameters_at(t)))
             return jax.vmap(along, in_axes=1, out_axes=1)(X)
         outside = (jnp.arange(q.size) >= sigma)[:, None]
         return -share * (complete(X) @ jnp.where(outside, structure, jnp.zeros_like(structure)))

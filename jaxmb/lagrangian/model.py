@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State
+from ..parts.series import AbstractSignal
 from ..system import AbstractGeneralizedSystem, DenseInertia, DiagonalInertia
 from ..system.describe import count_independent, count_rows, shorten, specialised_constraints
 from ..system.description import Description
@@ -38,13 +39,21 @@ class AbstractEquations(eqx.Module):
         """`F(t, q, u)`."""
 
 
+class Input(eqx.Module):
+    """A parameter that is a function of time, and whether constraints or the meaning of velocities depend on it."""
+
+    signal: AbstractSignal
+    binds: bool = eqx.field(static=True)
+
+
 class AbstractLagrangian(AbstractGeneralizedSystem):
     """The functions of a Lagrangian system, and every kernel that follows from them by automatic differentiation.
 
     **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
     potential, or None; `constraints`, ordered by level; `sizes`, the number of rows of each.
 
-    `diagonal` says whether the mass matrix is diagonal and constant.
+    `inputs` are the parameters that are functions of time. `diagonal` says whether the mass matrix is diagonal and
+    constant.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
@@ -58,6 +67,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     length: Float[Array, ""]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
+    inputs: dict[str, Input]
 
     diagonal: AbstractVar[bool]
 
@@ -118,6 +128,14 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
         return {name: [(_parameter(name), None)] for name in self.parameters}
 
+    def parameters_at(self, t: Scalar) -> dict[str, Array]:
+        """The parameters at a time, the last argument of every function."""
+        at = lambda name: jnp.asarray(self.inputs[name].signal(t), self.parameters[name].dtype)
+        return self.parameters | {name: at(name) for name in self.inputs}
+
+    def signals(self):
+        return {name: (own.signal, own.binds) for name, own in self.inputs.items()}
+
     def positive_parameters(self):
         # The meaning of a parameter is the user's.
         return frozenset()
@@ -125,7 +143,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     # Kinematics
 
     def rates(self, t, q, u):
-        return self.kinematics.rates(t, q, u, self.parameters)
+        return self.kinematics.rates(t, q, u, self.parameters_at(t))
 
     def normalize(self, q):
         return q
@@ -134,7 +152,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
 
     @eqx.filter_jit
     def position_residual(self, t, q):
-        return self._join(c.value(t, q, q, q, self.parameters) for c in self.constraints if c.level == 0)
+        return self._join(c.value(t, q, q, q, self.parameters_at(t)) for c in self.constraints if c.level == 0)
 
     def coordinate_residual(self, t, q):
         return self.position_residual(t, q)
@@ -148,7 +166,9 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         t = jnp.asarray(t, q.dtype)
         v = self.rates(t, q, u)
         _, rate = jax.jvp(self.position_residual, (t, q), (jnp.ones_like(t), v))
-        return self._join([rate, *(c.value(t, q, v, v, self.parameters) for c in self.constraints if c.level == 1)])
+        return self._join(
+            [rate, *(c.value(t, q, v, v, self.parameters_at(t)) for c in self.constraints if c.level == 1)]
+        )
 
     @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
@@ -156,7 +176,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         v, one = self.rates(t, q, u), jnp.ones_like(t)
         _, rate = jax.jvp(self.velocity_residual, (t, q, u), (one, v, udot))
         _, a = jax.jvp(self.rates, (t, q, u), (one, v, udot))
-        others = [c.value(t, q, v, a, self.parameters) for c in self.constraints if c.level == 2]
+        others = [c.value(t, q, v, a, self.parameters_at(t)) for c in self.constraints if c.level == 2]
         return self._join([rate, *others])
 
     @eqx.filter_jit
@@ -179,7 +199,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
             reaction = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
             first = [name for name, _ in self.rows].index(law.constraint)
             own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
-            total = total + law.force(t, q, v, reaction, own, self.parameters)
+            total = total + law.force(t, q, v, reaction, own, self.parameters_at(t))
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):
@@ -187,9 +207,9 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
 
         def residual(a):
             return self._join(
-                jax.jacfwd(c.value, 1 + c.level)(t, q, v, v, self.parameters) @ a
+                jax.jacfwd(c.value, 1 + c.level)(t, q, v, v, self.parameters_at(t)) @ a
                 if c.level < 2
-                else c.value(t, q, v, a, self.parameters)
+                else c.value(t, q, v, a, self.parameters_at(t))
                 for c in self.constraints
             )
 
@@ -202,7 +222,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
 
     def momentum(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """`∂L/∂q̇`."""
-        return jax.grad(self.lagrangian, 2)(t, q, v, self.parameters)
+        return jax.grad(self.lagrangian, 2)(t, q, v, self.parameters_at(t))
 
     @eqx.filter_jit
     def inertia(self, t, q, u):
@@ -222,7 +242,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
 
     def applied_force(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """Q, the generalized forces on the coordinates that have no potential."""
-        return jnp.zeros_like(v) if self.applied is None else jnp.asarray(self.applied(t, q, v, self.parameters))
+        return jnp.zeros_like(v) if self.applied is None else jnp.asarray(self.applied(t, q, v, self.parameters_at(t)))
 
     # Energy
 
@@ -231,13 +251,13 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         """`q̇ · ∂L/∂q̇ − L` without the potential energy: the kinetic energy, if L is quadratic in q̇."""
         t = jnp.asarray(t, q.dtype)
         v = self.rates(t, q, u)
-        energy = v @ self.momentum(t, q, v) - self.lagrangian(t, q, v, self.parameters)
+        energy = v @ self.momentum(t, q, v) - self.lagrangian(t, q, v, self.parameters_at(t))
         return energy - self.potential_energy(t, q)
 
     @eqx.filter_jit
     def potential_energy(self, t, q):
         """`−L(t, q, 0)`."""
-        return -self.lagrangian(t, q, jnp.zeros_like(q), self.parameters)
+        return -self.lagrangian(t, q, jnp.zeros_like(q), self.parameters_at(t))
 
     # Scales
 

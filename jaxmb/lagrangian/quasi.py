@@ -124,11 +124,11 @@ def kinetostatic_forces(
     """
     kinematics, t = _quasi(system), jnp.asarray(t, q.dtype)
     omega = kinematics.all_of(q.size, u)
-    columns = jax.jacfwd(lambda omega: kinematics.rates_of_all(t, q, omega, system.parameters))(omega)
+    columns = jax.jacfwd(lambda omega: kinematics.rates_of_all(t, q, omega, system.parameters_at(t)))(omega)
     v, one = system.rates(t, q, u), jnp.ones_like(t)
     momentum = lambda t, q, u: system.momentum(t, q, system.rates(t, q, u))
     _, rate = jax.jvp(momentum, (t, q, u), (one, v, udot))
-    missing = rate - jax.grad(system.lagrangian, 1)(t, q, v, system.parameters) - system.applied_force(t, q, v)
+    missing = rate - jax.grad(system.lagrangian, 1)(t, q, v, system.parameters_at(t)) - system.applied_force(t, q, v)
     return missing @ columns[:, list(kinematics.dependent)]
 
 
@@ -145,10 +145,10 @@ def johnsen_hamel_residual(
     with $L^*(t, q, \omega) = L(t, q, \dot q)$ and
     $\partial / \partial \theta_k = (\partial \dot q_l / \partial \omega_k) \, \partial / \partial q_l$.
     """
-    kinematics, p, t = _quasi(system), system.parameters, jnp.asarray(t, q.dtype)
+    kinematics, at, t = _quasi(system), system.parameters_at, jnp.asarray(t, q.dtype)
     omega, along = kinematics.all_of(q.size, u), kinematics.all_of(q.size, udot)
-    rates = lambda t, q, omega: kinematics.rates_of_all(t, q, omega, p)
-    star = lambda t, q, omega: system.lagrangian(t, q, rates(t, q, omega), p)
+    rates = lambda t, q, omega: kinematics.rates_of_all(t, q, omega, at(t))
+    star = lambda t, q, omega: system.lagrangian(t, q, rates(t, q, omega), at(t))
     v = rates(t, q, omega)
     moving = (t, q, omega), (jnp.ones_like(t), v, along)
     columns, turned = jax.jvp(jax.jacfwd(rates, 2), *moving)

@@ -14,6 +14,7 @@ from ..parts.fields import as_jax
 from ..system.equation import Ranks
 from .constraints import check_names
 from .equations import Projected
+from .inputs import inputs_of
 from .kinematics import AbstractKinematics, Rates
 from .model import AbstractEquations, AbstractLagrangian
 from .nonideal import AbstractNonIdealForce
@@ -102,12 +103,22 @@ class LagrangianSystem(AbstractLagrangian):
             length=as_jax(length),
             coordinates=_names(coordinates, guess.q.size),
             sizes=constraint_sizes(*functions, constraints, kinematics, guess, numbers),
+            inputs={},
         )
         for field in dataclasses.fields(model):
             setattr(self, field.name, getattr(model, field.name))
         for name, value in find_structure(model)._asdict().items():
             setattr(self, name, value)
         self.equations.check(self)
+
+    def with_signals(self, signals):
+        inputs = self.inputs | inputs_of(self, signals)
+        out = object.__new__(type(self))
+        for field in dataclasses.fields(self):
+            object.__setattr__(out, field.name, getattr(self, field.name))
+        object.__setattr__(out, "inputs", inputs)
+        object.__setattr__(out, "drift_free", self.drift_free and not any(own.binds for own in inputs.values()))
+        return out
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:

@@ -49,25 +49,25 @@ class Voronets(AbstractEquations):
 
     def force(self, system, t, q, u):
         connection: Any = system.kinematics
-        p = system.parameters
         fibre = jnp.array(connection.fibre)
         one, v = jnp.ones_like(t), system.rates(t, q, u)
         # Columns along the base: displacements with δs = −A δr.
-        A = lambda t, q: jnp.asarray(connection.matrix(t, q, p))
+        A = lambda t, q: jnp.asarray(connection.matrix(t, q, system.parameters_at(t)))
         columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
         along = lambda fn: jax.vmap(lambda x: jax.jvp(fn, (q,), (x,))[1], in_axes=1, out_axes=1)(columns)
         # B_αβ ṙ^β + B_α0 = d A_α / dt along the motion less the change of ṡ, as a function of q alone, along column α.
         _, moved = jax.jvp(A, (t, q), (one, v))
         curvature = moved + along(lambda q: system.rates(t, q, u)[fibre])
 
-        constrained = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), p)
+        at = system.parameters_at
+        constrained = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), at(t))
         _, rate = jax.jvp(lambda t, q: jax.grad(constrained, 2)(t, q, u), (t, q), (one, v))
         momentum = system.momentum(t, q, v)
         curvature = jnp.zeros_like(columns).at[fibre].set(curvature)
         share = share_of_suslov(self.transposition)
         if share is None:
             transposition: Any = self.transposition
-            W = jax.vmap(lambda x: jnp.asarray(transposition(t, q, v, x, p)), in_axes=1, out_axes=1)(columns)
+            W = jax.vmap(lambda x: jnp.asarray(transposition(t, q, v, x, at(t))), in_axes=1, out_axes=1)(columns)
         else:
             W = share * curvature
         right = momentum @ (W - curvature) - momentum @ W

@@ -113,6 +113,12 @@ class RelativeTrain(AbstractGeneralizedSystem):
     def rate_names(self):
         return self.coordinate_names()
 
+    def signals(self):
+        return {}
+
+    def with_signals(self, signals):
+        raise ValueError(f"A train in relative coordinates takes no inputs; got {', '.join(signals)}.")
+
     def parameter_paths(self):
         paths: dict[str, list[ParameterPath]] = {}
         for k in range(self.nq):

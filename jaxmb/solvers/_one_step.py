@@ -118,9 +118,10 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         return dataclasses.replace(self, controller=controller)
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
+        least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
         if self.scales is None:
             first, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-            return first, (state, None)
+            return first, (state, None, least)
         flat = ravel(y0)
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
         # The first step is chosen in units of these sizes, and of the time that they change in: it then depends on no
@@ -134,10 +135,10 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         y0 = unravel_like(y0, flat / unit)
         dt0 = None if dt0 is None else dt0 * rate
         first, state = self.controller.init(terms, t0 * rate, t1 * rate, y0, dt0, args, field, error_order)
-        return t0 + (first - t0 * rate) / rate, (state, sizes)
+        return t0 + (first - t0 * rate) / rate, (state, sizes, least)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        state, sizes = controller_state
+        state, sizes, least = controller_state
         of_state, of_tangents = (y_error.error, y_error.of_tangents) if self.tangents else (y_error, [])
         scale = Tolerances(self.rtol, self.atol, MultistepNorm(self.norm, self.scales)).scale(
             ravel(y0), ravel(y1_candidate), sizes
@@ -147,7 +148,10 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         unit = eqx.tree_at(lambda c: (c.rtol, c.atol, c.norm), self.controller, (0.0, 1.0, jnp.abs))
         zero = jnp.zeros_like(errors[0])
         error = functools.reduce(jnp.maximum, errors)
-        keep, *rest, state, result = unit.adapt_step_size(t0, t1, zero, zero, args, error, error_order, state)
+        keep, *times, made_jump, state, result = unit.adapt_step_size(t0, t1, zero, zero, args, error, error_order, state)
+        # Where errors are not finite, ever smaller steps would be tried.
+        stuck = jnp.logical_not(keep) & (times[1] - times[0] <= least)
+        result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
         if self.scales is not None and sizes is not None:
             sizes = jnp.where(keep, self.scales.grown(sizes, ravel(y1_candidate)), sizes)
-        return keep, *rest, (state, sizes), result
+        return keep, *times, made_jump, (state, sizes, least), result

@@ -198,7 +198,7 @@ def _connected(system):
             moving = [k for k in own if k != ground]
             for k in moving[1:]:
                 parent[root(k)] = root(moving[0])
-            parts.append((moving, range(row, row + g.rows), g.group.part.rheonomic))
+            parts.append((moving, range(row, row + g.rows), g.rheonomic))
             row += g.rows
     bodies, rows, driven = ([[] for _ in parent] for _ in range(3))
     for k in range(ground):

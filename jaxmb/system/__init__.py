@@ -8,6 +8,7 @@ from ..linalg.inertia import (
 )
 from .equation import AbstractSystem as AbstractSystem
 from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
+from .inputs import with_inputs as with_inputs
 from .parameters import parameters as parameters, with_parameters as with_parameters
 from .quantities import BodyMotion as BodyMotion, Quantity as Quantity, Reaction as Reaction
 from .rigid_bodies import RigidBodySystem as RigidBodySystem

@@ -1,5 +1,6 @@
 """Systems of bodies: sizes, kinematics, names, and views of a motion, for a scene whose parts are stacked."""
 
+import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from .body_motion import attachments, body_motion, body_quantities, outline
 from .coordinates import coordinate_names, rate_names
 from .describe import describe_scene
 from .equation import AbstractSystem, Ranks
+from .group_inputs import signals_of, with_signals
 from .groups import (
     AbstractConstraintGroup,
     BodyGroup,
@@ -127,9 +129,7 @@ class AbstractBodySystem(AbstractSystem):
 
     @property
     def drift_free(self) -> bool:
-        return not any(g.group.part.rheonomic for g in self.constraints) and all(
-            g.group.part.homogeneous for g in self.velocity_constraints
-        )
+        return not any(g.rheonomic for g in self.constraints) and all(g.homogeneous for g in self.velocity_constraints)
 
     @property
     def rows(self) -> tuple[tuple[str, int], ...]:
@@ -171,6 +171,12 @@ class AbstractBodySystem(AbstractSystem):
     @property
     def _gravity_name(self):
         return None if self.gravity is None else self.gravity_name
+
+    def signals(self):
+        return signals_of(self._groups)
+
+    def with_signals(self, signals):
+        return dataclasses.replace(self, **with_signals(self._groups, signals))
 
     def describe(self):
         kinds: dict[str, list[str]] = {}

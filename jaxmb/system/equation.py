@@ -11,8 +11,8 @@ work; M depends on u only where velocities are nonlinear in q̇.
 """
 
 import abc
-from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Scalar, State
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, EliminationOrder
+from ..parts.series import AbstractSignal
 from .description import Description
 from .quantities import Quantity, Reaction
 
@@ -110,6 +111,17 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def parameters_in_range(self) -> bool | Bool[Array, ""]:
         """Whether all parameters that are traced are in their ranges; True if none are traced."""
+
+    @abc.abstractmethod
+    def signals(self) -> dict[str, tuple[AbstractSignal, bool]]:
+        """The parameters that are functions of time, by name; and whether constraints depend on them."""
+
+    @abc.abstractmethod
+    def with_signals(self, signals: Mapping[str, AbstractSignal]) -> Self:
+        """A copy with some parameters as functions of time; shapes have been checked.
+
+        **Raises:** `ValueError` for parameters that must be constant.
+        """
 
     @abc.abstractmethod
     def describe(self) -> Description:

@@ -14,18 +14,49 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
-from ..parts.fields import anonymous
+from ..parts.fields import anonymous, entry
+from ..parts.series import AbstractSignal
 from ..parts.space import AbstractSpace
 from .layout import Layout
 
 
+class Input(eqx.Module):
+    """A number of stacked parts that is a function of time: the parameter's name, the keys that lead to it in the
+    part, and the number of the part.
+    """
+
+    signal: AbstractSignal
+    name: str = eqx.field(static=True)
+    keys: tuple[str, ...] = eqx.field(static=True)
+    member: int = eqx.field(static=True)
+
+
 class Group(eqx.Module):
-    """Stacked parts. `part` has the structure of one part with a leading axis on every number."""
+    """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
+    numbers by functions of time.
+    """
 
     part: Any
     names: tuple[str, ...] = eqx.field(static=True)
     bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     layout: Layout = eqx.field(static=True)
+    inputs: tuple[Input, ...] = ()
+
+    def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
+        """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
+        if not self.inputs:
+            return jax.vmap(lambda part, *own: kernel(lambda t: part, *own))(self.part, *per_part)
+        single = lambda member, part, *own: kernel(lambda t: self._at(member, part, t), *own)
+        return jax.vmap(single)(jnp.arange(len(self.names)), self.part, *per_part)
+
+    def _at(self, member, part, t):
+        """One part with its inputs at a time."""
+        for own in self.inputs:
+            where = lambda part, keys=own.keys: entry(part, keys)
+            given = where(part)
+            value = jnp.where(member == own.member, jnp.asarray(own.signal(t), given.dtype), given)
+            part = eqx.tree_at(where, part, value)
+        return part
 
     @property
     def body_index(self) -> np.ndarray:
@@ -129,25 +160,30 @@ class AbstractConstraintGroup(eqx.Module):
     def _space(self):
         return self.group.layout.space
 
-    def _map(self, single, *of_bodies, more=()):
-        """`single(part, …)` of every part, with the rows of its bodies, and with `more` per part."""
-        return jax.vmap(single)(self.group.part, *map(self.group.gather, of_bodies), *more)
+    def _map(self, kernel, *of_bodies, more=()):
+        """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
+        return self.group.map(kernel, *map(self.group.gather, of_bodies), *more)
 
 
 class ConstraintGroup(AbstractConstraintGroup):
     """Kernels of stacked position constraints."""
 
+    @property
+    def rheonomic(self) -> bool:
+        """Whether the residuals depend on time."""
+        return self.group.part.rheonomic or bool(self.group.inputs)
+
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
-        return self._map(lambda part, x: part.residual(self._space, x, t), poses)
+        return self._map(lambda at, x: at(t).residual(self._space, x, t), poses)
 
     def along(
         self, t: Scalar, poses: Float[Array, "b_ground p"], moves: Float[Array, "b_ground n p"]
     ) -> Float[Array, "parts rows k n"]:
         """Derivatives along `n` motions of every body, one at a time."""
 
-        def single(part, x, moves):
+        def single(at, x, moves):
             k, n, size = moves.shape
-            residual = lambda x: part.residual(self._space, x, t)
+            residual = lambda x: at(t).residual(self._space, x, t)
             # One body moves, the others rest.
             one = jnp.eye(k, dtype=x.dtype)[:, None, :, None] * moves[:, :, None, :]
             push = lambda dx: jax.jvp(residual, (x,), (dx,))[1]
@@ -162,13 +198,13 @@ class ConstraintGroup(AbstractConstraintGroup):
         return self.along(t, poses, moves)
 
     def velocity(self, t, poses, velocities):
-        return self._map(lambda part, x, xdot: self._rate(part, t, x, xdot), poses, self._rates(poses, velocities))
+        return self._map(lambda at, x, xdot: self._rate(at, t, x, xdot), poses, self._rates(poses, velocities))
 
     def wrenches(self, t, poses, velocities, multipliers):
         del velocities
 
-        def single(part, x, multipliers):
-            _, pull = jax.vjp(lambda x: part.residual(self._space, x, t), x)
+        def single(at, x, multipliers):
+            _, pull = jax.vjp(lambda x: at(t).residual(self._space, x, t), x)
             return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
         return self._map(single, poses, more=(multipliers,))
@@ -177,8 +213,8 @@ class ConstraintGroup(AbstractConstraintGroup):
         rates = self._rates(poses, velocities)
         _, second = jax.jvp(self._rates, (poses, velocities), (rates, accelerations))
 
-        def single(part, x, xdot, xddot):
-            rate = lambda t, x, xdot: self._rate(part, t, x, xdot)
+        def single(at, x, xdot, xddot):
+            rate = lambda t, x, xdot: self._rate(at, t, x, xdot)
             return jax.jvp(rate, (t, x, xdot), (jnp.ones_like(t), xdot, xddot))[1]
 
         return self._map(single, poses, rates, second)
@@ -186,32 +222,38 @@ class ConstraintGroup(AbstractConstraintGroup):
     def _rates(self, poses, velocities):
         return jax.vmap(self._space.rates)(poses, velocities)
 
-    def _rate(self, part, t, x, xdot):
+    def _rate(self, at, t, x, xdot):
         """Velocity residuals of one part, from the rates of its bodies' poses."""
-        if part.rheonomic:
-            return jax.jvp(lambda t, x: part.residual(self._space, x, t), (t, x), (jnp.ones_like(t), xdot))[1]
-        return jax.jvp(lambda x: part.residual(self._space, x, t), (x,), (xdot,))[1]
+        if self.rheonomic:
+            residual = lambda t, x: at(t).residual(self._space, x, t)
+            return jax.jvp(residual, (t, x), (jnp.ones_like(t), xdot))[1]
+        return jax.jvp(lambda x: at(t).residual(self._space, x, t), (x,), (xdot,))[1]
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
     """Kernels of stacked velocity constraints."""
 
+    @property
+    def homogeneous(self) -> bool:
+        """Whether the residuals vanish at rest."""
+        return self.group.part.homogeneous and not self.group.inputs
+
     def velocity(self, t, poses, velocities):
-        return self._map(lambda part, x, v: part.residual(self._space, x, v, t), poses, velocities)
+        return self._map(lambda at, x, v: at(t).residual(self._space, x, v, t), poses, velocities)
 
     def jacobian(self, t, poses, velocities):
-        single = lambda part, x, v: jax.jacfwd(lambda w: part.residual(self._space, x, w, t))(v)
+        single = lambda at, x, v: jax.jacfwd(lambda w: at(t).residual(self._space, x, w, t))(v)
         return self._map(single, poses, velocities)
 
     def wrenches(self, t, poses, velocities, multipliers):
-        def single(part, x, v, multipliers):
-            return jax.vjp(lambda w: part.residual(self._space, x, w, t), v)[1](multipliers)[0]
+        def single(at, x, v, multipliers):
+            return jax.vjp(lambda w: at(t).residual(self._space, x, w, t), v)[1](multipliers)[0]
 
         return self._map(single, poses, velocities, more=(multipliers,))
 
     def acceleration(self, t, poses, velocities, accelerations):
-        def single(part, x, xdot, v, a):
-            residual = lambda t, x, v: part.residual(self._space, x, v, t)
+        def single(at, x, xdot, v, a):
+            residual = lambda t, x, v: at(t).residual(self._space, x, v, t)
             return jax.jvp(residual, (t, x, v), (jnp.ones_like(t), xdot, a))[1]
 
         rates = jax.vmap(self._space.rates)(poses, velocities)
@@ -226,14 +268,14 @@ class ForceGroup(eqx.Module):
     def wrenches(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts k v"]:
-        single = lambda part, poses, v: part.wrenches(self.group.layout.space, poses, v, t)
-        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities))
+        single = lambda at, poses, v: at(t).wrenches(self.group.layout.space, poses, v, t)
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
-        single = lambda part, poses: part.energy(self.group.layout.space, poses, t)
-        return jnp.sum(jax.vmap(single)(self.group.part, self.group.gather(poses)))
+        single = lambda at, poses: at(t).energy(self.group.layout.space, poses, t)
+        return jnp.sum(self.group.map(single, self.group.gather(poses)))
 
 
 class ServoGroup(AbstractConstraintGroup):
@@ -282,5 +324,5 @@ class NonIdealGroup(eqx.Module):
         reactions: Float[Array, "parts k v"],
     ) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
-        single = lambda part, x, v, own: part.wrenches(self.group.layout.space, x, v, own, t)
-        return jax.vmap(single)(self.group.part, self.group.gather(poses), self.group.gather(velocities), reactions)
+        single = lambda at, x, v, own: at(t).wrenches(self.group.layout.space, x, v, own, t)
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)

@@ -3,10 +3,33 @@
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..parts.fields import entry, paths
+from ..parts.fields import Declaration, entry, paths
 from .equation import ParameterPath
+
+
+class StackedNumber(NamedTuple):
+    """A parameter in a group of stacked parts: `keys` lead to it in group number `group` of the system's field `kind`,
+    `member` is the number of its part.
+    """
+
+    name: str
+    kind: str
+    group: int
+    keys: tuple[str, ...]
+    member: int
+    declared: Declaration
+
+
+def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumber]:
+    """Every parameter of some groups, which are given by the name of the system's field that holds them."""
+    for kind, of_kind in groups.items():
+        for g, group in enumerate(of_kind):
+            own = [(keys, ".".join(shown), declared) for keys, shown, declared in paths(group.group.part)]
+            for k, name in enumerate(group.group.names):
+                for keys, field, declared in own:
+                    yield StackedNumber(f"{name}.{field}", kind, g, keys, k, declared)
 
 
 def parameter_paths(
@@ -18,12 +41,9 @@ def parameter_paths(
     them; `servos`: groups of servos, which also have gains.
     """
     out: dict[str, list[ParameterPath]] = {}
-    for kind, of_kind in groups.items():
-        for g, group in enumerate(of_kind):
-            own = [(_accessor(kind, g, keys), ".".join(shown)) for keys, shown, _ in paths(group.group.part)]
-            for k, name in enumerate(group.group.names):
-                for where, field in own:
-                    out.setdefault(f"{name}.{field}", []).append((where, k))
+    for number in stacked_numbers(groups):
+        where = _accessor(number.kind, number.group, number.keys)
+        out.setdefault(number.name, []).append((where, number.member))
     for g, group in enumerate(servos):
         for k, name in enumerate(group.group.names):
             out.setdefault(f"{name}.damping", []).append((lambda s, g=g: s.servos[g].damping, k))
@@ -35,11 +55,9 @@ def parameter_paths(
 
 def positive_parameters(groups: Mapping[str, Sequence[Any]]) -> Iterator[str]:
     """Names of the parameters that parts declare to be positive, or positive definite."""
-    for of_kind in groups.values():
-        for group in of_kind:
-            for _, shown, declared in paths(group.group.part):
-                if declared.sign in ("positive", "positive definite"):
-                    yield from (f"{name}.{'.'.join(shown)}" for name in group.group.names)
+    for number in stacked_numbers(groups):
+        if number.declared.sign in ("positive", "positive definite"):
+            yield number.name
 
 
 def _accessor(kind: str, group: int, keys: tuple[str, ...]):

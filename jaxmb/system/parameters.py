@@ -46,6 +46,11 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
     for name, value in values.items():
         if name not in paths:
             raise unknown("parameter", name, paths)
+        if name in system.signals():
+            raise ValueError(
+                f"{name!r} is an input of this system, a function of time, which its value would not change; give "
+                "another input instead."
+            )
         value = as_jax(value)
         for where, index in paths[name]:
             old = where(system)

@@ -1,0 +1,197 @@
+"""Values as functions of time: measured or planned series, and functions."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._types import Scalar, VectorLike
+from ..linalg.arrays import is_traced
+from .fields import as_jax
+
+Interpolation = Literal["linear", "cubic", "held"]
+
+
+class AbstractSignal(eqx.Module):
+    """A value as a function of time."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Scalar) -> Array:
+        """The value at a time [s]."""
+
+    @abc.abstractmethod
+    def break_times(self, *, of_rates: bool) -> np.ndarray:
+        """Times [s] at which the value jumps; with `of_rates` also those at which its rate does."""
+
+    @abc.abstractmethod
+    def check_interval(self, label: str, t0: Scalar, t1: Scalar) -> None:
+        """Raise a `ValueError` if the value is not known from `t0` to `t1`."""
+
+    @property
+    @abc.abstractmethod
+    def continuous(self) -> bool:
+        """Whether the value never jumps."""
+
+
+class Series(AbstractSignal):
+    """A value given at some times, such as a measured or a planned input.
+
+    **Arguments:**
+
+    - `ts` [s], shape (n,), ascending, n ≥ 2; `values`, shape (n, …): numbers, vectors or matrices, in SI units.
+    - `interpolation`: `"linear"`; `"cubic"`, the not-a-knot spline, whose first two derivatives are continuous;
+        `"held"`, each value until the next time.
+
+    Before the first and after the last time the value stays what it is there. `ts` and `values` may be traced:
+    motions can be differentiated with respect to values.
+
+    **Raises:** `ValueError` for times that do not ascend, and for numbers that are not finite or of the wrong shape.
+
+    Source of the spline: C. de Boor, "A Practical Guide to Splines", Springer, 1978.
+    """
+
+    ts: Float[Array, "n"]
+    values: Float[Array, "n *shape"]
+    slopes: Float[Array, "n *shape"] | None
+    interpolation: str = eqx.field(static=True)
+
+    def __init__(self, ts: VectorLike, values: VectorLike, interpolation: Interpolation = "linear"):
+        if interpolation not in ("linear", "cubic", "held"):
+            raise ValueError(f"Series: interpolation must be 'linear', 'cubic' or 'held', got {interpolation!r}.")
+        try:
+            self.ts, self.values = as_jax(ts), as_jax(values)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"Series: {error}.") from error
+        if self.ts.ndim != 1 or self.ts.shape[0] < 2 or self.values.shape[:1] != self.ts.shape:
+            raise ValueError(
+                f"Series: ts must be a vector of at least two times and values have one entry for each along axis 0, "
+                f"got shapes {self.ts.shape} and {self.values.shape}."
+            )
+        if not is_traced(self.ts):
+            times = np.asarray(self.ts)
+            if not np.all(np.isfinite(times)):
+                raise ValueError(f"Series: ts must be finite, got {times[~np.isfinite(times)][0]}.")
+            if np.any(np.diff(times) <= 0):
+                k = int(np.argmax(np.diff(times) <= 0))
+                raise ValueError(
+                    f"Series: ts must ascend, got {times[k]:g} before {times[k + 1]:g}; sort the samples and remove "
+                    "repeated times."
+                )
+        if not is_traced(self.values) and not np.all(np.isfinite(np.asarray(self.values))):
+            missing = np.asarray(self.ts)[~np.isfinite(np.asarray(self.values).reshape(len(self.ts), -1)).all(axis=1)]
+            raise ValueError(
+                f"Series: values must be finite, got another at t = {missing[0]:g}; leave such samples out."
+            )
+        self.interpolation = interpolation
+        self.slopes = _spline_slopes(self.ts, self.values) if interpolation == "cubic" else None
+
+    def __call__(self, t):
+        ts, values = self.ts, self.values
+        k = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, ts.shape[0] - 2)
+        if self.interpolation == "held":
+            # At a time of the series the value is the new one.
+            return jnp.where(t >= ts[-1], values[-1], values[k])
+        h = ts[k + 1] - ts[k]
+        s = (t - ts[k]) / h
+        inside = values[k] + (values[k + 1] - values[k]) * s
+        if self.slopes is not None:
+            chord = (values[k + 1] - values[k]) / h
+            before, after = self.slopes[k] - chord, chord - self.slopes[k + 1]
+            inside = inside + h * s * (1 - s) * (before * (1 - s) + after * s)
+        # Not a clipped time, whose derivative would be halved at the first and the last one.
+        return jnp.where(t < ts[0], values[0], jnp.where(t > ts[-1], values[-1], inside))
+
+    def break_times(self, *, of_rates):
+        if self.interpolation == "cubic" or (self.interpolation == "linear" and not of_rates):
+            return np.zeros(0)
+        if is_traced(self.ts):
+            raise ValueError(
+                "Series: times at which a value or its rate jumps must not be traced; give them as numbers."
+            )
+        if self.interpolation == "linear" or is_traced(self.values):
+            return np.asarray(self.ts)
+        values = np.asarray(self.values).reshape(len(self.ts), -1)
+        return np.asarray(self.ts)[1:][np.any(np.diff(values, axis=0) != 0, axis=1)]
+
+    def check_interval(self, label, t0, t1):
+        if is_traced((self.ts, t0, t1)):
+            return
+        first, last = float(self.ts[0]), float(self.ts[-1])
+        if min(t0, t1) < first or max(t0, t1) > last:
+            raise ValueError(
+                f"The series of {label!r} is known from {first:g} to {last:g} s, the motion runs from {float(t0):g} to "
+                f"{float(t1):g} s; give a longer series or a shorter motion."
+            )
+
+    @property
+    def continuous(self):
+        return self.interpolation != "held"
+
+
+class Signal(AbstractSignal):
+    """A value from a function of time. The arrays of a function that is an equinox module are differentiable."""
+
+    function: Callable[[Scalar], Array]
+
+    def __init__(self, function: Callable[[Scalar], Array]):
+        self.function = function if isinstance(function, eqx.Module) else _Static(function)
+
+    def __call__(self, t):
+        return jnp.asarray(self.function(t))
+
+    def break_times(self, *, of_rates):
+        # What a function does is not known; `simulate(..., jumps=)` says it.
+        return np.zeros(0)
+
+    def check_interval(self, label, t0, t1):
+        pass
+
+    @property
+    def continuous(self):
+        return True
+
+
+class _Static(eqx.Module):
+    function: Callable[[Scalar], Array] = eqx.field(static=True)
+
+    def __call__(self, t):
+        return self.function(t)
+
+
+def as_signal(label: str, value: Any) -> AbstractSignal:
+    """A series, or a function of time as a signal."""
+    if isinstance(value, AbstractSignal):
+        return value
+    if callable(value):
+        return Signal(value)
+    raise ValueError(f"The input {label!r} must be a jaxmb.Series or a function of time, got {value!r}.")
+
+
+def _spline_slopes(ts, values):
+    """Slopes at the knots of the spline with a continuous third derivative at the second and the last but one."""
+    n, flat = ts.shape[0], values.reshape(ts.shape[0], -1)
+    h = jnp.diff(ts)[:, None]
+    chords = jnp.diff(flat, axis=0) / h
+    if n == 2:
+        return jnp.broadcast_to(chords, flat.shape).reshape(values.shape)
+    if n == 3:
+        # One parabola.
+        middle = (chords[0] * h[1] + chords[1] * h[0]) / (h[0] + h[1])
+        return jnp.stack([2 * chords[0] - middle, middle, 2 * chords[1] - middle]).reshape(values.shape)
+    first, last = h[0] + h[1], h[-1] + h[-2]
+    diagonal = jnp.concatenate([h[1], 2 * (h[:-1] + h[1:])[:, 0], h[-2]])
+    upper = jnp.concatenate([first, h[:-1, 0], jnp.zeros(1)])
+    lower = jnp.concatenate([jnp.zeros(1), h[1:, 0], last])
+    right = jnp.concatenate(
+        [
+            (((h[0] + 2 * first) * h[1] * chords[0] + h[0] ** 2 * chords[1]) / first)[None],
+            3 * (h[1:] * chords[:-1] + h[:-1] * chords[1:]),
+            ((h[-1] ** 2 * chords[-2] + (2 * last + h[-1]) * h[-2] * chords[-1]) / last)[None],
+        ]
+    )
+    return lax.linalg.tridiagonal_solve(lower, diagonal, upper, right).reshape(values.shape)

@@ -1,0 +1,161 @@
+"""Checks of the arguments of `simulate`, and their defaults."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import State, VectorLike
+from ..formulations import AbstractFormulation
+from ..linalg.arrays import as_array, is_traced
+from ..manifold import AbstractManifold
+from ..parts.names import unknown
+from ..solvers import Adams
+from ..system import AbstractSystem
+from ..system.arguments import check_kind, real_array
+from ..system.parameters import parameters
+
+KINDS: dict[str, tuple[type, str]] = {
+    "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
+    "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
+    "manifold": (AbstractManifold, "jaxmb.manifold.Partition()"),
+    "stepsize_controller": (diffrax.AbstractStepSizeController, "jaxmb.solvers.MultistepController(rtol, atol)"),
+    "adjoint": (diffrax.AbstractAdjoint, "diffrax.ForwardMode()"),
+    "event": (diffrax.Event, "diffrax.Event(function)"),
+    "progress_meter": (diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
+}
+
+
+def check_error_estimate(saveat, stepsize_controller, event) -> None:
+    """Refuse runs whose times a second run would not share."""
+    if stepsize_controller is not None:
+        raise ValueError(
+            "error=True repeats the run at tighter tolerances: give rtol and atol, no stepsize_controller."
+        )
+    steps = isinstance(saveat, diffrax.SaveAt) and saveat.subs is not None and saveat.subs.steps
+    if event is not None or steps:
+        what = "an event" if event is not None else "SaveAt(steps=True)"
+        raise ValueError(
+            f"error=True compares two runs at the same times, which {what} does not have; give saveat=times."
+        )
+
+
+def parameter_changes(system: AbstractSystem, direction: Mapping[str, VectorLike]) -> dict[str, tuple[Any, Any]]:
+    """Values of parameters and their changes, by name."""
+    known = parameters(system)
+    if not isinstance(direction, Mapping):
+        raise ValueError(f"direction must be a dictionary of parameters by name, got {direction!r}.")
+    for name in direction:
+        if name not in known:
+            raise unknown("parameter", name, known)
+    array = lambda name, x: real_array(f"direction[{name!r}]", x, known[name].dtype, (known[name].shape,))
+    return {name: (known[name], array(name, x)) for name, x in direction.items()}
+
+
+def named_solver(name: str, state: State) -> Adams:
+    if name not in ("auto", "switch"):
+        raise ValueError(f"solver must be an object, or one of the words 'auto' and 'switch'; got {name!r}.")
+    if name == "switch" and is_traced(state):
+        raise ValueError(
+            "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
+            "once with solver='auto', outside, and then choose Adams() or Hermite()."
+        )
+    return Adams(stiffness="count" if name == "auto" else "stop")
+
+
+def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
+    dtype = state.q.dtype
+    least = 10 * float(jnp.finfo(dtype).eps)
+    relative = real_array("rtol", rtol, dtype)
+    absolute = None if atol is None else real_array("atol", atol, dtype, ((), (state.q.size + state.u.size,)))
+    for name, value in (("rtol", relative), ("atol", absolute)):
+        if value is not None and not is_traced(value) and (np.any(value < 0) or np.any(value >= 1)):
+            raise ValueError(f"{name} must be between 0 and 1, got {value}.")
+    if not is_traced(relative) and relative < least:
+        if dtype != jnp.float32:
+            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
+        warnings.warn(
+            f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
+            'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
+            stacklevel=3,
+        )
+        relative = as_array(least, dtype)
+    return relative, relative / 100 if absolute is None else absolute
+
+
+def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
+    if saveat is None:
+        return diffrax.SaveAt(t1=True)
+    if isinstance(saveat, diffrax.SaveAt):
+        if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
+            raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
+        if saveat.subs is not None and saveat.subs.ts is not None:
+            _check_saved_times(saveat.subs.ts, start, end)
+        return saveat
+    return diffrax.SaveAt(ts=jax.device_put(_check_saved_times(saveat, start, end)))
+
+
+def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
+    ts = real_array("saveat", times, jnp.result_type(float), None)
+    if ts.ndim != 1 or ts.shape[0] == 0:
+        raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
+    if is_traced((ts, start, end)):
+        return ts
+    if not (min(start, end) <= ts.min() and ts.max() <= max(start, end)):
+        raise ValueError(
+            f"saveat must lie between t0 = {start:g} and t1 = {end:g}, got times from {ts.min():g} to {ts.max():g}."
+        )
+    if np.any(np.diff(ts) * (1 if start <= end else -1) < 0):
+        raise ValueError(f"saveat must run from t0 to t1 without turning back, got {ts}.")
+    return ts
+
+
+def checked_jumps(jumps: Any, of_inputs: np.ndarray) -> Any:
+    """Times at which to restart: those that the user announces and those of inputs; None if there are none."""
+    if jumps is None:
+        return jnp.asarray(of_inputs) if of_inputs.size else None
+    times = real_array("jumps", jumps, jnp.result_type(float), None)
+    if times.ndim != 1 or times.shape[0] == 0 or not (is_traced(times) or np.all(np.isfinite(times))):
+        raise ValueError(f"jumps must be a vector of finite times, got {jumps!r}; leave it out if there are none.")
+    return jnp.sort(jnp.concatenate([jnp.asarray(times), jnp.asarray(of_inputs, times.dtype)]))
+
+
+def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
+    """The user's series and, for statistics and diagnosis, the end state."""
+    first = saveat.subs if saveat.subs is not None else diffrax.SubSaveAt(t1=True)
+    return diffrax.SaveAt(
+        subs=(first, diffrax.SubSaveAt(t1=True)), dense=saveat.dense, solver_state=True, controller_state=True
+    )
+
+
+def checked_state(system: AbstractSystem, state: Any) -> State:
+    cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u)"
+    # A concrete class: a state is nothing but its two fields.
+    check_kind("state", state, State, "a jaxmb.State", cure)
+    for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu)):
+        if np.result_type(getattr(value, "dtype", type(value))).kind not in "fiub":
+            raise ValueError(f"state.{name} must be an array of real numbers, got {value!r}; {cure}.")
+        if np.shape(value) != (size,):
+            raise ValueError(
+                f"The state must have {system.nq} coordinates and {system.nu} velocities, got state.{name} of shape "
+                f"{np.shape(value)}."
+            )
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
+
+
+def checked_times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
+    start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
+    if not is_traced(start) and not np.isfinite(start):
+        raise ValueError(f"t0 must be finite, got {t0}.")
+    if dt0 is None:
+        return {"t0": start, "t1": end, "dt0": None}
+    step = real_array("dt0", dt0, dtype)
+    if not is_traced((start, end, step)) and not (np.isfinite(step) and step * (1 if end >= start else -1) > 0):
+        raise ValueError(
+            f"dt0 must be a finite step from t0 = {t0} towards t1 = {t1}, got {dt0}; leave it out for the default."
+        )
+    return {"t0": start, "t1": end, "dt0": step}

@@ -1,0 +1,109 @@
+"""The integration of a motion as one compiled program, whose mesh resolves derivatives where they are taken."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .._results import RESULTS
+from ..manifold.diagnosis import diagnose_friction
+from ..solvers import AbstractMultistep
+from ..solvers._one_step import with_tangents
+from ..solvers._scales import RunningScales
+from ..solvers._tangent import TangentControl
+from ..trajectory import Trajectory
+from .outcome import has_failed
+
+
+@eqx.filter_jit
+def integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid):
+    start, first = options["y0"], options["saveat"].subs[0]
+    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
+    # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
+    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
+    options = options | {"t1": at_once(options["t1"])}
+    if times is not None:
+        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(times))
+    solution: Any = _solve(term, solver, options, _tangent_control(system, options, direction))
+    ts, saved = solution.ts[0], solution.ys[0]
+    if times is not None:
+        ts = jnp.where(finite, ts, jnp.inf)
+    correction = manifold.correction(interpolated)
+    # `SaveAt(fn=...)` may save something else than states.
+    are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
+    if are_states and correction is not None:
+        saved = _corrected(system, ts, saved, correction)
+    end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
+    result = RESULTS.promote(solution.result)
+    result = RESULTS.where(finite, result, RESULTS.assembly_failed)
+    if valid is not True:
+        result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
+    stuck = has_failed(result) & finite
+    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck)
+    coupling = None
+    if system.friction_parts:
+        result, coupling = diagnose_friction(system, formulation, *end, result, stuck)
+    stats = dict(solution.stats)
+    if isinstance(solver, AbstractMultistep):
+        stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
+    trajectory = Trajectory(
+        system=system,
+        formulation=formulation,
+        ts=ts,
+        ys=saved,
+        stats=stats | manifold.statistics(solution.solver_state),
+        result=result,
+        interpolation=solution.interpolation,
+        event_mask=solution.event_mask,
+    )
+    return trajectory, has_failed(result), end, coupling
+
+
+@eqx.filter_custom_jvp
+def _solve(term, solver, options, control):
+    """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
+    del control
+    return diffrax.diffeqsolve(term, solver, throw=False, **options)
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents):
+    arguments, control = primals[:-1], primals[-1]
+
+    def solve(term, solver, options):
+        solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
+        solution = diffrax.diffeqsolve(term, solver, throw=False, **options | {"stepsize_controller": controller})
+        return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
+
+    return eqx.filter_jvp(solve, arguments, tangents[:-1])
+
+
+def _tangent_control(system, options, direction) -> TangentControl:
+    """What is known of the sizes of a tangent: those of the coordinates, and of the velocities in the time that the
+    motion takes.
+    """
+    state, span = options["y0"], jnp.abs(options["t1"] - options["t0"])
+    coordinates, velocities = system.coordinate_scale(), system.velocity_scale()
+    rate = jnp.maximum(jnp.max(jnp.abs(state.u) / velocities, initial=0.0), 1 / jnp.where(span > 0, span, 1.0))
+    units = jnp.concatenate([coordinates, velocities * rate]).astype(state.q.dtype)
+    blocks = (0, system.nq), (system.nq, system.nq + system.nu)
+    return lax.stop_gradient(TangentControl(units, blocks, direction))
+
+
+def running_scales(system, state, options) -> RunningScales:
+    """Natural units of coordinates and velocities; where nothing moves yet, one unit in the whole time."""
+    units = jnp.concatenate([system.coordinate_scale(), system.velocity_scale()]).astype(state.q.dtype)
+    span = jnp.abs(options["t1"] - options["t0"])
+    return lax.stop_gradient(RunningScales(units, system.nq, 1 / jnp.where(span > 0, span, 1.0)))
+
+
+def _corrected(system, ts, saved, correction):
+    """Saved states, returned to the constraints; entries after the end of a run stay as they are."""
+    finite = jnp.isfinite(ts)
+    first = lambda y: jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
+    inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(first(y))), saved)
+    corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, 0.0), inside)
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved)

@@ -1,0 +1,203 @@
+"""Parameters as functions of time: series and functions."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+import jaxmb as mb
+from jaxmb import planar
+
+G, LENGTH, MASS = 9.81, 0.7, 1.3
+INERTIA = MASS * LENGTH**2 / 3
+TS = np.linspace(0.0, 1.0, 6)
+TORQUES = np.array([0.0, 4.0, -3.0, 5.0, 1.0, -2.0])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A rod on a pin, horizontal at the start, with a motor."""
+    rod = planar.Body("rod", mass=MASS, inertia=planar.rod(MASS, LENGTH), position=(LENGTH / 2, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    motor = planar.Torque("motor", body="rod", torque=0.0)
+    return mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -G)), motor]).compile()
+
+
+def angle_under(torque, breaks=()):
+    """The rod's angle and rate after one second."""
+    rates = lambda t, y: [y[1], (torque(t) - MASS * G * LENGTH / 2 * np.cos(y[0])) / INERTIA]
+    y, ends = np.zeros(2), [0.0, *breaks, 1.0]
+    for a, b in zip(ends, ends[1:], strict=False):
+        y = solve_ivp(rates, (a, np.nextafter(b, a)), y, rtol=1e-12, atol=1e-13).y[:, -1]
+    return y
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "torque"),
+    [
+        ("linear", lambda t: np.interp(t, TS, TORQUES)),
+        ("cubic", CubicSpline(TS, TORQUES)),
+        ("held", lambda t: TORQUES[np.searchsorted(TS, t, side="right") - 1]),
+    ],
+)
+def test_a_torque_that_is_a_series(pendulum, interpolation, torque):
+    series = mb.Series(TS, TORQUES, interpolation)
+    motion = mb.simulate(pendulum, pendulum.guess, t1=1.0, rtol=1e-11, inputs={"motor.torque": series})
+    expected = angle_under(torque, TS[1:-1])
+    found = motion["rod"].angle[-1], motion["rod"].angular_velocity[-1]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+    # The views know the input, too.
+    np.testing.assert_allclose(motion.forces["motor"][-1, 1, 2], torque(1.0), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 9])
+def test_the_spline_is_that_without_knots_at_the_second_and_the_last_but_one(count):
+    random = np.random.default_rng(count)
+    ts, values = np.sort(random.uniform(-1.0, 2.0, count)), random.normal(size=(count, 2))
+    spline, series = CubicSpline(ts, values), mb.Series(ts, values, "cubic")
+    at = np.concatenate([ts, np.linspace(ts[0], ts[-1], 23)])
+    np.testing.assert_allclose(jax.vmap(series)(at), spline(at), rtol=0, atol=1e-11 * np.abs(spline(at)).max())
+    # At the first and the last time as well, the derivative is that of the polynomial.
+    found = jax.vmap(jax.jacfwd(series))(at[:-1])
+    np.testing.assert_allclose(found, spline(at[:-1], 1), rtol=0, atol=1e-11 * np.abs(spline(at, 1)).max())
+    outside = jnp.array([ts[0] - 1.0, ts[-1] + 1.0])
+    np.testing.assert_array_equal(jax.vmap(series)(outside), values[[0, -1]])
+
+
+def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
+    def angle(values, rtol=1e-9, adjoint=None):
+        inputs = {"motor.torque": mb.Series(TS, values, "cubic")}
+        motion = mb.simulate(pendulum, pendulum.guess, t1=1.0, rtol=rtol, inputs=inputs, adjoint=adjoint)
+        return motion["rod"].angle[-1]
+
+    values = jnp.asarray(TORQUES)
+    forward = jax.jit(jax.jacfwd(lambda x: angle(x, adjoint=diffrax.ForwardMode())))(values)
+    reverse = jax.jit(jax.grad(angle))(values)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    moved = np.eye(len(TS)) * 1e-3
+    both = jax.jit(jax.vmap(lambda x: angle(x, rtol=1e-11)))(jnp.concatenate([values + moved, values - moved]))
+    differences = (both[: len(TS)] - both[len(TS) :]) / 2e-3
+    np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-7)
+
+
+def test_a_driver_that_is_a_series_moves_with_its_rates(pendulum):
+    rod = planar.Body("rod", mass=MASS, inertia=planar.rod(MASS, LENGTH), position=(LENGTH / 2, 0.0))
+    drive = planar.Driver(
+        "drive", "ground", "rod", quantity="angle", motion=lambda t, p: p["angle"], parameters={"angle": 0.0}
+    )
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    system = mb.Scene([rod], joints=[pin, drive]).compile()
+    angles = 0.3 * np.sin(3 * TS)
+    driven = mb.with_inputs(system, {"drive.angle": mb.Series(TS, angles, "cubic")})
+    motion = mb.simulate(driven, mb.assemble(driven), t1=1.0, saveat=np.linspace(0.0, 1.0, 7))
+    spline = CubicSpline(TS, angles)
+    np.testing.assert_allclose(motion["rod"].angle, spline(motion.ts), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion["rod"].angular_velocity, spline(motion.ts, 1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion.accelerations[:, 2], spline(motion.ts, 2), rtol=0, atol=1e-11)
+
+
+def test_a_kink_of_a_driven_angle_comes_with_its_impulse():
+    def arm(motion, parameters):
+        bodies = [
+            planar.Body("arm", mass=1.0, inertia=0.1, position=(0.4, 0.0)),
+            planar.Body("rod", mass=1.5, inertia=0.2, position=(1.3, 0.0)),
+        ]
+        joints = [
+            planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0)),
+            planar.Revolute("elbow", "arm", "rod", point=(0.8, 0.0)),
+            planar.Driver("drive", "ground", "arm", quantity="angle", motion=motion, parameters=parameters),
+        ]
+        return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
+
+    kinked = arm(lambda t, p: jnp.where(t < 0.6, 0.4 * t, 0.24 + 2.5 * (t - 0.6)), {})
+    expected = mb.simulate(kinked, mb.assemble(kinked, rates={"rod.angle": 0.0}), t1=1.1, rtol=1e-10, jumps=[0.6])
+    series = mb.Series([0.0, 0.6, 1.1], [0.0, 0.24, 1.49])
+    driven = mb.with_inputs(arm(lambda t, p: p["angle"], {"angle": 0.0}), {"drive.angle": series})
+    found = mb.simulate(driven, mb.assemble(driven, rates={"rod.angle": 0.0}), t1=1.1, rtol=1e-10)
+    np.testing.assert_allclose(found.ys.u, expected.ys.u, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.long), diffrax.Dopri8()])
+def test_an_input_of_a_lagrangian_system(solver):
+    system = mb.lagrangian.LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * INERTIA * v[0] ** 2,
+        potential=lambda t, q, p: MASS * G * LENGTH / 2 * jnp.sin(q[0]),
+        force=lambda t, q, v, p: p["torque"][None],
+        q=[0.0],
+        parameters={"torque": 0.0},
+        coordinates=["angle"],
+    )
+    inputs = {"torque": mb.Series(TS, TORQUES, "cubic")}
+    motion = mb.simulate(system, system.guess, t1=1.0, rtol=1e-10, inputs=inputs, solver=solver)
+    np.testing.assert_allclose(motion["angle"][-1], angle_under(CubicSpline(TS, TORQUES))[0], rtol=0, atol=1e-8)
+
+
+def test_a_length_of_a_lagrangian_constraint_takes_its_rate_along():
+    """A point on a string that is drawn in, beside the same length as a function of time."""
+
+    def system(length):
+        return mb.lagrangian.LagrangianSystem(
+            kinetic=lambda t, q, v, p: 0.5 * jnp.sum(v**2),
+            potential=lambda t, q, p: G * q[1],
+            constraints=[mb.lagrangian.Holonomic("string", lambda t, q, p: jnp.sum(q**2) - length(t, p) ** 2)],
+            q=[1.0, 0.0],
+            parameters={"length": 1.0},
+        )
+
+    inputs = {"length": lambda t: 1.0 - 0.3 * t**2}
+    own = mb.with_inputs(system(lambda t, p: p["length"]), inputs)
+    other = system(lambda t, p: p["length"] - 0.3 * t**2)
+    found, expected = (mb.simulate(s, mb.assemble(s), t1=1.0, rtol=1e-10) for s in (own, other))
+    assert not own.drift_free
+    np.testing.assert_allclose(found.ys.u, expected.ys.u, rtol=0, atol=1e-9)
+
+
+def test_a_scene_without_inputs_traces_nothing_of_them(pendulum):
+    state, t = pendulum.guess, jnp.zeros(())
+    text = lambda system: str(jax.make_jaxpr(lambda q, u: system.force(t, q, u))(state.q, state.u))
+    driven = mb.with_inputs(pendulum, {"motor.torque": mb.Series(TS, TORQUES)})
+    assert "searchsorted" in text(driven) and "searchsorted" not in text(pendulum)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ({"motor.torqe": mb.Series(TS, TORQUES)}, "'motor.torque'"),
+        ({"motor.torque": 3.0}, "The input 'motor.torque' must be a jaxmb.Series or a function of time"),
+        ({"motor.torque": mb.Series(TS, np.ones((6, 2)))}, r"'motor.torque' must have shape \(\)"),
+        ({"rod.mass": mb.Series(TS, TORQUES)}, "'rod.mass' must be constant"),
+        ({"gravity.acceleration": lambda t: jnp.zeros(2)}, "'gravity.acceleration' must be constant"),
+        ({"pin.point_a": mb.Series(TS, np.ones((6, 2)), "held")}, "'pin.point_a', so it must not jump"),
+        ({"motor.torque": mb.Series(TS / 2, TORQUES)}, "'motor.torque' is known from 0 to 0.5 s"),
+        ([1.0], "inputs must be a dictionary"),
+    ],
+)
+def test_inputs_that_cannot_be(pendulum, inputs, message):
+    with pytest.raises(ValueError, match=message):
+        mb.simulate(pendulum, pendulum.guess, t1=1.0, inputs=inputs)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([0.0, 1.0, 0.5], [1.0, 2.0, 3.0]), "ts must ascend, got 1 before 0.5"),
+        (([0.0, 1.0], [1.0, np.nan]), "values must be finite, got another at t = 1"),
+        (([0.0, np.inf], [1.0, 2.0]), "ts must be finite"),
+        (([0.0], [1.0]), "at least two times"),
+        (([0.0, 1.0], [1.0, 2.0, 3.0]), r"got shapes \(2,\) and \(3,\)"),
+        (([0.0, 1.0], ["a", "b"]), "expected a real number"),
+        (([0.0, 1.0], [1.0, 2.0], "spline"), "'linear', 'cubic' or 'held'"),
+    ],
+)
+def test_series_that_cannot_be(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        mb.Series(*arguments)
+
+
+def test_an_input_is_not_set_as_a_number(pendulum):
+    driven = mb.with_inputs(pendulum, {"motor.torque": mb.Series(TS, TORQUES)})
+    with pytest.raises(ValueError, match="'motor.torque' is an input of this system"):
+        mb.with_parameters(driven, {"motor.torque": 1.0})
