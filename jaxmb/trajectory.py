@@ -18,7 +18,7 @@ from ._types import State
 from .formulations import AbstractFormulation, accelerations
 from .manifold import project_normalized
 from .parts.names import unknown
-from .system import Reaction
+from .system import Reaction, Solved
 from .system.violation import row_sizes
 
 
@@ -70,7 +70,8 @@ class Trajectory(eqx.Module):
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
-    `BodyMotion`; of a system in generalized coordinates it is that of a coordinate, shape (times,).
+    `BodyMotion`, and `trajectory["hip"]` that of a joint's own coordinates, a `JointMotion`; of a system in generalized
+    coordinates it is that of a coordinate, shape (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
     that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
@@ -88,9 +89,12 @@ class Trajectory(eqx.Module):
 
     def __getitem__(self, name: str) -> Any:
         names = self.system.motion_names()
-        if name not in names:
-            raise unknown("body" if self.system.has_bodies else "coordinate", name, names)
-        return self._motion(name)
+        if name in names:
+            return self._motion(name)
+        joints = dict.fromkeys(known.split(".")[0] for known in self.system.joint_coordinates())
+        if name in joints:
+            return JointMotion(self, name)
+        raise unknown("body or joint" if self.system.has_bodies else "coordinate", name, (*names, *joints))
 
     @_of_each_member
     def _motion(self, name):
@@ -120,8 +124,8 @@ class Trajectory(eqx.Module):
     @_of_each_member
     def _measured(self, names):
         known = {name: quantity for name, quantity in self.system.quantities().items() if name in names}
-        multipliers = self.multipliers if any(quantity.of_forces for quantity in known.values()) else None
-        return {name: quantity.value(self.ts, self.ys, multipliers) for name, quantity in known.items()}
+        solved = Solved(*self._solved) if any(quantity.of_forces for quantity in known.values()) else None
+        return {name: quantity.value(self.ts, self.ys, solved) for name, quantity in known.items()}
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
@@ -266,6 +270,31 @@ class Trajectory(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`."""
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
+
+
+class JointMotion:
+    """The own coordinates of a joint along a motion, as attributes: `.angle`, `.angle_rate`, `.angle_acceleration` of
+    a hinge, `.displacement`, … of a slide; see the joints of `planar` and `spatial`. Axis 0 is time, after the batch's
+    axes.
+
+    An angle is continued over full turns; saved times must be so close that its change between two of them differs by
+    less than half a turn from that by the trapezoidal rule of its rate.
+    """
+
+    def __init__(self, trajectory: Trajectory, name: str):
+        self._trajectory, self._name = trajectory, name
+
+    def __dir__(self) -> list[str]:
+        start = f"{self._name}."
+        own = [
+            name.removeprefix(start) for name in self._trajectory.system.joint_coordinates() if name.startswith(start)
+        ]
+        return [f"{name}{end}" for name in own for end in ("", "_rate", "_acceleration")]
+
+    def __getattr__(self, field: str) -> Array:
+        if field.startswith("_") or field not in dir(self):
+            raise AttributeError(f"The joint {self._name!r} has {', '.join(dir(self))}; got {field!r}.")
+        return self._trajectory.quantity(f"{self._name}.{field}")
 
 
 class GlobalError(NamedTuple):

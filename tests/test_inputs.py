@@ -1,5 +1,7 @@
 """Parameters as functions of time: series and functions."""
 
+import itertools
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,7 @@ def angle_under(torque, breaks=()):
     """The rod's angle and rate after one second."""
     rates = lambda t, y: [y[1], (torque(t) - MASS * G * LENGTH / 2 * np.cos(y[0])) / INERTIA]
     y, ends = np.zeros(2), [0.0, *breaks, 1.0]
-    for a, b in zip(ends, ends[1:], strict=False):
+    for a, b in itertools.pairwise(ends):
         y = solve_ivp(rates, (a, np.nextafter(b, a)), y, rtol=1e-12, atol=1e-13).y[:, -1]
     return y
 
@@ -68,15 +70,17 @@ def test_the_spline_is_that_without_knots_at_the_second_and_the_last_but_one(cou
 
 
 def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
-    def angle(values, rtol=1e-9, adjoint=None):
+    # On one mesh: steps that are rejected at a knot depend on rounding, which differs between the two modes.
+    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02, "solver": diffrax.Dopri8()}
+
+    def angle(values, **options):
         inputs = {"motor.torque": mb.Series(TS, values, "cubic")}
-        motion = mb.simulate(pendulum, pendulum.guess, t1=1.0, rtol=rtol, inputs=inputs, adjoint=adjoint)
-        return motion["rod"].angle[-1]
+        return mb.simulate(pendulum, pendulum.guess, t1=1.0, inputs=inputs, **options)["rod"].angle[-1]
 
     values = jnp.asarray(TORQUES)
-    forward = jax.jit(jax.jacfwd(lambda x: angle(x, adjoint=diffrax.ForwardMode())))(values)
-    reverse = jax.jit(jax.grad(angle))(values)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    forward = jax.jit(jax.jacfwd(lambda x: angle(x, adjoint=diffrax.ForwardMode(), **fixed)))(values)
+    reverse = jax.jit(jax.grad(lambda x: angle(x, **fixed)))(values)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
     moved = np.eye(len(TS)) * 1e-3
     both = jax.jit(jax.vmap(lambda x: angle(x, rtol=1e-11)))(jnp.concatenate([values + moved, values - moved]))
     differences = (both[: len(TS)] - both[len(TS) :]) / 2e-3
@@ -199,5 +203,5 @@ def test_series_that_cannot_be(arguments, message):
 
 def test_an_input_is_not_set_as_a_number(pendulum):
     driven = mb.with_inputs(pendulum, {"motor.torque": mb.Series(TS, TORQUES)})
-    with pytest.raises(ValueError, match="'motor.torque' is an input of this system"):
+    with pytest.raises(ValueError, match="is an input of this system"):
         mb.with_parameters(driven, {"motor.torque": 1.0})

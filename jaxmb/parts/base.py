@@ -175,9 +175,17 @@ class AbstractConstraint(AbstractLink):
     rows: AbstractVar[int]
     rheonomic: AbstractVar[bool]
 
+    # Names of the coordinates that are angles known up to full turns.
+    periodic: ClassVar[frozenset[str]] = frozenset()
+
     @abc.abstractmethod
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
         """Φ(poses, t) of this part."""
+
+    def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
+        """Hook: the joint's own coordinates by name, numbers or vectors, such as its `angle` or `displacement`."""
+        del space, poses
+        return {}
 
 
 class AbstractJoint(AbstractPair, AbstractConstraint):

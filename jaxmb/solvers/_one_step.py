@@ -148,7 +148,9 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         unit = eqx.tree_at(lambda c: (c.rtol, c.atol, c.norm), self.controller, (0.0, 1.0, jnp.abs))
         zero = jnp.zeros_like(errors[0])
         error = functools.reduce(jnp.maximum, errors)
-        keep, *times, made_jump, state, result = unit.adapt_step_size(t0, t1, zero, zero, args, error, error_order, state)
+        keep, *times, made_jump, state, result = unit.adapt_step_size(
+            t0, t1, zero, zero, args, error, error_order, state
+        )
         # Where errors are not finite, ever smaller steps would be tried.
         stuck = jnp.logical_not(keep) & (times[1] - times[0] <= least)
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)

@@ -19,6 +19,7 @@ from ..system import AbstractSystem
 from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
+from .held_coordinates import holding, split_names
 
 
 def assemble(
@@ -36,8 +37,9 @@ def assemble(
 
     - `system`: a compiled scene, or another system.
     - `guess`: where to start, default the poses and velocities given with the bodies.
-    - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}`.
-    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`; in space `"body.angular_velocity"`
+    - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
+        of a joint's own.
+    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`, also of a joint's own; in space `"body.angular_velocity"`
         (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of coordinates, or `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
@@ -52,10 +54,16 @@ def assemble(
     check_system("assemble", system)
     guess = checked_guess("assemble", system, guess)
     t = checked_time("assemble", t, guess.q.dtype)
-    u, fixed_rates = prescribe("rate", system.rate_names(), {} if rates is None else rates, guess.u)
+    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    rates, rates_of_joints = split_names("rate", system, system.rate_names(), rates)
+    u, fixed_rates = prescribe("rate", system.rate_names(), rates, guess.u)
     if not is_traced(u):
         _check_finite(u, "rates")
-    q, _, ok = configuration(system, guess.q, fix, t, throw)
+    q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, throw)
+    if rates_of_joints:
+        known = system.joint_coordinates()
+        here = {name: system.joint_coordinate(known[name], t, q) for name in rates_of_joints}
+        system = holding(system, here, rates_of_joints, t)
     # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)

@@ -25,6 +25,7 @@ from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
 from .closest import tolerance
+from .held_coordinates import holding, split_names
 
 _ITERATIONS = 200
 
@@ -71,6 +72,8 @@ def equilibrium(
         )
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)
+    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    system = holding(system, of_joints, {}, time)
     start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))

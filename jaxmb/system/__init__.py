@@ -10,5 +10,5 @@ from .equation import AbstractSystem as AbstractSystem
 from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
 from .inputs import with_inputs as with_inputs
 from .parameters import parameters as parameters, with_parameters as with_parameters
-from .quantities import BodyMotion as BodyMotion, Quantity as Quantity, Reaction as Reaction
+from .quantities import BodyMotion as BodyMotion, Quantity as Quantity, Reaction as Reaction, Solved as Solved
 from .rigid_bodies import RigidBodySystem as RigidBodySystem

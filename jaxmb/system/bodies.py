@@ -29,6 +29,7 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
+from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
 from .layout import Layout
 from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
@@ -210,9 +211,25 @@ class AbstractBodySystem(AbstractSystem):
         d = self.layout.space.dimension
         for name in self.joint_names():
             for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
-                value = lambda *along, name=name, field=field: getattr(self.reaction(name, *along), field)
+                value = lambda ts, ys, solved, name=name, field=field: getattr(
+                    self.reaction(name, ts, ys, solved.multipliers), field
+                )
                 out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
-        return out
+        return out | joint_quantities(self, self.joint_coordinates())
+
+    def joint_coordinates(self):
+        return joint_coordinates(self.constraints, self.layout)
+
+    def joint_coordinate(self, coordinate, t, q):
+        values = self.constraints[coordinate.group].coordinates(t, self.prepared_poses(q))
+        return values[coordinate.field][coordinate.member]
+
+    def holding(self, values, rates, t):
+        held = held_groups(self.constraints, self.joint_coordinates(), values, rates, t)
+        rows = sum(g.rows for g in held)
+        ranks = dataclasses.astuple(self.ranks)
+        more = Ranks(*(rank + rows for rank in ranks))
+        return dataclasses.replace(self, constraints=(*self.constraints, *held), ranks=more, elimination=None)
 
     def position_quantities(self):
         return tuple(f"{name}.position" for name in self.body_names)

@@ -142,6 +142,18 @@ class AbstractSystem(eqx.Module):
         """The quantities that can be measured of a motion, by name."""
 
     @abc.abstractmethod
+    def joint_coordinates(self) -> Mapping[str, Any]:
+        """The own coordinates of joints, by name; each has a `shape`. Empty for a system without bodies."""
+
+    @abc.abstractmethod
+    def joint_coordinate(self, coordinate: Any, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "*shape"]:
+        """The value of one of `joint_coordinates`; an angle known up to full turns is in (−π, π]."""
+
+    @abc.abstractmethod
+    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
+        """The same system with coordinates of joints held at values, which change at some rates, from t on."""
+
+    @abc.abstractmethod
     def position_quantities(self) -> tuple[str, ...]:
         """Names of the quantities that determine the configuration up to the attitude of bodies."""
 

@@ -37,9 +37,20 @@ class AbstractGeneralizedSystem(AbstractSystem):
             rate = lambda ts, ys, _, index=index: self.rates_along(ts, ys)[:, index]
             out[f"{name}.rate"] = Quantity((), rate)
         for name in self.constraint_names():
-            force = lambda ts, ys, multipliers, name=name: self.generalized_constraint_force(name, ts, ys, multipliers)
+            force = lambda ts, ys, solved, name=name: self.generalized_constraint_force(
+                name, ts, ys, solved.multipliers
+            )
             out[f"{name}.force"] = Quantity((self.nu,), force, of_forces=True)
         return out
+
+    def joint_coordinates(self):
+        return {}
+
+    def joint_coordinate(self, coordinate, t, q):
+        raise ValueError("This system has no joints between bodies, and so no coordinates of joints.")
+
+    def holding(self, values, rates, t):
+        return self
 
     def position_quantities(self):
         return self.motion_names()

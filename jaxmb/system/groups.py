@@ -49,6 +49,10 @@ class Group(eqx.Module):
         single = lambda member, part, *own: kernel(lambda t: self._at(member, part, t), *own)
         return jax.vmap(single)(jnp.arange(len(self.names)), self.part, *per_part)
 
+    def single(self, member: int, t: Scalar) -> Any:
+        """One part at a time."""
+        return self._at(member, jax.tree.map(lambda leaf: leaf[member], self.part), t)
+
     def _at(self, member, part, t):
         """One part with its inputs at a time."""
         for own in self.inputs:
@@ -175,6 +179,10 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
         return self._map(lambda at, x: at(t).residual(self._space, x, t), poses)
+
+    def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
+        """The joints' own coordinates, by name within the joint."""
+        return self._map(lambda at, x: at(t).coordinates(self._space, x), poses)
 
     def along(
         self, t: Scalar, poses: Float[Array, "b_ground p"], moves: Float[Array, "b_ground n p"]

@@ -6,11 +6,18 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Float
 
 
+class Solved(NamedTuple):
+    """What the equations of motion give along a motion: accelerations u̇ and multipliers, axis 0 is time."""
+
+    accelerations: Float[Array, "times nu"]
+    multipliers: Float[Array, "times rows"]
+
+
 class Quantity(NamedTuple):
     """A quantity that can be measured of a motion, such as the position of a body or the force of a joint.
 
-    **Fields:** `shape` at one time; `value(ts, ys, multipliers)`: its values along a motion, axis 0 is time;
-    `of_forces`: whether the values depend on the multipliers, which are None otherwise.
+    **Fields:** `shape` at one time; `value(ts, ys, solved)`: its values along a motion, axis 0 is time; `of_forces`:
+    whether the values depend on accelerations or multipliers, `solved`, which is None otherwise.
     """
 
     shape: tuple[int, ...]

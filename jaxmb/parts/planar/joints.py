@@ -3,6 +3,9 @@
 Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
 the body frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the given poses (`point`,
 `axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
+
+Their own coordinates are `angle` [rad], that of `body_b` less that of `body_a`, and `displacement` [m], the component
+of d along the axis.
 """
 
 from collections.abc import Callable
@@ -33,6 +36,9 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
+
+    def coordinates(self, space, poses):
+        return {"angle": relative_angle(poses)}
 
 
 class Fixed(AbstractPlanarPart, AbstractJoint):
@@ -65,6 +71,9 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     def residual(self, space, poses, t):
         return _offset(space, self, poses)[None]
 
+    def coordinates(self, space, poses):
+        return {"displacement": _displacement(space, self, poses), "angle": relative_angle(poses)}
+
 
 class Prismatic(AbstractPlanarPart, AbstractJoint):
     """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a
@@ -84,11 +93,19 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     def residual(self, space, poses, t):
         return jnp.stack([_offset(space, self, poses), relative_angle(poses) - self.angle])
 
+    def coordinates(self, space, poses):
+        return {"displacement": _displacement(space, self, poses)}
+
 
 def _offset(space, part, poses):
     """`n·d`."""
     along = space.direction(poses[0], part.axis_a)
     return jnp.dot(jnp.stack([-along[1], along[0]]), separation(space, part, poses))
+
+
+def _displacement(space, part, poses):
+    """The component of d along the axis."""
+    return jnp.dot(space.direction(poses[0], part.axis_a), separation(space, part, poses))
 
 
 class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
@@ -129,6 +146,9 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     def residual(self, space, poses, t):
         point = space.body_point(poses[0], space.point(poses[1], self.point_b))
         return jnp.reshape(self.curve(point, self.parameters), (1,))
+
+    def coordinates(self, space, poses):
+        return {"angle": relative_angle(poses)}
 
 
 class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):

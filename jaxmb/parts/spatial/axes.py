@@ -65,6 +65,23 @@ def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
     return xp.where(defined, xp.arctan2(s, xp.where(defined, c, 1.0)), 0.0)
 
 
+def turn_about(axis: Vector3, start: Vector3, end: Vector3) -> Float[Array, ""]:
+    """The angle [rad] about an axis from one direction to another, both perpendicular to it, in (−π, π]."""
+    return namespace(axis).arctan2(rot.cross(axis, start) @ end, start @ end)
+
+
+def rotation_vector(part, poses: Float[Array, "k p"]) -> Vector3:
+    """The rotation vector [rad], in A, of the shortest turn from `part.orientation` to the relative attitude."""
+    turned = rot.multiply(relative_orientation(poses), rot.conjugate(part.orientation))
+    turned = jax.numpy.where(turned[0] < 0, -turned, turned)
+    cosine, vector = turned[0], turned[1:]
+    square = vector @ vector
+    small = square < 1e-16
+    sine = jax.numpy.sqrt(jax.numpy.where(small, 1.0, square))
+    # Near zero twice the vector part, whose derivatives are right there as well.
+    return jax.numpy.where(small, 2.0, 2 * jax.numpy.arctan2(sine, cosine) / sine) * vector
+
+
 def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
     """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if None."""
     if (part.x_a is None) != (part.x_b is None):

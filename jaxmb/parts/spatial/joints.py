@@ -4,6 +4,10 @@ Every joint connects body-fixed points and axes of `body_a` and `body_b` (either
 the body frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a world point and axis at the given poses
 (`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two points, `d = B − A`, `a`
 and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
+
+Their own coordinates are `angle` [rad], the turn of `body_b` about the axis, and `displacement` [m], the component of d
+along it. An angle is zero at the given poses, or where the directions `x_a` and `x_b` that are given with the joint
+coincide.
 """
 
 from typing import ClassVar
@@ -11,7 +15,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import norm
+from ...linalg.rotations import cross, norm
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
 from ..space import separation
@@ -23,6 +27,8 @@ from .axes import (
     offset_in_a,
     perpendiculars,
     rotation_error,
+    rotation_vector,
+    turn_about,
     with_given_orientation,
 )
 
@@ -32,6 +38,11 @@ def _across(axis_a, w):
     return jnp.sum(perpendiculars(axis_a) * w[None, :], axis=1)
 
 
+def _displacement(space, part, poses):
+    """The component of d along the axis."""
+    return jnp.dot(part.axis_a, offset_in_a(space, part, poses))
+
+
 def _parallel(space, part, poses):
     return _across(part.axis_a, direction_in_a(space, poses, part.axis_b))
 
@@ -39,33 +50,58 @@ def _parallel(space, part, poses):
 class Spherical(AbstractSpatialPart, AbstractJoint):
     """A ball: two points coincide. Rows 3: `d`.
 
-    **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; or `point` [m], shape (3,), world.
+    Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
+    from `orientation` to the relative attitude. It is not smooth at half a turn.
+
+    **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; or `point` [m], shape (3,), world; `orientation`,
+    shape (4,), unit Euler parameters of B relative to A where the rotation is zero, default those of the given poses.
     """
 
+    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
+
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
+
+    def coordinates(self, space, poses):
+        return {"rotation": rotation_vector(self, poses)}
 
 
 class Revolute(AbstractSpatialPart, AbstractJoint):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, `u·b`, `v·b`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), direction of the hinge fixed in each
-    body; or `axis`, unit, shape (3,), world.
+    body; or `axis`, unit, shape (3,), world; `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis:
+    the angle is measured between them.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis_b: fields.Number = fields.axis(body=1, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 5
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    def complete(self, space, poses):
+        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), _parallel(space, self, poses)])
 
+    def coordinates(self, space, poses):
+        return {"angle": angle(space, self, poses)}
+
 
 class Universal(AbstractSpatialPart, AbstractJoint):
     """A Cardan joint: two points coincide and two axes stay perpendicular. Rows 4: `d`, `a·b`.
+
+    Its coordinates are `angle_a`, the turn of the cross in `body_a` about `axis_a`, and `angle_b`, that of `body_b` on
+    the cross about `axis_b` [rad], both zero at the given poses: the relative attitude is a turn by the one, the
+    attitude at zero, and a turn by the other. They are smooth in every position of the joint.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), the arms of the cross, fixed in
     `body_a` and in `body_b`; each may be given in the world instead, as `axis_a_W` and `axis_b_W`.
@@ -75,7 +111,10 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     axis_b: fields.Number = fields.axis(body=1, optional=True)
     axis_a_W: fields.Number = fields.axis(body=None, gives=("axis_a",))
     axis_b_W: fields.Number = fields.axis(body=None, gives=("axis_b",))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
 
     def validate(self):
         if self.axis_a_W is not None and self.axis_b_W is not None:
@@ -89,6 +128,19 @@ class Universal(AbstractSpatialPart, AbstractJoint):
         cosine = jnp.dot(self.axis_a, direction_in_a(space, poses, self.axis_b))
         return jnp.concatenate([separation(space, self, poses), cosine[None]])
 
+    def complete(self, space, poses):
+        # The direction of each axis in the other body, perpendicular to that body's own.
+        return self.filled(
+            x_a=direction_in_a(space, poses, self.axis_b), x_b=direction_in_a(space, poses[::-1], self.axis_a)
+        )
+
+    def coordinates(self, space, poses):
+        arm_b, arm_a = direction_in_a(space, poses, self.axis_b), direction_in_a(space, poses[::-1], self.axis_a)
+        return {
+            "angle_a": turn_about(self.axis_a, self.x_a, arm_b),
+            "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
+        }
+
 
 class Cylindrical(AbstractSpatialPart, AbstractJoint):
     """A pin that turns and slides: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
@@ -99,11 +151,20 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis_b: fields.Number = fields.axis(body=1, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    def complete(self, space, poses):
+        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift)])
+
+    def coordinates(self, space, poses):
+        return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
 
 
 class Screw(AbstractSpatialPart, AbstractJoint):
@@ -128,6 +189,7 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     x_b: fields.Number = fields.axis(body=1, optional=True)
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -141,6 +203,9 @@ class Screw(AbstractSpatialPart, AbstractJoint):
         c, s = cosine_sine(space, self, poses)
         thread = lead * (s * jnp.cos(turn) - c * jnp.sin(turn))
         return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift), thread[None]])
+
+    def coordinates(self, space, poses):
+        return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
 
 
 class Prismatic(AbstractSpatialPart, AbstractJoint):
@@ -165,9 +230,14 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
     def residual(self, space, poses, t):
         return jnp.concatenate([_across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
 
+    def coordinates(self, space, poses):
+        return {"displacement": _displacement(space, self, poses)}
+
 
 class Planar(AbstractSpatialPart, AbstractJoint):
     """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: `u·b`, `v·b`, `a·d`.
+
+    Its displacement, shape (2,), has the components of d along `x_a` and along `a × x_a`.
 
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
@@ -175,11 +245,22 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis_b: fields.Number = fields.axis(body=1, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 3
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    def complete(self, space, poses):
+        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
         return jnp.concatenate([_parallel(space, self, poses), height[None]])
+
+    def coordinates(self, space, poses):
+        shift, y_a = offset_in_a(space, self, poses), cross(self.axis_a, self.x_a)
+        displacement = jnp.stack([jnp.dot(self.x_a, shift), jnp.dot(y_a, shift)])
+        return {"displacement": displacement, "angle": angle(space, self, poses)}
 
 
 class Fixed(AbstractSpatialPart, AbstractJoint):
@@ -248,3 +329,6 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
 
     def residual(self, space, poses, t):
         return _across(self.axis_a, offset_in_a(space, self, poses))
+
+    def coordinates(self, space, poses):
+        return {"displacement": _displacement(space, self, poses)}

@@ -1,0 +1,39 @@
+"""Prescribed coordinates by name: entries of q and u, and the own coordinates of joints."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from .._types import Scalar, VectorLike
+from ..parts.names import unknown
+from ..system import AbstractSystem
+from ..system.arguments import real_array
+
+
+def split_names(
+    what: str, system: AbstractSystem, own: Mapping[str, Any], values: Mapping[str, VectorLike] | None
+) -> tuple[dict[str, VectorLike], dict[str, Any]]:
+    """Prescribed values of the system's own coordinates or rates, and of coordinates of joints, which become arrays.
+
+    **Raises:** `ValueError` for names of neither kind and for values of the wrong shape.
+    """
+    if values is None or not isinstance(values, Mapping) or all(name in own for name in values):
+        return ({} if values is None else values), {}  # pyright: ignore[reportReturnType]
+    known, dtype = system.joint_coordinates(), jnp.result_type(float)
+    of_joints = {}
+    for name, value in values.items():
+        if name not in own:
+            if name not in known:
+                raise unknown(what, name, (*own, *known))
+            of_joints[name] = jnp.asarray(
+                real_array(f"{what.capitalize()} {name!r}", value, dtype, (known[name].shape,))
+            )
+    return {name: value for name, value in values.items() if name in own}, of_joints
+
+
+def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
+    """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
+    if not values:
+        return system
+    return system.holding(values, {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}, t)

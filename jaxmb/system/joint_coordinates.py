@@ -1,0 +1,111 @@
+"""The own coordinates of joints by name, `"hip.angle"` or `"slide.displacement"`, with their rates and accelerations."""
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .._types import Scalar
+from ..parts.held_coordinate import HeldCoordinate
+from .equation import AbstractSystem
+from .groups import ConstraintGroup, Group
+from .layout import Layout
+from .quantities import Quantity
+
+# A coordinate and its derivatives with respect to time, by the ends of their names.
+ORDERS = ("", "_rate", "_acceleration")
+
+
+class JointCoordinate(NamedTuple):
+    """A coordinate of a joint: the numbers of the joint's group and of the joint in it, the name within the joint, its
+    shape, and whether it is an angle known up to full turns.
+    """
+
+    group: int
+    member: int
+    field: str
+    shape: tuple[int, ...]
+    periodic: bool
+
+
+def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout) -> dict[str, JointCoordinate]:
+    """The coordinates of all joints, by name."""
+    space, out = layout.space, {}
+    ground = np.tile(np.asarray(space.ground, jnp.result_type(float)), (layout.bodies + 1, 1))
+    for g, own in enumerate(groups):
+        found = jax.eval_shape(
+            lambda own=own: own.coordinates(jnp.zeros(()), jax.vmap(space.prepare)(jnp.asarray(ground)))
+        )
+        for field, values in found.items():
+            for k, name in enumerate(own.group.names):
+                coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)
+                out[f"{name}.{field}"] = coordinate
+    return out
+
+
+def joint_quantities(system: AbstractSystem, known: Mapping[str, JointCoordinate]) -> dict[str, Quantity]:
+    """Coordinates of joints, their rates and accelerations, as quantities of a motion.
+
+    Angles known up to full turns are continued from time to time: a change in one interval is taken to be that by which
+    the angle and the trapezoidal rule of its rate differ least.
+    """
+    out = {}
+    for name, coordinate in known.items():
+        for order, end in enumerate(ORDERS):
+            value = functools.partial(_along, system, coordinate, order)
+            out[f"{name}{end}"] = Quantity(coordinate.shape, value, of_forces=order == 2)
+    return out
+
+
+def _along(system, coordinate, order, ts, ys, solved):
+    accelerations = ys.u if solved is None else solved.accelerations
+    every = jax.vmap(lambda t, y, a: _derivatives(system, coordinate, t, y, a, 1 if order < 2 else 2))
+    values = every(ts, ys, accelerations)
+    return _continued(ts, *values[:2]) if order == 0 and coordinate.periodic else values[order]
+
+
+def _derivatives(system, coordinate, t, y, acceleration, order) -> tuple[Array, ...]:
+    """The coordinate and its derivatives with respect to time up to an order, 1 or 2."""
+    t = jnp.asarray(t, y.q.dtype)
+    one = jnp.ones_like(t)
+    value = lambda t, q: system.joint_coordinate(coordinate, t, q)
+    along = lambda t, q, u: jax.jvp(value, (t, q), (one, system.rates(t, q, u)))
+    if order == 1:
+        return along(t, y.q, y.u)
+    both, second = jax.jvp(along, (t, y.q, y.u), (one, system.rates(t, y.q, y.u), acceleration))
+    return *both, second[1]
+
+
+def _continued(ts, angles, rates):
+    """Angles with full turns added."""
+    predicted = jnp.diff(ts) * (rates[1:] + rates[:-1]) / 2
+    turns = jnp.round((predicted - jnp.diff(angles)) / (2 * np.pi))
+    # Entries after the end of a run are not finite; the earlier ones do not depend on them.
+    turns = lax.stop_gradient(jnp.where(jnp.isfinite(turns), turns, 0.0))
+    return angles + 2 * np.pi * jnp.concatenate([jnp.zeros(1, angles.dtype), jnp.cumsum(turns)])
+
+
+def held_groups(
+    groups: Sequence[ConstraintGroup],
+    known: Mapping[str, JointCoordinate],
+    values: Mapping[str, Array],
+    rates: Mapping[str, Array],
+    t: Scalar,
+) -> tuple[ConstraintGroup, ...]:
+    """Constraints that hold coordinates of joints at values, which change at some rates, from a time on."""
+    out = []
+    for name, value in values.items():
+        own = known[name]
+        group = groups[own.group].group
+        start = jnp.asarray(t, value.dtype)
+        rows = math.prod(own.shape)
+        part = HeldCoordinate(name, group.single(own.member, t), own.field, value, rates[name], start, rows)
+        stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)
+        out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout)))
+    return tuple(out)
