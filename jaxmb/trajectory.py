@@ -285,11 +285,9 @@ class JointMotion:
         self._trajectory, self._name = trajectory, name
 
     def __dir__(self) -> list[str]:
-        start = f"{self._name}."
-        own = [
-            name.removeprefix(start) for name in self._trajectory.system.joint_coordinates() if name.startswith(start)
-        ]
-        return [f"{name}{end}" for name in own for end in ("", "_rate", "_acceleration")]
+        known = (name.split(".") for name in self._trajectory.system.joint_coordinates())
+        own = [field for joint, field in known if joint == self._name]
+        return [f"{field}{end}" for field in own for end in ("", "_rate", "_acceleration")]
 
     def __getattr__(self, field: str) -> Array:
         if field.startswith("_") or field not in dir(self):

@@ -39,8 +39,9 @@ def assemble(
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
         of a joint's own.
-    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`, also of a joint's own; in space `"body.angular_velocity"`
-        (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of coordinates, or `u0`, `u1`, ….
+    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`, also of a joint's own coordinates; in
+        space `"body.angular_velocity"` (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of
+        coordinates, or `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
         that one member of a batch does not spoil the others.

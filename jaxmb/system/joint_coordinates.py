@@ -1,4 +1,4 @@
-"""The own coordinates of joints by name, `"hip.angle"` or `"slide.displacement"`, with their rates and accelerations."""
+"""The own coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
 
 import functools
 import math
@@ -37,11 +37,9 @@ class JointCoordinate(NamedTuple):
 def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name."""
     space, out = layout.space, {}
-    ground = np.tile(np.asarray(space.ground, jnp.result_type(float)), (layout.bodies + 1, 1))
+    ground = jnp.tile(space.prepare(np.asarray(space.ground, jnp.result_type(float))), (layout.bodies + 1, 1))
     for g, own in enumerate(groups):
-        found = jax.eval_shape(
-            lambda own=own: own.coordinates(jnp.zeros(()), jax.vmap(space.prepare)(jnp.asarray(ground)))
-        )
+        found = jax.eval_shape(own.coordinates, jnp.zeros(()), ground)
         for field, values in found.items():
             for k, name in enumerate(own.group.names):
                 coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)

@@ -1,0 +1,156 @@
+"""The own coordinates of joints: in initial states, along motions, and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, rotations, spatial
+
+J = np.diag([0.01, 0.08, 0.07])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A hinge on the ground, then a universal joint; along x at the given poses."""
+    rod = lambda name, x: spatial.Body(name, mass=1.0, inertia=J, position=(x, 0.0, 0.0))
+    joints = [
+        spatial.Revolute("hip", "ground", "thigh", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
+        spatial.Universal(
+            "knee", "thigh", "shank", point=(1.0, 0.0, 0.0), axis_a_W=(0.0, 1.0, 0.0), axis_b_W=(0.0, 0.0, 1.0)
+        ),
+    ]
+    forces = [mb.Gravity((0.0, 0.0, -9.81))]
+    return mb.Scene([rod("thigh", 0.5), rod("shank", 1.5)], joints=joints, forces=forces).compile()
+
+
+def turn(axis, angle):
+    return rotations.from_axis_angle(jnp.array(axis), angle)
+
+
+def test_attitudes_follow_from_the_angles_that_are_given(arm):
+    hip, first, second = 0.7, 1.9, -2.4
+    state = mb.assemble(arm, fix={"hip.angle": hip, "knee.angle_a": first, "knee.angle_b": second})
+    thigh, shank = state.q[3:7], state.q[10:14]
+    expected = turn((0.0, 1.0, 0.0), hip)
+    np.testing.assert_allclose(jnp.abs(thigh @ expected), 1.0, rtol=0, atol=1e-14)
+    relative = rotations.multiply(turn((0.0, 1.0, 0.0), first), turn((0.0, 0.0, 1.0), second))
+    np.testing.assert_allclose(jnp.abs(shank @ rotations.multiply(expected, relative)), 1.0, rtol=0, atol=1e-14)
+
+
+def test_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(arm):
+    rates = {"hip.angle": 9.0, "knee.angle_a": 0.3, "knee.angle_b": 0.2}
+    start = mb.assemble(arm, fix={"hip.angle": 0.1}, rates=rates)
+    ts = np.linspace(0.0, 1.6, 1601)
+    motion = mb.simulate(arm, start, t1=1.6, saveat=ts, rtol=1e-10)
+    hip, knee = motion["hip"], motion["knee"]
+    assert hip.angle[0] == pytest.approx(0.1, abs=1e-13) and np.ptp(hip.angle) > 2 * np.pi
+    first = [hip.angle_rate[0], knee.angle_a_rate[0], knee.angle_b_rate[0]]
+    np.testing.assert_allclose(first, list(rates.values()), rtol=0, atol=1e-12)
+    for value, rate, scale in (
+        (hip.angle, hip.angle_rate, 2e-3),
+        (hip.angle_rate, hip.angle_acceleration, 2e-1),
+        (knee.angle_a, knee.angle_a_rate, 2e-3),
+        (knee.angle_b, knee.angle_b_rate, 2e-3),
+    ):
+        central = (np.asarray(value[2:]) - np.asarray(value[:-2])) / (ts[2:] - ts[:-2])
+        np.testing.assert_allclose(central, rate[1:-1], rtol=0, atol=scale)
+    # At fewer times, the same numbers.
+    few = mb.simulate(arm, start, t1=1.6, saveat=ts[::20], rtol=1e-10)
+    np.testing.assert_allclose(few["hip"].angle, hip.angle[::20], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("near", [np.pi, -np.pi, 0.0])
+def test_an_angle_and_another_by_two_full_turns_are_one_position(arm, near):
+    angle = near + 0.01
+    one, other = (mb.assemble(arm, fix={"hip.angle": x}) for x in (angle, angle + 4 * np.pi))
+    np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-13)
+
+
+def test_planar_angles_count_turns():
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    system = mb.Scene([rod], joints=[planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))]).compile()
+    state = mb.assemble(system, fix={"pin.angle": 4 * np.pi + 0.3}, rates={"pin.angle": 2.0})
+    assert state.q[2] == pytest.approx(4 * np.pi + 0.3, abs=1e-12) and state.u[2] == pytest.approx(2.0, abs=1e-12)
+
+
+SHIFT, ANGLE, VECTOR = 0.3, 0.4, np.array([0.3, -0.5, 0.2])
+AXIS = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "values"),
+    [
+        (spatial.Cylindrical, AXIS, {"angle": ANGLE, "displacement": SHIFT}),
+        (spatial.Screw, AXIS | {"pitch": 2 * np.pi * SHIFT / ANGLE}, {"angle": ANGLE}),
+        (spatial.Prismatic, AXIS, {"displacement": SHIFT}),
+        (spatial.Planar, AXIS, {"angle": ANGLE, "displacement": np.array([0.2, -0.1])}),
+        (spatial.PointOnLine, AXIS, {"displacement": SHIFT}),
+        (spatial.Spherical, {"point": (0.0, 0.0, 0.0)}, {"rotation": VECTOR}),
+    ],
+)
+def test_the_position_that_the_coordinates_of_each_joint_give(kind, options, values):
+    body = spatial.Body("body", mass=1.0, inertia=J)
+    system = mb.Scene([body], joints=[kind("joint", "ground", "body", **options)]).compile()
+    state = mb.assemble(system, fix={f"joint.{name}": value for name, value in values.items()})
+    position, attitude = np.zeros(3), (1.0, 0.0, 0.0, 0.0)
+    if "angle" in values:
+        attitude = turn((0.0, 0.0, 1.0), ANGLE)
+    if "rotation" in values:
+        size = np.linalg.norm(VECTOR)
+        attitude = turn(VECTOR / size, size)
+    if kind is spatial.Planar:
+        # Its directions are those that the compiled joint has.
+        x = np.asarray(mb.parameters(system)["joint.x_a"])
+        position = values["displacement"][0] * x + values["displacement"][1] * np.cross((0.0, 0.0, 1.0), x)
+    elif kind is not spatial.Spherical:
+        position = np.array([0.0, 0.0, SHIFT])
+    np.testing.assert_allclose(state.q[:3], position, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(jnp.abs(jnp.asarray(attitude) @ state.q[3:]), 1.0, rtol=0, atol=1e-13)
+
+
+def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
+    def entries(angle):
+        state = mb.assemble(arm, fix={"hip.angle": angle}, rates={"hip.angle": 2.0}, throw=False)
+        return jnp.concatenate([state.q, state.u])
+
+    forward, reverse = jax.jit(jax.jacfwd(entries))(0.4), jax.jit(jax.jacrev(entries))(0.4)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-12)
+    both = jax.jit(jax.vmap(entries))(jnp.array([0.4 + 1e-4, 0.4 - 1e-4]))
+    np.testing.assert_allclose(forward, (both[0] - both[1]) / 2e-4, rtol=0, atol=1e-6)
+
+
+def test_equilibrium_with_an_angle_that_is_held():
+    """Two rods hang from a pin; the first is held, the second hangs straight down."""
+    rod = lambda name, x: planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0))
+    joints = [
+        planar.Revolute("pin", "ground", "one", point=(0.0, 0.0)),
+        planar.Revolute("elbow", "one", "two", point=(1.0, 0.0)),
+    ]
+    system = mb.Scene([rod("one", 0.5), rod("two", 1.5)], joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+    guess = mb.assemble(system, fix={"pin.angle": -0.3, "elbow.angle": -1.0})
+    state = mb.equilibrium(system, guess, fix={"pin.angle": -0.3})
+    np.testing.assert_allclose(state.q[np.array([2, 5])], [-0.3, -np.pi / 2], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fix": {"hip.angel": 0.3}}, "did you mean 'hip.angle'"),
+        ({"fix": {"hip.angle": [0.3, 0.1]}}, "Coordinate 'hip.angle'"),
+        ({"rates": {"knee.angle": 0.3}}, "'knee.angle'"),
+        ({"rates": {"knee.angle_a": "fast"}}, "Rate 'knee.angle_a'"),
+    ],
+)
+def test_coordinates_of_joints_that_are_not_there(arm, options, message):
+    with pytest.raises(ValueError, match=message):
+        mb.assemble(arm, **options)
+
+
+def test_a_joint_says_which_coordinates_it_has(arm):
+    motion = mb.simulate(arm, mb.assemble(arm), t1=0.01)
+    with pytest.raises(AttributeError, match="'knee' has angle_a, angle_a_acceleration, angle_a_rate, angle_b"):
+        _ = motion["knee"].angle
+    with pytest.raises(ValueError, match="Unknown body or joint 'hips'"):
+        _ = motion["hips"]
