@@ -23,6 +23,7 @@ from .parts.functions import (
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
 )
+from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
 from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
 from .scene import Scene as Scene

@@ -22,6 +22,7 @@ from .parts.base import (
 from .parts.boundary import check_kernels
 from .parts.fields import anonymous, declarations
 from .parts.forces import Gravity
+from .parts.joint_parts import AbstractCoordinatePart
 from .parts.names import unknown
 from .parts.planar.kinematics import PLANE
 from .parts.servo import Servo
@@ -40,6 +41,9 @@ from .system.groups import (
     stack,
 )
 from .system.layout import Layout
+
+# Parts that act on a joint, given by its name.
+_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart)
 
 
 class Scene(eqx.Module):
@@ -89,10 +93,14 @@ class Scene(eqx.Module):
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         gravity, parts, laws, joints = None, [], [], {}
-        for part in (*self.joints, *self.forces):
+        # Parts of joints after the joints that they act on.
+        for part in sorted((*self.joints, *self.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
             if isinstance(part, AbstractNonIdeal):
                 joint, own = joints[part.joint]
                 laws.append((part.resolve(space, joint, given[list(own)]), own))
+            elif isinstance(part, AbstractCoordinatePart):
+                joint, own = joints[part.joint_name]
+                parts.append((part.of_joint(joint).resolve(space, given[list(own)]), own))
             elif isinstance(part, AbstractLink):
                 own = tuple(index[name] for name in part.bodies)
                 poses = given[list(own)]
@@ -178,11 +186,13 @@ def _check_names(scene: Scene):
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
-    joints = dict.fromkeys(part.name for part in scene.joints if isinstance(part, kinds))
+    is_joint = lambda part: isinstance(part, kinds) and not isinstance(part, AbstractCoordinatePart)
+    joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
     for part in (*scene.joints, *scene.forces):
-        if isinstance(part, AbstractNonIdeal):
-            if part.joint not in joints:
-                raise ValueError(f"{part.label}: {unknown('joint', part.joint, joints)}")
+        if isinstance(part, _OF_JOINTS):
+            joint = part.joint if isinstance(part, AbstractNonIdeal) else part.joint_name
+            if joint not in joints:
+                raise ValueError(f"{part.label}: {unknown('joint', joint, joints)}")
         elif isinstance(part, AbstractLink):
             for name in part.bodies:
                 if name not in known:

@@ -45,8 +45,8 @@ class Declaration:
     **Fields:**
 
     - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
-        several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"state"` for
-        a number of the initial guess, which is not a parameter.
+        several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
+        another part of the scene, `"state"` for a number of the initial guess, which is not a parameter.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
@@ -279,6 +279,11 @@ def numbers() -> Any:
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
 
 
+def part(of: Any) -> Any:
+    """Another part, which the scene fills in; its numbers are parameters under that part's own name."""
+    return _field(Declaration("part", of=of | None), default=None, kw_only=True)
+
+
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """A module whose numbers are parameters, `"part.field.number"`.
 
@@ -306,20 +311,26 @@ def anonymous(part: Any) -> Any:
             value = ("",) * len(value)
         elif kind == "state":
             value = None
-        elif kind == "law" and hasattr(value, "bodies"):
-            value = anonymous(value)
+        elif kind == "part" or (kind == "law" and hasattr(value, "bodies")):
+            value = None if value is None else anonymous(value)
         object.__setattr__(out, field, value)
     return out
 
 
+def parts_of(part: Any) -> tuple[str, ...]:
+    """The fields that hold other parts."""
+    return tuple(name for name, own in declarations(type(part)).items() if own.kind == "part")
+
+
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
-    """For every parameter of a part: its path of keys, the same path without the names of dictionaries, as in the
-    parameter's name, and its declaration, which for an entry of a dictionary says nothing.
+    """For every parameter of a part, without those of other parts that it holds: its path of keys, the same path
+    without the names of dictionaries, as in the parameter's name, and its declaration, which for an entry of a
+    dictionary says nothing.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
         own = declared.get(field, _ANY_NUMBER)
-        if own.kind != "state":
+        if own.kind not in ("state", "part"):
             yield from _paths(getattr(part, field), (field,), (field,), own)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
-from ..parts.fields import anonymous, entry
+from ..parts.fields import anonymous, entry, parts_of
 from ..parts.series import AbstractSignal
 from ..parts.space import AbstractSpace
 from .layout import Layout
@@ -33,7 +33,7 @@ class Input(eqx.Module):
 
 class Group(eqx.Module):
     """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
-    numbers by functions of time.
+    numbers by functions of time; `inner`: for each field that holds another part, the names of those parts.
     """
 
     part: Any
@@ -41,6 +41,7 @@ class Group(eqx.Module):
     bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     layout: Layout = eqx.field(static=True)
     inputs: tuple[Input, ...] = ()
+    inner: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True, default=())
 
     def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
         """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
@@ -87,19 +88,23 @@ def stack(
     group.
     """
     groups: dict[Any, list] = {}
+    fields: dict[Any, tuple[str, ...]] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
         if key not in groups and check is not None:
             check(part, layout.space, len(bodies))
-        groups.setdefault(key, []).append((leaves, part.name, bodies))
+        inner = [getattr(part, field).name for field in parts_of(part)]
+        groups.setdefault(key, []).append((leaves, part.name, bodies, inner))
+        fields[key] = parts_of(part)
     out = []
-    for (structure, _, _), members in groups.items():
+    for key, members in groups.items():
         # NumPy, since XLA would compile a program for thousands of operands.
         columns = zip(*(member[0] for member in members), strict=True)
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
-        out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout))
+        inner = tuple((field, tuple(m[3][k] for m in members)) for k, field in enumerate(fields[key]))
+        out.append(Group(jtu.tree_unflatten(key[0], leaves), names, bodies, layout, inner=inner))
     return tuple(out)
 
 

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar
-from ..parts.held_coordinate import HeldCoordinate
+from ..parts.joint_parts import JointDriver
 from .equation import AbstractSystem
 from .groups import ConstraintGroup, Group
 from .layout import Layout
@@ -101,9 +101,15 @@ def held_groups(
     for name, value in values.items():
         own = known[name]
         group = groups[own.group].group
-        start = jnp.asarray(t, value.dtype)
-        rows = math.prod(own.shape)
-        part = HeldCoordinate(name, group.single(own.member, t), own.field, value, rates[name], start, rows)
+        part = JointDriver(
+            name,
+            name,
+            joint=group.single(own.member, t),
+            within=own.field,
+            value=value - rates[name] * jnp.asarray(t, value.dtype),
+            rate=rates[name],
+            rows=math.prod(own.shape),
+        )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)
         out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout)))
     return tuple(out)

@@ -26,10 +26,15 @@ def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumb
     """Every parameter of some groups, which are given by the name of the system's field that holds them."""
     for kind, of_kind in groups.items():
         for g, group in enumerate(of_kind):
-            own = [(keys, ".".join(shown), declared) for keys, shown, declared in paths(group.group.part)]
-            for k, name in enumerate(group.group.names):
-                for keys, field, declared in own:
-                    yield StackedNumber(f"{name}.{field}", kind, g, keys, k, declared)
+            # Numbers of another part that these parts hold keep the name of that part.
+            stacked = group.group
+            sources = [((), stacked.part, stacked.names)]
+            sources += [((field,), getattr(stacked.part, field), names) for field, names in stacked.inner]
+            for prefix, part, names in sources:
+                own = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
+                for k, name in enumerate(names):
+                    for keys, field, declared in own:
+                        yield StackedNumber(f"{name}.{field}", kind, g, keys, k, declared)
 
 
 def parameter_paths(

@@ -1,0 +1,142 @@
+"""Springs, forces and prescribed motions of a joint's own coordinate, such as `"hip.angle"`."""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from . import fields
+from .base import AbstractConstraint, AbstractForce, AbstractLink, AbstractPotentialForce
+from .forces import generalized_force
+from .names import unknown
+
+
+class AbstractCoordinatePart(AbstractLink):
+    """A part that acts on a coordinate of a joint, in the plane or in space.
+
+    **Fields:** `coordinate`: `"joint.coordinate"`, a coordinate that the joint's class documents. A scene fills in the
+    `joint`, whose numbers keep the joint's name, and the coordinate's name `within` it.
+    """
+
+    name: str = fields.name()
+    coordinate: str = fields.name()
+    joint: Any = fields.part(AbstractConstraint)
+    within: str = eqx.field(static=True, default="", kw_only=True)
+
+    @property
+    def joint_name(self) -> str:
+        """The name of the joint."""
+        return self.coordinate.split(".")[0]
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return () if self.joint is None else self.joint.bodies
+
+    def of_joint(self, joint: AbstractLink) -> Any:
+        """The same part with its joint.
+
+        **Raises:** `ValueError` if the joint has no such coordinate; see its class for those that it has.
+        """
+        return self.with_fields(joint=joint, within=self.coordinate.partition(".")[2])
+
+    def complete(self, space, poses):
+        known = self.joint.coordinates(space, poses) if isinstance(self.joint, AbstractConstraint) else {}
+        if self.within not in known:
+            names = [f"{self.joint_name}.{own}" for own in known]
+            if not names:
+                raise ValueError(f"{self.label}: {self.joint.label} has no coordinate of its own.")
+            raise ValueError(f"{self.label}: {unknown('coordinate', self.coordinate, names)}")
+        return self.with_numbers(np.asarray(known[self.within]))
+
+    @abc.abstractmethod
+    def with_numbers(self, given: np.ndarray) -> Any:
+        """A checked copy with omitted numbers filled in, from the coordinate at the given poses."""
+
+    def measured(self, space, poses) -> Float[Array, "n"]:
+        """The coordinate, raveled."""
+        return self.joint.coordinates(space, poses)[self.within].reshape(-1)
+
+    def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """`value − target`; of angles that are known up to full turns the smallest such difference."""
+        out = value - target.reshape(-1)
+        if self.within in self.joint.periodic:
+            out = out - 2 * np.pi * lax.stop_gradient(jnp.round(out / (2 * np.pi)))
+        return out
+
+    def _check_shape(self, field: str, given: np.ndarray) -> None:
+        shape = np.shape(getattr(self, field))
+        if shape != given.shape:
+            raise ValueError(
+                f"{self.label}: {field} must have the shape of {self.coordinate!r}, {given.shape}, got {shape}."
+            )
+
+
+class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
+    """A linear spring and damper on a coordinate: generalized force `−stiffness (value − free) − damping rate`.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
+    ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
+    spring of an angle takes the shortest way to it, up to half a turn.
+    """
+
+    stiffness: fields.Number = fields.parameter(unit="N m/rad, N/m", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad, N s/m", sign="non-negative", default=0.0)
+    free: fields.Number = fields.parameter(shape=None, unit="rad, m", optional=True)
+
+    def with_numbers(self, given):
+        part = self.filled(free=given)
+        part._check_shape("free", given)
+        return part
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: -self.stiffness * self.difference(x, self.free) - self.damping * v
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+    def energy(self, space, poses, t):
+        return 0.5 * self.stiffness * jnp.sum(self.difference(self.measured(space, poses), self.free) ** 2)
+
+
+class JointForce(AbstractCoordinatePart, AbstractForce):
+    """A force along a coordinate, or a moment about it, with its reaction on the other body: a motor on a hinge.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m of an angle, N of a displacement], of the
+    coordinate's shape, positive where it increases the coordinate. As an input of `simulate`, `"motor.force"` is a
+    function of time.
+    """
+
+    force: fields.Number = fields.parameter(shape=None, unit="N m, N")
+
+    def with_numbers(self, given):
+        self._check_shape("force", given)
+        return self
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: self.force.reshape(-1)
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+
+class JointDriver(AbstractCoordinatePart, AbstractConstraint):
+    """A coordinate that is prescribed, `value + rate t`. Rows: one for each of its components.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `value` [rad, m], default that at the given poses; `rate`
+    [rad/s, m/s], default zero; both of the coordinate's shape. As an input of `simulate`, `"drive.value"` is any
+    function of time.
+    """
+
+    value: fields.Number = fields.parameter(shape=None, unit="rad, m", optional=True)
+    rate: fields.Number = fields.parameter(shape=None, unit="rad/s, m/s", optional=True)
+    rows: int = eqx.field(static=True, default=1, kw_only=True)
+    rheonomic: ClassVar[bool] = True
+
+    def with_numbers(self, given):
+        part = self.filled(value=given, rate=np.zeros_like(given))
+        part._check_shape("value", given)
+        part._check_shape("rate", given)
+        return part.with_fields(rows=given.size)
+
+    def residual(self, space, poses, t):
+        return self.difference(self.measured(space, poses), self.value + self.rate * t)

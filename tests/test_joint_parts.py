@@ -1,0 +1,154 @@
+"""Springs, forces and prescribed motions of the own coordinates of joints."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+
+J = np.diag([0.02, 0.09, 0.07])
+
+
+def pendulums(*parts, joints=()):
+    """Two rods in the plane on pins, along x at the given poses."""
+    rod = lambda name, x: planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0))
+    pins = [
+        planar.Revolute("hip", "ground", "thigh", point=(0.0, 0.0)),
+        planar.Revolute("knee", "thigh", "shank", point=(1.0, 0.0)),
+    ]
+    forces = [mb.Gravity((0.0, -9.81)), *parts]
+    return mb.Scene([rod("thigh", 0.5), rod("shank", 1.5)], joints=[*joints, *pins], forces=forces).compile()
+
+
+def hinged(*parts, joints=()):
+    """A body on a hinge about y, and one on a slide along it."""
+    bodies = [spatial.Body("arm", mass=1.0, inertia=J, position=(0.5, 0.0, 0.0)), spatial.PointMass("bead", mass=0.3)]
+    own = [
+        spatial.Revolute("hip", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
+        spatial.PointOnLine("slide", "ground", "bead", point=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0)),
+    ]
+    return mb.Scene(bodies, joints=[*joints, *own], forces=[mb.Gravity((0.0, 0.0, -9.81)), *parts]).compile()
+
+
+def forces_of(system, q, u):
+    return system.force(jnp.zeros(()), q, u)
+
+
+def test_a_spring_of_an_angle_is_a_torsional_spring_in_the_plane():
+    own = pendulums(mb.JointSpring("spring", "knee.angle", stiffness=3.0, damping=0.4, free=0.2))
+    other = pendulums(
+        planar.TorsionalSpringDamper("spring", "thigh", "shank", stiffness=3.0, damping=0.4, free_angle=0.2)
+    )
+    random = np.random.default_rng(0)
+    q, u = jnp.asarray(random.normal(size=6)), jnp.asarray(random.normal(size=6))
+    np.testing.assert_allclose(forces_of(own, q, u), forces_of(other, q, u), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(own.potential_energy(0.0, q), other.potential_energy(0.0, q), rtol=0, atol=1e-12)
+    assert {"spring.stiffness", "spring.damping", "spring.free"} < set(mb.parameters(own))
+    assert not any(name.startswith("spring.joint") for name in mb.parameters(own))
+
+
+def test_a_spring_of_an_angle_is_a_torsional_spring_in_space():
+    own = hinged(mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.4, free=-0.3))
+    other = hinged(
+        spatial.TorsionalSpringDamper(
+            "spring", "ground", "arm", axis=(0.0, 1.0, 0.0), stiffness=3.0, damping=0.4, free_angle=-0.3
+        )
+    )
+    for angle, rate in ((0.4, 1.0), (-1.9, -2.0), (2.5, 0.3)):
+        state = mb.assemble(own, fix={"hip.angle": angle}, rates={"hip.angle": rate})
+        found, expected = (forces_of(system, state.q, state.u) for system in (own, other))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_springs_on_many_joints_are_one_group():
+    springs = [mb.JointSpring(f"spring {j}", f"{j}.angle", stiffness=k) for j, k in (("hip", 1.0), ("knee", 2.0))]
+    system = pendulums(*springs)
+    assert len(system.forces) == 1 and mb.parameters(system)["spring knee.stiffness"] == 2.0
+
+
+def test_a_change_of_the_joint_reaches_its_spring():
+    """The axis that the spring of a displacement acts along is that of the joint."""
+    system = hinged(mb.JointSpring("spring", "slide.displacement", stiffness=2.0, free=0.0))
+    turned = mb.with_parameters(system, {"slide.axis_a": (0.0, 0.0, 1.0)})
+    q = system.guess.q.at[7:].set(jnp.array([0.3, 0.0, 0.5]))
+    u = jnp.zeros(9)
+    change = forces_of(turned, q, u)[6:] - forces_of(system, q, u)[6:]
+    np.testing.assert_allclose(change, [0.6, 0.0, -1.0], rtol=0, atol=1e-14)
+
+
+def test_a_motor_on_a_hinge_does_its_work():
+    """The power of a moment is that times the rate of the angle."""
+    motor = mb.JointForce("motor", "knee.angle", force=0.0)
+    system = pendulums(motor)
+    ts = jnp.linspace(0.0, 0.5, 201)
+    torque = lambda t: 2.0 + jnp.sin(9.0 * t)
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=ts, rtol=1e-11, inputs={"motor.force": torque})
+    power = jax.vmap(torque)(ts) * motion["knee"].angle_rate
+    work = jnp.sum((power[1:] + power[:-1]) / 2 * jnp.diff(ts))
+    assert motion.energy[-1] - motion.energy[0] == pytest.approx(float(work), rel=1e-4)
+
+
+def test_a_driven_joint_may_stand_before_the_joint_it_drives():
+    drive = mb.JointDriver("drive", "knee.angle", rate=1.5)
+    system = pendulums(joints=[drive])
+    start = mb.assemble(system)
+    motion = mb.simulate(system, start, t1=0.8, saveat=np.linspace(0.0, 0.8, 5))
+    np.testing.assert_allclose(motion["knee"].angle, 1.5 * motion.ts, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion["knee"].angle_rate, 1.5, rtol=0, atol=1e-12)
+    # Its multiplier is the moment that drives: power into the machine is the change of its energy.
+    np.testing.assert_allclose(system.describe().tables["joints"][-1][1], "drive")
+
+
+def test_a_hinge_that_is_driven_through_two_turns_in_space():
+    system = hinged(joints=[mb.JointDriver("drive", "hip.angle", value=0.1, rate=8.0)])
+    motion = mb.simulate(system, mb.assemble(system), t1=1.7, saveat=np.linspace(0.0, 1.7, 35))
+    np.testing.assert_allclose(motion["hip"].angle, 0.1 + 8.0 * motion.ts, rtol=0, atol=1e-11)
+
+
+@pytest.mark.long
+def test_derivatives_by_all_numbers_of_parts_of_joints():
+    parts = [
+        mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.2),
+        mb.JointForce("push", "slide.displacement", force=0.7),
+    ]
+    system = hinged(*parts)
+    names = ["spring.stiffness", "spring.damping", "spring.free", "push.force"]
+    values = {name: mb.parameters(system)[name] for name in names}
+
+    def end(values, rtol=1e-9, adjoint=None):
+        changed = mb.with_parameters(system, values)
+        motion = mb.simulate(changed, mb.assemble(changed), t1=0.7, rtol=rtol, adjoint=adjoint)
+        return jnp.stack([motion.quantity("hip.angle")[-1], motion.quantity("slide.displacement")[-1]])
+
+    forward = jax.jit(jax.jacfwd(lambda x: end(x, adjoint=diffrax.ForwardMode())))(values)
+    reverse = jax.jit(jax.jacrev(end))(values)
+    tight = jax.jit(lambda x: end(x, rtol=1e-12))
+    for name in names:
+        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-7, atol=1e-10)
+        moved = [tight(values | {name: values[name] + h}) for h in (1e-4, -1e-4)]
+        np.testing.assert_allclose(forward[name], (moved[0] - moved[1]) / 2e-4, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (mb.JointSpring("s", "hop.angle", stiffness=1.0), "JointSpring 's': Unknown joint 'hop'"),
+        (mb.JointSpring("s", "hip.angel", stiffness=1.0), "JointSpring 's': Unknown coordinate 'hip.angel'"),
+        (mb.JointSpring("s", "hip.angle", stiffness=-1.0), "stiffness must be non-negative"),
+        (mb.JointForce("s", "hip.angle", force=[1.0, 2.0]), r"force must have the shape of 'hip.angle', \(\)"),
+        (mb.JointForce("s", "hip", force=1.0), "Unknown coordinate 'hip'"),
+    ],
+)
+def test_parts_of_joints_that_cannot_be(part, message):
+    with pytest.raises(ValueError, match=message):
+        pendulums(part)
+
+
+def test_a_joint_without_a_coordinate_of_its_own():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    weld = planar.Fixed("weld", "ground", "body", point=(0.0, 0.0))
+    with pytest.raises(ValueError, match="Fixed 'weld' has no coordinate of its own"):
+        mb.Scene([body], joints=[weld], forces=[mb.JointForce("f", "weld.angle", force=1.0)]).compile()
