@@ -13,6 +13,7 @@ from .._types import Scalar, State
 from ..system import AbstractGeneralizedSystem, DenseInertia, DiagonalInertia
 from ..system.describe import count_independent, count_rows, shorten, specialised_constraints
 from ..system.description import Description
+from ..system.design_variables import DesignVariables, description_rows
 from ..system.equation import ParameterPath
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics
@@ -58,6 +59,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     length: Float[Array, ""]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
+    design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]
 
@@ -265,6 +267,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         tables = {
             "constraints": tuple((type(c).__name__, c.name, f"{n} row{'s' * (n > 1)}") for c, n in sizes),
             "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
+            "design variables": tuple(description_rows(self.design)),
         }
         specialised = specialised_constraints(self)
         if self.diagonal:

@@ -6,6 +6,8 @@ from ..linalg.inertia import (
     DenseInertia as DenseInertia,
     DiagonalInertia as DiagonalInertia,
 )
+from .design import design as design
+from .design_variables import Variable as Variable
 from .equation import AbstractSystem as AbstractSystem
 from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
 from .parameters import parameters as parameters, with_parameters as with_parameters
