@@ -28,6 +28,7 @@ from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
+from .states.gap import assembly_gap as assembly_gap
 from .studies.identify import Identification as Identification, identify as identify
 from .system import (
     RigidBodySystem as RigidBodySystem,
