@@ -109,8 +109,8 @@ def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     # A constraint without a gradient, such as a gap that is closed, balances nothing.
     gradients = np.where(active[:, None], trial.jacobian[1:], 0.0)[:, ~at_bound]
     found = np.linalg.lstsq(gradients.T, trial.jacobian[0, ~at_bound], rcond=1e-10)[0] if active.any() else 0.0 * values
-    equal = low == high
-    return np.where(equal, np.abs(found), np.where(below, found, -found)) * active, active
+    signed = np.where(below, found, -found)
+    return np.where(active, np.where(low == high, np.abs(found), signed), 0.0) + 0.0, active
 
 
 def _one_sided(trials: Trials) -> list[dict[str, Any]]:

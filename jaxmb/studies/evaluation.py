@@ -40,15 +40,15 @@ class Program(eqx.Module):
         """All outputs by name."""
         options = {"adjoint": diffrax.ForwardMode() if self.forward else None} if self.takes_adjoint else {}
         out = self.function(self.space(z), **options)
-        return {name: jnp.asarray(x, z.dtype) for name, x in (out if isinstance(out, Mapping) else {OBJECTIVE: out}).items()}
+        return {
+            name: jnp.asarray(x, z.dtype) for name, x in (out if isinstance(out, Mapping) else {OBJECTIVE: out}).items()
+        }
 
     def rows(self, z: Float[Array, "n"]) -> tuple[Float[Array, "rows"], dict[str, Array]]:
         out = self.outputs(z)
         return jnp.concatenate([out[name].reshape(-1) for name in self.names]), out
 
-    def linearised(
-        self, z: Float[Array, "n"]
-    ) -> tuple[Float[Array, "rows"], Float[Array, "rows n"], dict[str, Array]]:
+    def linearised(self, z: Float[Array, "n"]) -> tuple[Float[Array, "rows"], Float[Array, "rows n"], dict[str, Array]]:
         """Rows, their Jacobian, and all outputs."""
 
         def rows(z):
@@ -152,7 +152,9 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
             raise unknown("output", name, shapes)
         sides = given if isinstance(given, tuple) else (given, given)
         if len(sides) != 2 or all(side is None for side in sides):
-            raise ValueError(f"The constraint of {name!r} must be (low, high), one of them None at most; got {given!r}.")
+            raise ValueError(
+                f"The constraint of {name!r} must be (low, high), one of them None at most; got {given!r}."
+            )
         low, high = (_side(name, side, shapes[name], e) for side, e in zip(sides, (-np.inf, np.inf), strict=True))
         if np.any(low > high):
             raise ValueError(f"The constraint of {name!r} must be (low, high) with low ≤ high, got {given!r}.")

@@ -99,7 +99,9 @@ class Optimum:
         rows = [("parameter", "start", "optimum")]
         for name, value in self.parameters.items():
             own = component_names(name, value.shape)
-            rows += [(n, f"{a:.6g}", f"{b:.6g}") for n, a, b in zip(own, self.start[name].flat, value.flat, strict=True)]
+            rows += [
+                (n, f"{a:.6g}", f"{b:.6g}") for n, a, b in zip(own, self.start[name].flat, value.flat, strict=True)
+            ]
         rows += [(), ("output", "before", "after")]
         for name, value in self.outputs.items():
             if value.ndim == 0:
@@ -146,12 +148,13 @@ def optimise(
     """Find the values of named parameters that make an objective smallest, with constraints on named outputs.
 
     ```python
-    def ride(v, adjoint=None):
+    def drive(v, adjoint=None):
         s = mb.with_parameters(vehicle, v)
         motion = mb.simulate(s, start(s), t1=1.5, saveat=ts, adjoint=adjoint, throw=False)
         return {"comfort": ride.vertical_rms(motion), "travel": jnp.abs(ride.arm_travel(motion)).max(axis=0)}
 
-    best = mb.optimise(ride, ["bar", "damper"], system=vehicle, objective="comfort", constraints={"travel": (None, 0.3)})
+    limits = {"travel": (None, 0.3)}
+    best = mb.optimise(drive, ["bar", "damper"], system=vehicle, objective="comfort", constraints=limits)
     ```
 
     **Arguments:**
@@ -259,7 +262,11 @@ def _check(method: Any, limited: Limits, starts: Any, local: Any, max_iterations
         raise ValueError(f"method must be {', '.join(map(repr, known))} or an optax optimiser, got {method!r}.")
     if limited.components and method not in known[:2]:
         raise ValueError("Constraints need method='slsqp' or 'trust-constr'.")
-    for name, value in (("starts", starts), ("max_iterations", max_iterations), ("local", 1 if local is None else local)):
+    for name, value in (
+        ("starts", starts),
+        ("max_iterations", max_iterations),
+        ("local", 1 if local is None else local),
+    ):
         if not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
     if local is not None and local > starts:
@@ -304,7 +311,9 @@ def _best_starts(program: Program, limited: Limits, starts: int, local: int, see
     if not good.any():
         return []
     typical = np.median(np.abs(rows[good, 1:]), axis=0)
-    excess = np.array([np.max(limited.excess(r) / np.where(typical > 0, typical, 1.0), initial=0.0) for r in rows[:, 1:]])
+    excess = np.array(
+        [np.max(limited.excess(r) / np.where(typical > 0, typical, 1.0), initial=0.0) for r in rows[:, 1:]]
+    )
     order = np.lexsort((rows[:, 0], np.where(excess > HOLDS, excess, 0.0), ~good))
     return [np.asarray(z[k], float) for k in order[:local] if good[k]]
 
@@ -334,7 +343,9 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
         raise ValueError(f"{what}, and no constraint that is violated leads away from it. {cure}")
     found, spent = first_feasible(part, lambda z: evaluate(program, z), kept, first.z, box, most)
     if found is None:
-        raise ValueError(f"{what}, and {spent} trials that made {', '.join(finite)} small found no start that is. {cure}")
+        raise ValueError(
+            f"{what}, and {spent} trials that made {', '.join(finite)} small found no start that is. {cure}"
+        )
     return found, spent
 
 
@@ -342,5 +353,3 @@ def _rows(trial: Trial, names: Sequence[str]) -> np.ndarray:
     if trial.outputs:
         return np.concatenate([np.ravel(trial.outputs[name]) for name in names])
     return trial.rows
-
-

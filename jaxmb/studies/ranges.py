@@ -118,8 +118,9 @@ def free_parameters(
     """Free parameters with their starting values and ranges.
 
     **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
-    `(low, high)` by name, either of them None; default those of design variables. The system's `positive_parameters`, such as masses and moments of
-    inertia of bodies, stay positive without bounds, or positive definite if they are matrices.
+    `(low, high)` by name, either of them None; default those of design variables. The system's `positive_parameters`,
+    such as masses and moments of inertia of bodies, stay positive without bounds, or positive definite if they are
+    matrices.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
     bounds.

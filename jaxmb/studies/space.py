@@ -57,7 +57,9 @@ class Space(eqx.Module):
 
     def components(self) -> list[str]:
         """The names of all components: `"A.point_b[0]"`."""
-        return [name for own, shape in zip(self.names, self.shapes, strict=True) for name in component_names(own, shape)]
+        return [
+            name for own, shape in zip(self.names, self.shapes, strict=True) for name in component_names(own, shape)
+        ]
 
     def unbounded(self) -> FreeParameters:
         """The same parameters as a function of a vector that may take any value; zero at the start.
@@ -120,7 +122,9 @@ def space(
         start = (start,)
     if not isinstance(start, Mapping):
         if system is None:
-            raise ValueError(f"Give starting values by name, or with names alone the system= they are from; got {start!r}.")
+            raise ValueError(
+                f"Give starting values by name, or with names alone the system= they are from; got {start!r}."
+            )
         for name in start:
             if name not in known:
                 raise unknown("parameter", name, known)
@@ -153,7 +157,9 @@ def _bounds(name: str, given: Any, value: np.ndarray) -> tuple[np.ndarray, np.nd
         raise ValueError(f"The bounds of {name!r} must be a pair (low, high), either of them None; got {given!r}.")
     shapes = ((), value.shape)
     sides = [
-        np.broadcast_to(real_array(f"A bound of {name!r}", empty if bound is None else bound, value.dtype, shapes), value.shape)
+        np.broadcast_to(
+            real_array(f"A bound of {name!r}", empty if bound is None else bound, value.dtype, shapes), value.shape
+        )
         for bound, empty in zip(given, (-np.inf, np.inf), strict=True)
     ]
     low, high = (np.where(np.isnan(side), empty, side) for side, empty in zip(sides, (-np.inf, np.inf), strict=True))

@@ -167,4 +167,3 @@ def first_feasible(
 
 def _padded(jacobian: np.ndarray) -> np.ndarray:
     return np.vstack([np.zeros((1, jacobian.shape[1])), jacobian])
-

@@ -121,7 +121,9 @@ def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Arra
             raise unknown("parameter", name, known)
         shape = real_shape(f"The derived parameter {name!r}", value)
         if shape != known[name].shape:
-            raise ValueError(f"The derived parameter {name!r} has shape {shape}, but {known[name].shape} in the system.")
+            raise ValueError(
+                f"The derived parameter {name!r} has shape {shape}, but {known[name].shape} in the system."
+            )
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"The derived parameter {name!r} is not finite: {np.asarray(value)}.")
     program = jax.make_jaxpr(own.derive)(dict(own.values)).jaxpr

@@ -54,9 +54,10 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
             raise unknown("parameter", name, [*paths, *variables])
         for own in system.design:
             if name in own.derived:
-                several = "s" * (len(own.values) > 1)
+                several = "s" * (len(own.variables) > 1)
+                names = ", ".join(variable for variable, _ in own.variables)
                 raise ValueError(
-                    f"Parameter {name!r} follows from the design variable{several} {', '.join(own.values)}; set "
+                    f"Parameter {name!r} follows from the design variable{several} {names}; set "
                     f"{'those' if several else 'that'} instead."
                 )
     given, design = dict(values), []
