@@ -45,7 +45,9 @@ def four_bar(lengths, scale, angle):
 
 
 def path_error(system, state, target, v, angles):
-    """Squared distances of the coupler's point from a target at crank angles, one after the other; and the gap."""
+    """Squared distances of the coupler's point from a target at crank angles, one after the other; the gap, and the sine
+    of the angle between coupler and rocker, which is zero where the linkage is about to open.
+    """
     own = mb.parameters(system)
     system = mb.with_parameters(system, {name: x for name, x in v.items() if name in own})
 
@@ -53,12 +55,13 @@ def path_error(system, state, target, v, angles):
         fix = {"crank.angle": angle}
         new = mb.assemble(system, guess, fix=fix, throw=False)
         ahead = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(new), old, new), new, guess)
-        return ahead, (new.q[3:6], mb.assembly_gap(system, guess, fix=fix))
+        transmission = jnp.abs(jnp.sin(new.q[8] - new.q[5]))
+        return ahead, (new.q[3:6], mb.assembly_gap(system, guess, fix=fix), transmission)
 
-    _, (coupler, gap) = jax.lax.scan(turn, state, angles + v.get("tilt", jnp.zeros(())))
+    _, (coupler, gap, transmission) = jax.lax.scan(turn, state, angles + v.get("tilt", jnp.zeros(())))
     point = jnp.stack([v["point"][0] - 0.5 * v["coupler"], v["point"][1]])
     path = coupler[:, :2] + jax.vmap(turned, (0, None))(coupler[:, 2], point)
-    return {"error": jnp.sum((path - target) ** 2), "gap": jnp.sum(gap)}
+    return {"error": jnp.sum((path - target) ** 2), "gap": jnp.sum(gap), "transmission": transmission}
 
 
 def closed_form_error(target, lengths, point, place, tilt, angles):
@@ -86,16 +89,16 @@ def evolved(objective, bounds, size, generations=1000):
 
 @pytest.mark.long
 def test_four_bar_through_a_line():
-    """Six points of a vertical line without timing: every point is met exactly, better than by evolution."""
+    """Six points of a vertical line without timing, with a bound of the transmission angle."""
     system, state = four_bar((35.0, 15.0, 30.0, 30.0), 20.0, 0.5)
-    start = {"base": 35.0, "crank": 15.0, "coupler": 12.0, "rocker": 9.0, "place": [0.0, 20.0], "tilt": 0.0}
-    start |= {"point": [10.0, 10.0], "angles": np.linspace(0.5, 2.0, 6)}
+    start = {"base": 35.0, "crank": 15.0, "coupler": 12.0, "rocker": 9.0, "place": [40.0, 20.0], "tilt": 0.0}
+    start |= {"point": [10.0, 10.0], "angles": np.linspace(2.0, 0.8, 6)}
     bounds = dict.fromkeys(LENGTHS, (5.0, 60.0)) | {"point": (-60.0, 60.0)}
     best = mb.optimise(
         lambda v: path_error(system, state, LINE, v, v["angles"]),
         start,
         objective="error",
-        constraints={"gap": (None, 0)},
+        constraints={"gap": (None, 0), "transmission": (0.2, None)},
         system=system,
         bounds=bounds,
         max_iterations=500,
@@ -114,7 +117,8 @@ def test_four_bar_through_a_line():
 
     searched = evolved(objective, [(5, 60)] * 4 + [(-60, 60)] * 4 + [(0, 2 * np.pi)] * 7, 7)
     print("differential evolution", searched)
-    assert best.objective < 1e-6 and best.objective < searched
+    assert np.min(best.outputs["transmission"]) > 0.2 * (1 - 2e-6)
+    assert best.objective < 1e-3 and best.objective < searched
 
 
 @pytest.mark.long
@@ -208,7 +212,7 @@ def test_camber_curve_of_a_double_wishbone():
     print(best)
     assert best.success and np.isnan(best.before["error"])
     assert np.max(np.abs(best.outputs["toe"])) < 5.001e-3
-    assert np.max(np.abs(best.outputs["camber"] + 0.6 * travel)) < 2e-3
+    assert np.max(np.abs(best.outputs["camber"] + 0.6 * travel)) < np.deg2rad(0.2)
 
 
 @pytest.mark.long

@@ -95,8 +95,9 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
     return ended, message.strip().rstrip(".")
 
 
-def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
-    """What one unit more of each constraint's bound would gain of the objective, and which constraints are active.
+def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, float]:
+    """What one unit more of each constraint's bound would gain of the objective, which constraints are active, and the
+    largest component of the gradient of the objective that they do not balance.
 
     The multipliers are those that come closest, in least squares, to balancing the gradient of the objective with those
     of active constraints and bounds.
@@ -110,7 +111,8 @@ def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     gradients = np.where(active[:, None], trial.jacobian[1:], 0.0)[:, ~at_bound]
     found = np.linalg.lstsq(gradients.T, trial.jacobian[0, ~at_bound], rcond=1e-10)[0] if active.any() else 0.0 * values
     signed = np.where(below, found, -found)
-    return np.where(active, np.where(low == high, np.abs(found), signed), 0.0) + 0.0, active
+    left = float(np.max(np.abs(trial.jacobian[0, ~at_bound] - gradients.T @ found), initial=0.0))
+    return np.where(active, np.where(low == high, np.abs(found), signed), 0.0) + 0.0, active, left
 
 
 def _one_sided(trials: Trials) -> list[dict[str, Any]]:

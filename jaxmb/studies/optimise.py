@@ -29,6 +29,9 @@ from .unconstrained import bfgs, descend
 # Local optimisations from the best of several starts.
 _LOCAL = 4
 
+# Gradients below this, relative to that at the start, are those of an optimum.
+_BALANCED = 1e-3
+
 # Lines of the log that are printed.
 _FIRST, _LAST = 3, 9
 
@@ -77,7 +80,8 @@ class Optimum:
     - `iterations`: the log of the local optimisation that gave the result; `trials`: how often the function was
         differentiated for it, of which `failed` trials were rejected.
     - `attempts`: all local optimisations, the best first, if there were several.
-    - `success`: whether the method converged and all constraints hold, to 1e-6 of their size; `message`: how it ended.
+    - `success`: whether the method converged, at no edge beyond which trials fail, and all constraints hold, to 1e-6 of
+        their size; `message`: how it ended.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -96,7 +100,7 @@ class Optimum:
     derivatives: str
 
     def __str__(self) -> str:
-        rows = [("parameter", "start", "optimum")]
+        rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
         for name, value in self.parameters.items():
             own = component_names(name, value.shape)
             rows += [
@@ -186,7 +190,9 @@ def optimise(
     **Trials that fail**, where the mechanism cannot be assembled, the simulation fails or an output is not a number,
     are rejected: the step is shortened. **A start that fails** needs an output that tells how far it is from one that
     does not, such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`: violations of constraints
-    that have a value are made small first, until all outputs have one.
+    that have a value are made small first, until all outputs have one. A gap is zero up to the edge of what can be
+    assembled and gives no warning of it: where the best designs lie there, constrain a margin as well, such as the sine
+    of the transmission angle.
 
     **Returns:** an `Optimum`, the best of all trials whose constraints hold.
 
@@ -229,7 +235,11 @@ def optimise(
     )
     trials, _, ok, message = runs[0]
     best = trials.best
-    sizes, active = multipliers(trials, best)
+    sizes, active, unbalanced = multipliers(trials, best)
+    slope = np.max(np.abs(trials.start.jacobian[0]), initial=0.0)
+    stuck = trials.failed > 0 and unbalanced > _BALANCED * slope
+    if stuck:
+        message = f"{message}; trials fail where the objective decreases: constrain a margin from there"
     if spent:
         message = f"{message}; {spent} trials led from the start, which failed, to one that does not"
     if trials.violation(best) > HOLDS:
@@ -243,14 +253,14 @@ def optimise(
         outputs=best.outputs,
         before=before.outputs or {name: np.full(shape, np.nan) for name, shape in shapes.items()},
         constraints=tuple(
-            Constraint(name, *map(float, numbers), bool(on), float(size) if on else 0.0)
-            for name, *numbers, on, size in zip(*columns, strict=True)
+            Constraint(name, float(low), float(high), float(a), float(b), bool(on), float(size))
+            for name, low, high, a, b, on, size in zip(*columns, strict=True)
         ),
         iterations=tuple(trials.log),
         trials=trials.count,
         failed=trials.failed,
         attempts=attempts,
-        success=ok and trials.violation(best) <= HOLDS,
+        success=ok and not stuck and trials.violation(best) <= HOLDS,
         message=message,
         derivatives="forward" if program.forward else "reverse",
     )

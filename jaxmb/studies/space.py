@@ -162,7 +162,7 @@ def _bounds(name: str, given: Any, value: np.ndarray) -> tuple[np.ndarray, np.nd
         )
         for bound, empty in zip(given, (-np.inf, np.inf), strict=True)
     ]
-    low, high = (np.where(np.isnan(side), empty, side) for side, empty in zip(sides, (-np.inf, np.inf), strict=True))
+    low, high = sides
     if np.any(low >= high):
         raise ValueError(f"The bounds of {name!r} must be (low, high) with low < high, got {given}.")
     if np.any(value < low) or np.any(value > high):

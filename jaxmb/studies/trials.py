@@ -49,7 +49,7 @@ class Trials:
 
     def __init__(self, program: Program, limits: Limits, box: tuple[np.ndarray, np.ndarray], start: Trial):
         self.program, self.limits, self.box = program, limits, box
-        self.good = self.best = self.last = start
+        self.start = self.good = self.best = self.last = start
         self.count = self.failed = 0
         self.scales = constraint_scales(limits, start)
         self.log: list[Iteration] = []

@@ -83,28 +83,22 @@ def design(
 
 
 def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = None) -> dict[str, Bounds]:
-    """Bounds by name: those given, and those of the design variables for which none are given.
+    """Bounds by name: those given, and those of the design variables where none are given.
 
     **Raises:** `ValueError` for bounds that reach beyond those of a design variable.
     """
     out = dict(bounds or {})
     for own in system.design:
         for name, variable in own.variables:
-            low, high = (np.where(np.isfinite(bound), bound, np.nan) for bound in (variable.low, variable.high))
-            if name not in out:
-                present = [None if np.all(np.isnan(bound)) else bound for bound in (low, high)]
-                if present != [None, None]:
-                    out[name] = present[0], present[1]
-                continue
-            below, above = (np.nan if bound is None else np.asarray(bound) for bound in out[name])
-            beyond = np.any(np.where(np.isnan(low), False, ~(below >= low))) or np.any(
-                np.where(np.isnan(high), False, ~(above <= high))
-            )
-            if beyond:
+            low, high = out.get(name, (None, None))
+            low, high = (variable.low if low is None else low), (variable.high if high is None else high)
+            if np.any(np.asarray(low) < variable.low) or np.any(np.asarray(high) > variable.high):
                 raise ValueError(
                     f"The bounds {out[name]} of {name!r} reach beyond those of the design variable, "
-                    f"{(variable.low.tolist(), variable.high.tolist())}."
+                    f"{variable.low.tolist(), variable.high.tolist()}."
                 )
+            if name in out or np.any(np.isfinite([variable.low, variable.high])):
+                out[name] = low, high
     return out
 
 
