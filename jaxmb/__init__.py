@@ -30,9 +30,14 @@ from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
+from .states.gap import assembly_gap as assembly_gap
 from .studies.identify import Identification as Identification, identify as identify
+from .studies.optimise import Optimum as Optimum, optimise as optimise
+from .studies.robust import robust as robust
 from .system import (
     RigidBodySystem as RigidBodySystem,
+    Variable as Variable,
+    design as design,
     parameters as parameters,
     with_inputs as with_inputs,
     with_parameters as with_parameters,

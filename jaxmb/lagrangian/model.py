@@ -14,6 +14,7 @@ from ..parts.series import AbstractSignal
 from ..system import AbstractGeneralizedSystem, DenseInertia, DiagonalInertia
 from ..system.describe import count_independent, count_rows, shorten, specialised_constraints
 from ..system.description import Description
+from ..system.design_variables import DesignVariables, description_rows
 from ..system.equation import ParameterPath
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics
@@ -68,6 +69,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     inputs: dict[str, Input]
+    design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]
 
@@ -285,6 +287,7 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
         tables = {
             "constraints": tuple((type(c).__name__, c.name, f"{n} row{'s' * (n > 1)}") for c, n in sizes),
             "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
+            "design variables": tuple(description_rows(self.design)),
         }
         specialised = specialised_constraints(self)
         if self.diagonal:

@@ -21,6 +21,7 @@ from ..planar import DraftGear
 from ..system import AbstractGeneralizedSystem, AbstractInertia, DenseInertia
 from ..system.describe import count_independent, shorten, specialised_constraints
 from ..system.description import Description
+from ..system.design_variables import DesignVariables, description_rows
 from ..system.equation import ParameterPath, Ranks
 
 
@@ -76,6 +77,7 @@ class RelativeTrain(AbstractGeneralizedSystem):
     slope: Float[Array, ""]
     guess: State
     length: Float[Array, ""]
+    design: tuple[DesignVariables, ...] = ()
 
     position_rows: ClassVar[int] = 0
     coordinate_rows: ClassVar[int] = 0
@@ -97,7 +99,8 @@ class RelativeTrain(AbstractGeneralizedSystem):
             ("degrees of freedom", str(self.nu)),
             ("independent", count_independent(self)),
         )
-        return Description(facts, {}, {"specialised away": tuple(specialised_constraints(self))})
+        tables = {"design variables": tuple(description_rows(self.design))}
+        return Description(facts, tables, {"specialised away": tuple(specialised_constraints(self))})
 
     @property
     def nq(self) -> int:

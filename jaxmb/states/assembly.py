@@ -44,7 +44,7 @@ def assemble(
         coordinates, or `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
-        that one member of a batch does not spoil the others.
+        that one member of a batch does not spoil the others; `assembly_gap` says how far it is from closing.
 
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import VectorLike
 from ..parts.names import unknown
 from ..system import AbstractSystem, parameters
+from ..system.design import design_bounds
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -117,8 +118,9 @@ def free_parameters(
     """Free parameters with their starting values and ranges.
 
     **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
-    `(low, high)` by name, either of them None. The system's `positive_parameters`, such as masses and moments of
-    inertia of bodies, stay positive without bounds, or positive definite if they are matrices.
+    `(low, high)` by name, either of them None; default those of design variables. The system's `positive_parameters`,
+    such as masses and moments of inertia of bodies, stay positive without bounds, or positive definite if they are
+    matrices.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
     bounds.
@@ -132,10 +134,10 @@ def free_parameters(
         if name not in known:
             raise unknown("parameter", name, known)
     starts = free if isinstance(free, Mapping) else {name: known[name] for name in free}
-    bounds = dict(bounds or {})
-    for name in bounds:
+    for name in bounds or {}:
         if name not in starts:
             raise unknown("free parameter with bounds", name, starts)
+    bounds = design_bounds(system, bounds)
     positive = system.positive_parameters()
     ranges = [
         _range(name, value, known[name], bounds.get(name), positive=name in positive) for name, value in starts.items()

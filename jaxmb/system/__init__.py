@@ -6,6 +6,8 @@ from ..linalg.inertia import (
     DenseInertia as DenseInertia,
     DiagonalInertia as DiagonalInertia,
 )
+from .design import design as design
+from .design_variables import Variable as Variable
 from .equation import AbstractSystem as AbstractSystem
 from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
 from .inputs import with_inputs as with_inputs

@@ -18,6 +18,7 @@ from ..parts.forces import Gravity
 from .body_motion import attachments, body_motion, body_quantities, outline
 from .coordinates import coordinate_names, rate_names
 from .describe import describe_scene
+from .design_variables import DesignVariables, description_rows, in_range
 from .equation import AbstractSystem, Ranks
 from .group_inputs import signals_of, with_signals
 from .groups import (
@@ -50,7 +51,7 @@ class AbstractBodySystem(AbstractSystem):
 
     **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
     bodies; `length` [m], the scene's size; `body_names`; `elimination`, the order in which the joints are
-    eliminated, or None.
+    eliminated, or None; `design`.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -68,6 +69,7 @@ class AbstractBodySystem(AbstractSystem):
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
     elimination: EliminationOrder | None = eqx.field(static=True)
+    design: tuple[DesignVariables, ...] = ()
 
     # Sizes
 
@@ -158,7 +160,8 @@ class AbstractBodySystem(AbstractSystem):
 
     def parameters_in_range(self):
         gravity = () if self.gravity is None else (self._gravity,)
-        return are_in_range((*gravity, *map(stacked_part, itertools.chain(*self._groups.values()))))
+        parts = (*gravity, *map(stacked_part, itertools.chain(*self._groups.values())))
+        return are_in_range(parts) & in_range(self.design)
 
     @property
     def _gravity(self):
@@ -196,6 +199,7 @@ class AbstractBodySystem(AbstractSystem):
             laws=self.nonideal,
             gravity=self._gravity_name,
             implied=self.implied,
+            design=description_rows(self.design),
         )
 
     # Views of a motion

@@ -55,11 +55,13 @@ def describe_scene(
     laws: Sequence[Any],
     gravity: str | None,
     implied: Sequence[Any],
+    design: Sequence[tuple[str, str, str]] = (),
 ) -> Description:
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well.
 
     **Arguments:** `bodies`: names by kind; `joints`: groups of constraints, with a note on each kind; `forces`, `laws`:
-    groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows.
+    groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows;
+    `design`: rows on the design variables.
     """
     count = sum(map(len, bodies.values()))
     grubler = system.nu - system.velocity_rows
@@ -83,6 +85,7 @@ def describe_scene(
             *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in laws),
             *((kind(g), shorten(g.group.names), "") for g in forces),
         ],
+        "design variables": list(design),
     }
     specialised = specialised_constraints(system)
     if system.elimination is not None:

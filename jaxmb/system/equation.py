@@ -25,6 +25,7 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, EliminationOrder
 from ..parts.series import AbstractSignal
 from .description import Description
+from .design_variables import DesignVariables
 from .quantities import Quantity, Reaction
 
 if TYPE_CHECKING:
@@ -65,6 +66,8 @@ class AbstractSystem(eqx.Module):
     - `guess`: the default guess of `assemble`; `length` [m]: the scale of position residuals.
     - `rows`: for every row of A, the name of its part and its number within the part.
     - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
+    - `design`: the design variables, in the order in which they were added; those of later ones may determine earlier
+        ones.
     """
 
     nq: AbstractVar[int]
@@ -85,6 +88,7 @@ class AbstractSystem(eqx.Module):
     ranks: AbstractVar[Ranks]
     rows: AbstractVar[tuple[tuple[str, int], ...]]
     elimination: AbstractVar[EliminationOrder | None]
+    design: AbstractVar[tuple[DesignVariables, ...]]
 
     @abc.abstractmethod
     def coordinate_names(self) -> dict[str, list[int]]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..linalg.arrays import is_traced
 from ..linalg.jacobian import DenseJacobian
+from .design_variables import in_range
 from .equation import AbstractSystem
 from .quantities import Quantity
 
@@ -70,7 +71,7 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def parameters_in_range(self):
         values = [self._parameter(name) for name in sorted(self.positive_parameters())]
         traced = [jnp.all(value > 0) for value in values if is_traced(value)]
-        return jnp.all(jnp.stack(traced)) if traced else True
+        return (jnp.all(jnp.stack(traced)) if traced else True) & in_range(self.design)
 
     def _parameter(self, name):
         where, index = self.parameter_paths()[name][0]

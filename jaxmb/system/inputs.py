@@ -37,6 +37,8 @@ def with_inputs(system: System, inputs: Signals) -> System:
     for name, value in inputs.items():
         if name not in known:
             raise unknown("parameter", name, known)
+        if any(name in own.values for own in system.design):
+            raise ValueError(f"The design variable {name!r} must be constant; make a parameter an input instead.")
         signals[name] = as_signal(name, value)
         t: Any = np.zeros((), known[name].dtype)
         found = eqx.filter_eval_shape(signals[name], t)

@@ -1,4 +1,4 @@
-"""The parameters of a system by name, `"part.field"`."""
+"""The parameters of a system by name, `"part.field"`, and its design variables."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -21,13 +21,16 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
     """Every parameter of a system by name.
 
     **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the
-    shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`.
+    shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`, and the variables of
+    `design` their own names.
     """
     leaves = {}
     for name, paths in system.parameter_paths().items():
         where, index = paths[0]
         value = where(system)
         leaves[name] = value if index is None else _of(value, index)
+    for own in system.design:
+        leaves |= own.values
     return leaves
 
 
@@ -36,16 +39,36 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew.
 
-    **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones.
+    **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. Where design
+    variables are among them, all parameters that follow from them are computed anew.
 
-    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, and numbers with which the
-    scene would not compile. Under `jit`, `vmap` or a derivative the numbers are not known yet; `simulate` then ends
-    with `RESULTS.invalid_parameters`, before the first step.
+    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, numbers with which the scene
+    would not compile, design variables out of bounds, and a parameter that follows from design variables. Under `jit`,
+    `vmap` or a derivative the numbers are not known yet; `simulate` then ends with `RESULTS.invalid_parameters`, before
+    the first step.
     """
     paths = system.parameter_paths()
-    for name, value in values.items():
-        if name not in paths:
-            raise unknown("parameter", name, paths)
+    variables = {name: own for own in system.design for name in own.values}
+    for name in values:
+        if name not in paths and name not in variables:
+            raise unknown("parameter", name, [*paths, *variables])
+        for own in system.design:
+            if name in own.derived:
+                several = "s" * (len(own.variables) > 1)
+                names = ", ".join(variable for variable, _ in own.variables)
+                raise ValueError(
+                    f"Parameter {name!r} follows from the design variable{several} {names}; set "
+                    f"{'those' if several else 'that'} instead."
+                )
+    given, design = dict(values), []
+    # Variables of a design may follow from those of a later one.
+    for own in reversed(system.design):
+        mine = {name: given.pop(name) for name in own.values if name in given}
+        if mine:
+            own = own.replaced(mine)
+            given |= own.parameters()
+        design.insert(0, own)
+    for name, value in given.items():
         if name in system.signals():
             raise ValueError(
                 f"{name!r} is an input of this system, a function of time, which its value would not change; give "
@@ -58,7 +81,9 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
             if value.shape != shape:
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
-    system.check_parameters(values)
+    if design:
+        system = eqx.tree_at(lambda s: s.design, system, tuple(design))
+    system.check_parameters(given)
     return system
 
 

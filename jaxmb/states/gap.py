@@ -1,0 +1,124 @@
+"""How far a mechanism is from closing: a smooth distance for optimisers, where `assemble` only says that it cannot."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._types import Scalar, State, VectorLike
+from ..linalg.newton import newton
+from ..system import AbstractSystem
+from ..system.coordinates import prescribe
+from .arguments import check_system, checked_guess, checked_time
+from .closest import meet_constraints, residual_size, tolerance
+from .held_coordinates import holding, split_names
+
+# Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
+_ITERATIONS = 200
+_LAST = 1e-12
+_HALVINGS = 12
+
+# Curvatures below this share of the largest one count as this share.
+_FLAT = 1e-8
+
+
+def assembly_gap(
+    system: AbstractSystem,
+    guess: State | None = None,
+    *,
+    fix: Mapping[str, VectorLike] | None = None,
+    t: Scalar = 0.0,
+) -> Float[Array, ""]:
+    """How far a mechanism is from closing, zero where `assemble` finds a configuration.
+
+    A coupler that is too short leaves a gap between its joint and the rocker. `assemble(..., throw=False)` then returns
+    a state that is not a number, which an optimiser learns nothing from. The gap tells it which way to go: as a
+    constraint of `optimise`, `{"gap": (None, 0)}`, and as what to make small first where a start cannot be assembled.
+
+    The gap is the norm of the residuals of all position constraints at the configuration, found from the guess by
+    Newton's method, where it is smallest. Each residual is relative to the norm of its gradient at the guess, with
+    translations in units of `system.length`, so the gap is about the open distance divided by the system's size.
+
+    It grows in proportion to what is missing, so at its zero it has a kink; its square is smooth. Derivatives with
+    respect to parameters, guess and prescribed values are exact to first order: the smallest value of a function
+    changes with its parameters as the function does, at the configuration kept (the envelope theorem). Second
+    derivatives are not those of the gap.
+
+    **Arguments:** as those of `assemble`. Coordinates in `fix` keep their values; rates have no part in it.
+
+    **Returns:** the gap, dimensionless; exactly zero where the constraints can be met.
+    """
+    check_system("assembly_gap", system)
+    guess = checked_guess("assembly_gap", system, guess)
+    t = checked_time("assembly_gap", t, guess.q.dtype)
+    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    system = holding(system, of_joints, {}, t)
+    q, fixed = prescribe("coordinate", system.coordinate_names(), fix, guess.q)
+    q, _ = system.normalize_fixed(q, fixed)
+    return _gap(system, t, q, tuple(fixed.tolist()))
+
+
+@eqx.filter_jit
+def _gap(system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...]) -> Float[Array, ""]:
+    if system.coordinate_rows == 0:
+        return jnp.zeros((), guess.dtype)
+    scale = jnp.where(np.array(held), 0.0, system.coordinate_scale())
+    frozen, t0, start = lax.stop_gradient((system, t, guess))
+    met, jacobian = meet_constraints(frozen, t0, start, scale)
+    closed = lax.stop_gradient(residual_size(frozen, t0, met, jacobian) <= tolerance(guess.dtype))
+    weights = _weights(system, t, guess)
+    own = lax.stop_gradient(weights)
+    nearest = lax.stop_gradient(_nearest(lambda q: own * _residual(frozen, t0, q), start, scale))
+    square = jnp.sum((weights * _residual(system, t, nearest)) ** 2)
+    open_ = ~closed & (square > 0)
+    return jnp.where(open_, jnp.sqrt(jnp.where(open_, square, 1.0)), 0.0)
+
+
+def _weights(system, t, q):
+    """One over the norms of the rows of the scaled Jacobian; a row without a gradient counts as the largest one."""
+    jacobian = system.coordinate_jacobian(t, q) * system.coordinate_scale()[None, :]
+    squares = jnp.sum(jacobian * jacobian, axis=1)
+    some = squares > jnp.finfo(q.dtype).eps ** 1.5 * jnp.max(squares)
+    return 1.0 / jnp.sqrt(jnp.where(some, squares, jnp.max(squares) + jnp.finfo(q.dtype).tiny))
+
+
+def _residual(system, t, q):
+    """Φ of rotations of unit size, and the invariants of the coordinates: no gap is closed by shrinking a body."""
+    position = system.position_residual(t, system.normalize(q))
+    return jnp.concatenate([position, system.coordinate_residual(t, q)[system.position_rows :]])
+
+
+def _nearest(residual, start, scale):
+    """A local minimum of the sum of squares, by Newton's method with the sizes of curvatures and step halving."""
+
+    def squares(z):
+        return 0.5 * jnp.sum(residual(start + scale * z) ** 2)
+
+    def slope(z):
+        value, gradient = jax.value_and_grad(squares)(z)
+        return gradient, (value, gradient)
+
+    def correct(z):
+        hessian, (value, gradient) = jax.jacfwd(slope, has_aux=True)(z)
+        curvatures, directions = jnp.linalg.eigh(hessian)
+        sizes = jnp.abs(curvatures)
+        sizes = jnp.maximum(sizes, _FLAT * jnp.max(sizes) + jnp.finfo(z.dtype).tiny)
+        step = -directions @ ((directions.T @ gradient) / sizes)
+        longest = jnp.max(jnp.abs(step))
+        step = step / jnp.maximum(longest, 1.0)
+        lengths = 0.5 ** jnp.arange(_HALVINGS, dtype=z.dtype)
+        found = lax.map(lambda a: squares(z + a * step), lengths)
+        best = jnp.argmin(jnp.where(jnp.isfinite(found), found, jnp.inf))
+        # At the level of rounding errors no step decreases the squares, and Newton's own is the best.
+        small = longest <= jnp.finfo(z.dtype).eps ** 0.5
+        better = (found[best] < value) | small
+        length = jnp.where(better, jnp.where(small, 1.0, lengths[best]), 0.0)
+        return z + length * step, jnp.where(better, longest, 0.0)
+
+    far = lambda z, size: (size > _LAST) & jnp.all(jnp.isfinite(z))
+    z = newton(correct, far, jnp.zeros_like(start), most=_ITERATIONS, dtype=start.dtype)[0]
+    return start + scale * z

@@ -1,0 +1,198 @@
+"""Objective and constraints of a design with their derivatives, from one compiled program."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..parts.names import unknown
+from .ranges import FreeParameters
+from .space import Space, component_names
+
+# Reverse mode costs about as much as this many tangents in forward mode, for every row.
+_TANGENTS_A_ROW = 8
+
+# The name of the output of a function that returns a number.
+OBJECTIVE = "objective"
+
+
+class Program(eqx.Module):
+    """Some outputs of a function of named parameters, as rows of one vector of the components of the parameters.
+
+    **Fields:** `function(values)` or `function(values, adjoint=…)`; `space`: named values of a vector; `names` of the
+    outputs that are rows; `forward`: in which mode to differentiate; `takes_adjoint`: whether the function does.
+    """
+
+    function: Callable[..., Any]
+    space: Space | FreeParameters
+    names: tuple[str, ...] = eqx.field(static=True)
+    forward: bool = eqx.field(static=True)
+    takes_adjoint: bool = eqx.field(static=True)
+
+    def outputs(self, z: Float[Array, "n"]) -> dict[str, Array]:
+        """All outputs by name."""
+        options = {"adjoint": diffrax.ForwardMode() if self.forward else None} if self.takes_adjoint else {}
+        out = self.function(self.space(z), **options)
+        return {
+            name: jnp.asarray(x, z.dtype) for name, x in (out if isinstance(out, Mapping) else {OBJECTIVE: out}).items()
+        }
+
+    def rows(self, z: Float[Array, "n"]) -> tuple[Float[Array, "rows"], dict[str, Array]]:
+        out = self.outputs(z)
+        return jnp.concatenate([out[name].reshape(-1) for name in self.names]), out
+
+    def linearised(self, z: Float[Array, "n"]) -> tuple[Float[Array, "rows"], Float[Array, "rows n"], dict[str, Array]]:
+        """Rows, their Jacobian, and all outputs."""
+
+        def rows(z):
+            value, out = self.rows(z)
+            return value, (value, out)
+
+        if self.forward:
+            jacobian, (value, out) = jax.jacfwd(rows, has_aux=True)(z)
+        else:
+            value, pull, (_, out) = jax.vjp(rows, z, has_aux=True)
+            (jacobian,) = jax.vmap(pull)(jnp.eye(value.size, dtype=value.dtype))
+        return value, jacobian, out
+
+
+@eqx.filter_jit
+def linearised(program: Program, z: Float[Array, "n"]):
+    """Rows, their Jacobian, and all outputs."""
+    return program.linearised(z)
+
+
+@eqx.filter_jit
+def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array, "starts rows"]:
+    """Rows of several vectors at once."""
+    return jax.vmap(lambda z: program.rows(z)[0])(z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Bounds of outputs, component by component.
+
+    **Fields:** `names` of the outputs; `components`: names of all components, the rows after the objective; `low`,
+    `high`, equal for equations.
+    """
+
+    names: tuple[str, ...]
+    components: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+
+    def excess(self, values: np.ndarray) -> np.ndarray:
+        """How far components are out of their bounds; zero within."""
+        return np.maximum(np.maximum(self.low - values, values - self.high), 0.0)
+
+
+def takes_adjoint(function: Callable[..., Any]) -> bool:
+    """Whether a function has an argument `adjoint`, to be handed on to `simulate`."""
+    try:
+        return "adjoint" in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
+    """The shapes of all outputs.
+
+    **Raises:** `ValueError` for outputs that are no real numbers.
+    """
+    start = jnp.zeros(program.space.size)
+
+    def outputs(z):
+        options = {"adjoint": None} if program.takes_adjoint else {}
+        return program.function(program.space(z), **options)
+
+    found = eqx.filter_eval_shape(outputs, start)
+    found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
+    shapes = {}
+    for name, own in found.items():
+        if not isinstance(name, str) or not hasattr(own, "shape") or not jnp.issubdtype(own.dtype, jnp.number):
+            raise ValueError(
+                f"The function must return a number, or numbers and arrays by name; got {own!r} under {name!r}."
+            )
+        shapes[name] = own.shape
+    return shapes
+
+
+def chosen_objective(objective: str | None, shapes: Mapping[str, tuple[int, ...]], constraints: Any) -> str:
+    """The name of the objective among the outputs.
+
+    **Raises:** `ValueError` for an unknown output, for one that is not a number, and where none is named.
+    """
+    if objective is None:
+        left = [name for name in shapes if name not in (constraints or {})]
+        if len(left) != 1:
+            raise ValueError(f"Name the objective, one of the outputs {', '.join(map(repr, shapes))}.")
+        objective = left[0]
+    if objective not in shapes:
+        raise unknown("output", objective, shapes)
+    if shapes[objective] != ():
+        raise ValueError(f"The objective must be a number, but {objective!r} has shape {shapes[objective]}.")
+    return objective
+
+
+def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int, ...]]) -> Limits:
+    """Bounds of outputs from `(low, high)`, or from the number that they equal, by name.
+
+    **Raises:** `ValueError` for unknown outputs and for bounds that are reversed, absent, or of another shape.
+    """
+    names, components, lows, highs = [], [], [], []
+    for name, given in (constraints or {}).items():
+        if name not in shapes:
+            raise unknown("output", name, shapes)
+        sides = given if isinstance(given, tuple) else (given, given)
+        if len(sides) != 2 or all(side is None for side in sides):
+            raise ValueError(
+                f"The constraint of {name!r} must be (low, high), one of them None at most; got {given!r}."
+            )
+        low, high = (_side(name, side, shapes[name], e) for side, e in zip(sides, (-np.inf, np.inf), strict=True))
+        if np.any(low > high):
+            raise ValueError(f"The constraint of {name!r} must be (low, high) with low ≤ high, got {given!r}.")
+        names.append(name)
+        components += component_names(name, shapes[name])
+        lows.append(low.ravel())
+        highs.append(high.ravel())
+    flat = lambda parts: np.concatenate([np.zeros(0), *parts])
+    return Limits(tuple(names), tuple(components), flat(lows), flat(highs))
+
+
+def _side(name: str, side: ArrayLike | None, shape: tuple[int, ...], empty: float) -> np.ndarray:
+    value = np.asarray(empty if side is None else side, float)
+    if value.shape not in ((), shape) or np.any(np.isnan(value)):
+        raise ValueError(f"A bound of {name!r} must be a number, or an array of shape {shape}; got {side!r}.")
+    return np.broadcast_to(value, shape)
+
+
+def differentiable(program: Program, derivatives: Literal["auto", "forward", "reverse"], rows: int) -> Program:
+    """The program in the mode that is asked for; with `"auto"`, in the cheaper one that the function allows.
+
+    **Raises:** `ValueError` where the function has no derivatives in that mode.
+    """
+    if derivatives not in ("auto", "forward", "reverse"):
+        raise ValueError(f"derivatives must be 'auto', 'forward' or 'reverse', got {derivatives!r}.")
+    cheaper = program.space.size <= _TANGENTS_A_ROW * rows
+    modes = (cheaper, not cheaper) if derivatives == "auto" else (derivatives == "forward",)
+    first: Exception | None = None
+    for forward in modes:
+        trial = Program(program.function, program.space, program.names, forward, program.takes_adjoint)
+        try:
+            eqx.filter_eval_shape(trial.linearised, jnp.zeros(program.space.size))
+        except (TypeError, ValueError) as error:
+            first = first or error
+            continue
+        return trial
+    which = "in either mode" if len(modes) == 2 else f"in {derivatives} mode"
+    raise ValueError(
+        f"The function has no derivatives {which}. If it simulates, let it take `adjoint=None` and hand that on: "
+        "simulate(..., adjoint=adjoint)."
+    ) from first

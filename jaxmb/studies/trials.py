@@ -1,0 +1,169 @@
+"""The trials of an optimisation: each is evaluated once, and those that fail are told apart."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from .evaluation import Limits, Program, linearised
+
+# Constraints that are violated by no more than this, relative to their size, hold.
+HOLDS = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Iteration:
+    """One line of the log: the number of the iteration, the objective, the largest violation of a constraint relative
+    to its size, the largest change of a parameter relative to its scale, and the numbers of trials and of those among
+    them that failed, so far.
+    """
+
+    number: int
+    objective: float
+    violation: float
+    step: float
+    trials: int
+    failed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Values and derivatives at a vector z; not finite where the trial failed.
+
+    **Fields:** `rows`, shape (1 + constraints,), the objective first; `jacobian`; `outputs` by name.
+    """
+
+    z: np.ndarray
+    rows: np.ndarray
+    jacobian: np.ndarray
+    outputs: dict[str, np.ndarray]
+
+    @property
+    def good(self) -> bool:
+        return bool(np.all(np.isfinite(self.rows)) and np.all(np.isfinite(self.jacobian)))
+
+
+class Trials:
+    """Evaluates a program at vectors within a box, and keeps what it found."""
+
+    def __init__(self, program: Program, limits: Limits, box: tuple[np.ndarray, np.ndarray], start: Trial):
+        self.program, self.limits, self.box = program, limits, box
+        self.start = self.good = self.best = self.last = start
+        self.count = self.failed = 0
+        self.scales = constraint_scales(limits, start)
+        self.log: list[Iteration] = []
+        self._noted = start.z
+        self.record(start.z)
+
+    def __call__(self, z: np.ndarray) -> Trial:
+        z = np.clip(np.asarray(z, float), *self.box)
+        if not np.array_equal(z, self.last.z):
+            self.count += 1
+            self.last = evaluate(self.program, z)
+            if not self.last.good:
+                self.failed += 1
+            else:
+                self.good = self.last
+                if self.merit(self.last) < self.merit(self.best):
+                    self.best = self.last
+        return self.last
+
+    def violation(self, trial: Trial) -> float:
+        """The largest violation of a constraint, relative to its size."""
+        return float(np.max(self.limits.excess(trial.rows[1:]) / self.scales, initial=0.0))
+
+    def merit(self, trial: Trial) -> tuple[float, float]:
+        """What makes one trial better than another: first constraints that hold, then a small objective."""
+        violation = self.violation(trial)
+        return (violation if violation > HOLDS else 0.0), float(trial.rows[0])
+
+    def record(self, z: np.ndarray) -> None:
+        """Note the end of an iteration."""
+        trial = self(z)
+        if trial.good:
+            step = float(np.max(np.abs(trial.z - self._noted), initial=0.0))
+            values = float(trial.rows[0]), self.violation(trial), step
+            self.log.append(Iteration(len(self.log), *values, self.count, self.failed))
+            self._noted = trial.z
+
+
+def evaluate(program: Program, z: np.ndarray) -> Trial:
+    """One trial. An error at run time, such as that of a simulation that throws, is a trial that failed."""
+    try:
+        rows, jacobian, outputs = linearised(program, jnp.asarray(z, jnp.result_type(float)))
+        rows = np.asarray(rows)
+    except RuntimeError:
+        return Trial(z, np.full(1, np.nan), np.full((1, z.size), np.nan), {})
+    return Trial(z, rows, np.asarray(jacobian), {name: np.asarray(value) for name, value in outputs.items()})
+
+
+def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
+    """Sizes of constraints: their largest bound, or where that is zero their first value or derivative."""
+    sides = np.abs(np.where(np.isfinite([limits.low, limits.high]), [limits.low, limits.high], 0.0))
+    size = np.max(sides, axis=0, initial=0.0)
+    first = np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0))
+    size = np.where(size > 0, size, first)
+    return np.where(size > 0, size, 1.0)
+
+
+def first_feasible(
+    program: Program,
+    whole: Callable[[np.ndarray], Trial],
+    limits: Limits,
+    start: np.ndarray,
+    box: tuple[np.ndarray, np.ndarray],
+    most: int,
+) -> tuple[Trial | None, int]:
+    """From a start where the objective is not a number to a trial where everything is finite.
+
+    Gauss–Newton steps make the excess of those constraints small that have a value, such as a gap of assembly, and go
+    beyond their bounds by a part of the way, since at the bounds themselves a mechanism is singular.
+
+    **Arguments:** `program`: of the constraints that have a value at the start; `whole(z)`: a trial of everything;
+    `limits` of these constraints; `box`: bounds of z; `most`: largest number of trials.
+
+    **Returns:** the trial, or None; and the number of trials.
+    """
+    low, high = box
+    here = evaluate(program, start)
+    scales = constraint_scales(limits, Trial(here.z, np.append(0.0, here.rows), _padded(here.jacobian), {}))
+    beyond = np.zeros_like(start)
+    count = 1
+    while count < most:
+        excess = limits.excess(here.rows) / scales
+        violated = excess > 0
+        if not violated.any():
+            break
+        slope = np.where(here.rows < limits.low, -1.0, 1.0)[:, None] * here.jacobian / scales[:, None]
+        step = -np.linalg.lstsq(slope[violated], excess[violated], rcond=1e-8)[0]
+        # No step is longer than half the scale of a parameter.
+        step *= min(1.0, 0.5 / max(np.max(np.abs(step)), 1e-300))
+        length, moved = 1.0, None
+        while length > 1e-3 and count < most:
+            trial = evaluate(program, np.clip(here.z + length * step, low, high))
+            count += 1
+            smaller = np.linalg.norm(limits.excess(trial.rows) / scales) < (1 - 1e-3 * length) * np.linalg.norm(excess)
+            if trial.good and smaller:
+                moved = trial
+                break
+            length *= 0.5
+        if moved is None:
+            break
+        beyond = moved.z - here.z
+        here = moved
+        if np.max(limits.excess(here.rows) / scales) < 1e-2:
+            break
+    # The last steps, lengthened until the objective has a value.
+    way = here.z - start if np.any(here.z != start) else beyond
+    for share in (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8):
+        for direction in (beyond, way):
+            trial = whole(np.clip(here.z + share * direction, low, high))
+            count += 1
+            if trial.good:
+                return trial, count
+    return None, count
+
+
+def _padded(jacobian: np.ndarray) -> np.ndarray:
+    return np.vstack([np.zeros((1, jacobian.shape[1])), jacobian])

@@ -1,0 +1,129 @@
+"""Design variables for a system: one name for what is one thing, however many parameters depend on it."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from .._types import VectorLike
+from ..linalg.arrays import is_traced
+from ..parts.fields import as_jax
+from ..parts.names import unknown
+from .arguments import check_kind, real_shape
+from .design_variables import DesignVariables, Variable
+from .equation import AbstractSystem
+from .parameters import System, parameters, with_parameters
+
+Bounds = tuple[ArrayLike | None, ArrayLike | None]
+
+
+def design(
+    system: System,
+    variables: Mapping[str, Variable | VectorLike],
+    derive: Callable[[dict[str, Array]], Mapping[str, VectorLike]],
+) -> System:
+    """Give a system design variables, from which several of its parameters follow.
+
+    The length of a coupler stands in the points of two joints and in a moment of inertia. As a design variable it has
+    one name:
+
+    ```python
+    machine = mb.design(
+        system,
+        {"rod": mb.Variable(3.0, bounds=(1.0, 5.0), unit="m")},
+        lambda v: {
+            "B.point_b": jnp.array([-v["rod"] / 2, 0.0]),
+            "C.point_a": jnp.array([v["rod"] / 2, 0.0]),
+            "coupler.inertia": 3.0 * v["rod"] ** 2 / 12,
+        },
+    )
+    longer = mb.with_parameters(machine, {"rod": 3.2})
+    ```
+
+    The result is a system like the given one, with the variables among its parameters: `with_parameters`, `identify`
+    and `optimise` take them by name, with their bounds. States change with lengths, so `assemble` them anew.
+
+    **Arguments:**
+
+    - `system`: a compiled scene, or another system; also one with design variables, which may then follow from the new
+        ones.
+    - `variables`: `Variable`s by name, or values alone.
+    - `derive(values)`: parameters by name from the values of all variables by name, in JAX functions of them alone. It
+        is static: systems that share it share their compiled programs.
+
+    **Returns:** the system, with all parameters that `derive` gives.
+
+    **Raises:** `ValueError` for a name that the system has already, for a variable without effect on what `derive`
+    returns, and for derived parameters that are unknown, follow from other variables already, or have another shape.
+    """
+    check_kind("design: system", system, AbstractSystem, "a compiled scene or another system", "scene.compile()")
+    known = parameters(system)
+    if not isinstance(variables, Mapping) or not variables:
+        raise ValueError(f"variables must be Variables by name, at least one; got {variables!r}.")
+    declared = {}
+    for name, value in variables.items():
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"A design variable's name is a string that is not empty, got {name!r}.")
+        if name in known:
+            raise ValueError(f"The system has a parameter {name!r} already; give the design variable another name.")
+        try:
+            # A concrete class: the declaration that users write, or a number in its place.
+            declared[name] = value if isinstance(value, Variable) else Variable(value)
+        except ValueError as error:
+            raise ValueError(f"Design variable {name!r}: {error}") from None
+    values = {name: as_jax(variable.value) for name, variable in declared.items()}
+    own = DesignVariables(values, tuple(declared.items()), derive, ())
+    derived = _checked(own, known)
+    changed = with_parameters(system, derived)
+    own = DesignVariables(values, own.variables, derive, tuple(derived))
+    return eqx.tree_at(lambda s: s.design, changed, (*changed.design, own), is_leaf=lambda x: x is changed.design)
+
+
+def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = None) -> dict[str, Bounds]:
+    """Bounds by name: those given, and those of the design variables where none are given.
+
+    **Raises:** `ValueError` for bounds that reach beyond those of a design variable.
+    """
+    out = dict(bounds or {})
+    for own in system.design:
+        for name, variable in own.variables:
+            low, high = out.get(name, (None, None))
+            low, high = (variable.low if low is None else low), (variable.high if high is None else high)
+            if np.any(np.asarray(low) < variable.low) or np.any(np.asarray(high) > variable.high):
+                raise ValueError(
+                    f"The bounds {out[name]} of {name!r} reach beyond those of the design variable, "
+                    f"{variable.low.tolist(), variable.high.tolist()}."
+                )
+            if name in out or np.any(np.isfinite([variable.low, variable.high])):
+                out[name] = low, high
+    return out
+
+
+def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Array]:
+    """The derived parameters of the first values."""
+    try:
+        derived: Any = own.derive(dict(own.values))
+    except KeyError as error:
+        raise unknown("design variable", str(error.args[0]), own.values) from None
+    if not isinstance(derived, Mapping) or not derived:
+        raise ValueError(f"derive must return parameters by name, at least one; got {derived!r}.")
+    for name, value in derived.items():
+        if name not in known:
+            raise unknown("parameter", name, known)
+        shape = real_shape(f"The derived parameter {name!r}", value)
+        if shape != known[name].shape:
+            raise ValueError(
+                f"The derived parameter {name!r} has shape {shape}, but {known[name].shape} in the system."
+            )
+        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+            raise ValueError(f"The derived parameter {name!r} is not finite: {np.asarray(value)}.")
+    program = jax.make_jaxpr(own.derive)(dict(own.values)).jaxpr
+    used = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
+    # As JAX orders the entries of a dictionary.
+    idle = [name for name, v in zip(sorted(own.values), program.invars, strict=True) if id(v) not in used]
+    if idle:
+        raise ValueError(f"Nothing follows from the design variable {idle[0]!r}: use it in derive, or leave it out.")
+    return {name: as_jax(value) for name, value in derived.items()}

@@ -1,0 +1,165 @@
+"""Design variables: numbers by name from which several parameters of a system follow."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool
+
+from .._types import VectorLike
+from ..linalg.arrays import is_traced
+from ..parts.fields import as_jax
+from .arguments import real_array
+
+# Rounding of a value at its bound, in units of the spacing of numbers there.
+_ROUNDING = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """A design variable: its value, and what a study needs to know of it.
+
+    **Arguments:**
+
+    - `value`: a number, or an array of numbers.
+    - `bounds`: `(low, high)`, either of them None; numbers, or arrays of the value's shape. No other values are
+        accepted, and studies search between them.
+    - `scale`: the size of a typical change, positive; default the distance of the bounds, or the value's size.
+    - `unit`: for printing.
+
+    **Raises:** `ValueError` for bounds that are reversed or that the value violates, and for a scale that is not
+    positive.
+    """
+
+    value: Any
+    bounds: tuple[ArrayLike | None, ArrayLike | None] = (None, None)
+    scale: ArrayLike | None = None
+    unit: str = ""
+
+    def __post_init__(self):
+        if is_traced((self.value, self.bounds, self.scale)):
+            raise ValueError("A Variable takes numbers that are known; change its value with `with_parameters`.")
+        value = real_array("value", self.value, np.result_type(float), None)
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"The value of a Variable must be finite, got {self.value!r}.")
+        if not isinstance(self.bounds, Sequence) or len(self.bounds) != 2:
+            raise ValueError(f"bounds must be a pair (low, high), either of them None; got {self.bounds!r}.")
+        pair = zip(("low", "high"), self.bounds, (-np.inf, np.inf), strict=True)
+        low, high = (_like(f"bounds: {side}", empty if bound is None else bound, value) for side, bound, empty in pair)
+        if np.any(low >= high):
+            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds!r}.")
+        if not np.all(_within(value, low, high)):
+            raise ValueError(f"The value {_short(value)} is not within its bounds {_interval(low, high)}.")
+        if self.scale is not None and np.any(_like("scale", self.scale, value) <= 0):
+            raise ValueError(f"scale must be positive, got {self.scale!r}.")
+        # Immutable, so that variables compare by value and are static in a system.
+        freeze = lambda name, array: object.__setattr__(self, name, _frozen(array))
+        freeze("value", value)
+        object.__setattr__(self, "bounds", (_frozen(low), _frozen(high)))
+        if self.scale is not None:
+            freeze("scale", _like("scale", self.scale, value))
+
+    @property
+    def low(self) -> np.ndarray:
+        """The lower bound, −∞ without one; of the value's shape."""
+        return np.asarray(self.bounds[0])
+
+    @property
+    def high(self) -> np.ndarray:
+        """The upper bound, ∞ without one; of the value's shape."""
+        return np.asarray(self.bounds[1])
+
+
+class DesignVariables(eqx.Module):
+    """Design variables of a system with their present values, and the function that gives parameters from them.
+
+    **Fields:** `values` by name; `variables`: names with what was declared of them; `derive(values)`: parameters by
+    name; `derived`: their names.
+    """
+
+    values: dict[str, Array]
+    variables: tuple[tuple[str, Variable], ...] = eqx.field(static=True)
+    derive: Callable[[dict[str, Array]], Mapping[str, VectorLike]] = eqx.field(static=True)
+    derived: tuple[str, ...] = eqx.field(static=True)
+
+    def replaced(self, values: Mapping[str, VectorLike]) -> "DesignVariables":
+        """The same with other values of some variables.
+
+        **Raises:** `ValueError` for a wrong shape, and for known values out of bounds.
+        """
+        known = dict(self.variables)
+        new = dict(self.values)
+        for name, value in values.items():
+            array, variable = as_jax(value), known[name]
+            if array.shape != variable.low.shape:
+                raise ValueError(f"Design variable {name!r} has shape {variable.low.shape}, got {array.shape}.")
+            if not is_traced(array) and not np.all(_within(np.asarray(array), variable.low, variable.high)):
+                raise ValueError(
+                    f"Design variable {name!r} must be within {_interval(variable.low, variable.high)}, got "
+                    f"{_short(np.asarray(array))}."
+                )
+            new[name] = array
+        return DesignVariables(new, self.variables, self.derive, self.derived)
+
+    def parameters(self) -> dict[str, Array]:
+        """The parameters that follow from the present values."""
+        return {name: as_jax(value) for name, value in self.derive(dict(self.values)).items()}
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Name, value and remark of every variable, for the description of a system."""
+        gives = f"gives {', '.join(self.derived)}"
+        out = []
+        for k, (name, variable) in enumerate(self.variables):
+            value = self.values[name]
+            shown = "traced" if is_traced(value) else _short(np.asarray(value))
+            bounded = np.any(np.isfinite([variable.low, variable.high]))
+            remark = [f"within {_interval(variable.low, variable.high)}"] * bool(bounded)
+            together = [gives] if len(self.variables) == 1 else [f"these variables together {gives[:4]}{gives[5:]}"]
+            last = k == len(self.variables) - 1
+            out.append((name, f"{shown} {variable.unit}".rstrip(), "; ".join(remark + together * last)))
+        return out
+
+
+def in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array, ""]:
+    """Whether all traced design variables are within their bounds; True if none are traced."""
+    ok: Any = True
+    for own in design:
+        for name, variable in own.variables:
+            value = own.values[name]
+            if is_traced(value):
+                ok = ok & jnp.all(_within(value, variable.low, variable.high))
+    return ok
+
+
+def description_rows(design: tuple[DesignVariables, ...]) -> list[tuple[str, str, str]]:
+    """Name, value and remark of all design variables."""
+    return [row for own in design for row in own.rows()]
+
+
+def _within(value, low, high):
+    slack = lambda bound: _ROUNDING * np.finfo(value.dtype).eps * np.abs(np.where(np.isfinite(bound), bound, 0.0))
+    return (value >= (low - slack(low)).astype(value.dtype)) & (value <= (high + slack(high)).astype(value.dtype))
+
+
+def _like(name: str, given: Any, value: np.ndarray) -> np.ndarray:
+    array = real_array(name, given, value.dtype, ((), value.shape))
+    return np.broadcast_to(array, value.shape)
+
+
+def _frozen(array: Any) -> Any:
+    listed = np.asarray(array).tolist()
+    deep = lambda item: tuple(map(deep, item)) if isinstance(item, list) else item
+    return deep(listed)
+
+
+def _interval(low: np.ndarray, high: np.ndarray) -> str:
+    return f"{_short(low)} … {_short(high)}"
+
+
+def _short(array: np.ndarray) -> str:
+    if array.ndim == 0 or (array.size > 1 and np.all(array == array.flat[0])):
+        return f"{float(array.flat[0]):g}"
+    return np.array2string(array, precision=6, separator=", ", threshold=6)

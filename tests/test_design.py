@@ -1,0 +1,205 @@
+"""Design variables, and how far a mechanism is from closing."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.lagrangian import LagrangianSystem
+from jaxmb.studies.ranges import free_parameters
+
+HALF = jnp.array([0.5, 0.0])
+FIX = {"crank.angle": np.pi}
+
+
+def lengths(v):
+    """What follows from the lengths of crank and coupler."""
+    out = {"A.point_b": -v["crank"] * HALF, "B.point_a": v["crank"] * HALF, "B.point_b": -v["rod"] * HALF}
+    return out | {"C.point_a": v["rod"] * HALF, "coupler.inertia": 3.0 * v["rod"] ** 2 / 12}
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return mb.mechanisms.four_bar()
+
+
+@pytest.fixture(scope="module")
+def machine(plain):
+    variables = {"rod": mb.Variable(3.0, bounds=(0.1, 9.0), unit="m"), "crank": mb.Variable(1.0, unit="m")}
+    return mb.design(plain.system, variables, lengths)
+
+
+def test_one_name_sets_everything_that_follows(plain, machine):
+    longer = mb.with_parameters(machine, {"rod": 3.2, "crank.mass": 2.0})
+    known = mb.parameters(longer)
+    assert type(machine) is type(plain.system)
+    assert float(known["rod"]) == 3.2 and float(known["crank"]) == 1.0
+    np.testing.assert_allclose(known["C.point_a"], [1.6, 0.0])
+    np.testing.assert_allclose(known["B.point_b"], [-1.6, 0.0])
+    np.testing.assert_allclose(known["coupler.inertia"], planar.rod(3.0, 3.2))
+    assert float(known["crank.mass"]) == 2.0
+    by_hand = {name: known[name] for name in mb.parameters(plain.system)}
+    same = mb.with_parameters(plain.system, by_hand)
+    start = mb.assemble(longer, plain.state, fix=plain.fix, rates=plain.rates)
+    other = mb.assemble(same, plain.state, fix=plain.fix, rates=plain.rates)
+    np.testing.assert_array_equal(start.q, other.q)
+
+
+def test_a_batch_of_designs(machine, plain):
+    def height(rod):
+        new = mb.with_parameters(machine, {"rod": rod})
+        return mb.assemble(new, plain.state, fix=plain.fix, throw=False).q[4]
+
+    rods = jnp.array([2.8, 3.0, 3.1])
+    np.testing.assert_allclose(jax.jit(jax.vmap(height))(rods), [height(rod) for rod in rods], rtol=1e-12)
+
+
+def test_variables_of_variables(machine):
+    two = mb.design(machine, {"size": 1.0, "inertia": [0.2, 0.3]}, lambda v: {"rod": 3 * v["size"], **inertias(v)})
+    known = mb.parameters(mb.with_parameters(two, {"size": 1.1}))
+    np.testing.assert_allclose(known["rod"], 3.3)
+    np.testing.assert_allclose(known["C.point_a"], [1.65, 0.0])
+    np.testing.assert_allclose(known["rocker.inertia"], 0.3)
+    with pytest.raises(ValueError, match="follows from the design variables size, inertia"):
+        mb.with_parameters(two, {"rod": 3.0})
+
+
+def inertias(v):
+    return {"crank.inertia": v["inertia"][0], "rocker.inertia": v["inertia"][1]}
+
+
+def test_a_description_lists_the_variables(machine):
+    text = str(machine)
+    assert "design variables" in text and "3 m" in text and "within 0.1 … 9" in text and "coupler.inertia" in text
+    seen = []
+    jax.eval_shape(lambda rod: seen.append(str(mb.with_parameters(machine, {"rod": rod}))), 3.0)
+    assert "rod    traced" in seen[0]
+
+
+def test_a_lagrangian_system_has_design_variables():
+    swing = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * p["inertia"] * (v @ v),
+        potential=lambda t, q, p: -9.81 * p["arm"] * jnp.cos(q[0]),
+        q=[1.0],
+        parameters={"inertia": 0.64, "arm": 0.8},
+    )
+    rod = mb.design(
+        swing, {"length": mb.Variable(0.8, (0.1, 2.0))}, lambda v: {"arm": v["length"], "inertia": v["length"] ** 2}
+    )
+    period = lambda x: mb.simulate(
+        mb.with_parameters(rod, {"length": x}), rod.guess, t1=0.3, adjoint=diffrax.ForwardMode()
+    ).ys.q[-1, 0]
+    by_hand = mb.with_parameters(swing, {"arm": 0.9, "inertia": 0.81})
+    np.testing.assert_allclose(period(0.9), mb.simulate(by_hand, rod.guess, t1=0.3).ys.q[-1, 0], rtol=1e-12)
+    assert "length" in str(rod)
+
+
+def test_studies_take_the_bounds(machine):
+    free = free_parameters(machine, {"rod": 3.0}, None)
+    far = free(jnp.array([200.0]))["rod"]
+    np.testing.assert_allclose(far, 9.0)
+    assert mb.parameters(mb.with_parameters(machine, {"rod": far}))["rod"] == far
+    narrower = free_parameters(machine, {"rod": 3.0}, {"rod": (2.0, 4.0)})
+    np.testing.assert_allclose(narrower(jnp.array([200.0]))["rod"], 4.0)
+    with pytest.raises(ValueError, match="reach beyond those of the design variable"):
+        free_parameters(machine, {"rod": 3.0}, {"rod": (0.0, 4.0)})
+
+
+def test_out_of_bounds_under_a_trace(machine, plain):
+    ok = jax.jit(lambda rod: mb.with_parameters(machine, {"rod": rod}).parameters_in_range())
+    assert bool(ok(3.0)) and bool(ok(9.0)) and not bool(ok(9.1)) and not bool(ok(jnp.nan))
+
+
+@pytest.mark.parametrize(
+    "message, bad",
+    [
+        (
+            "'coupler.inertia' follows from the design variables rod, crank",
+            lambda s, m: mb.with_parameters(m, {"coupler.inertia": 1.0}),
+        ),
+        ("'rod' must be within 0.1 … 9, got 9.5", lambda s, m: mb.with_parameters(m, {"rod": 9.5})),
+        ("did you mean 'rod'", lambda s, m: mb.with_parameters(m, {"rodd": 1.0})),
+        (r"'rod' has shape \(\), got \(1,\)", lambda s, m: mb.with_parameters(m, {"rod": [1.0]})),
+        ("has a parameter 'crank.mass' already", lambda s, m: mb.design(s, {"crank.mass": 1.0}, lambda v: {})),
+        ("has a parameter 'rod' already", lambda s, m: mb.design(m, {"rod": 1.0}, lambda v: {})),
+        ("did you mean 'B.point_a'", lambda s, m: mb.design(s, {"a": 1.0}, lambda v: {"B.pointa": v["a"]})),
+        (
+            r"'B.point_a' has shape \(\), but \(2,\)",
+            lambda s, m: mb.design(s, {"a": 1.0}, lambda v: {"B.point_a": v["a"]}),
+        ),
+        (
+            "Nothing follows from the design variable 'b'",
+            lambda s, m: mb.design(s, {"a": 1.0, "b": 2.0}, lambda v: {"crank.mass": v["a"]}),
+        ),
+        ("Unknown design variable 'c'", lambda s, m: mb.design(s, {"a": 1.0}, lambda v: {"crank.mass": v["c"]})),
+        ("is not finite", lambda s, m: mb.design(s, {"a": 1.0}, lambda v: {"crank.mass": jnp.log(-v["a"])})),
+        ("must return parameters by name", lambda s, m: mb.design(s, {"a": 1.0}, lambda v: v["a"])),
+        ("must be Variables by name", lambda s, m: mb.design(s, {}, lambda v: {})),
+        ("'a': value must be", lambda s, m: mb.design(s, {"a": "long"}, lambda v: {})),
+        ("low < high", lambda s, m: mb.Variable(1.0, bounds=(2.0, 1.0))),
+        ("a pair", lambda s, m: mb.Variable(1.0, bounds=2.0)),
+        ("not within its bounds 2 … 3", lambda s, m: mb.Variable(1.0, bounds=(2.0, 3.0))),
+        ("scale must be positive", lambda s, m: mb.Variable(1.0, scale=0.0)),
+        ("must be finite", lambda s, m: mb.Variable(np.inf)),
+    ],
+)
+def test_bad_designs_are_named(message, bad, plain, machine):
+    with pytest.raises(ValueError, match=message):
+        bad(plain.system, machine)
+
+
+def gap(machine, plain, rod, crank):
+    return mb.assembly_gap(mb.with_parameters(machine, {"rod": rod, "crank": crank}), plain.state, fix=FIX)
+
+
+def test_the_gap_is_zero_where_a_mechanism_closes_and_grows_where_not(machine, plain):
+    """With the crank at 180° the pivots of coupler and rocker, 2.5 m long, are 2.5 + crank apart."""
+    rods = jnp.array([0.2, 0.6, 0.99, 1.01, 3.0, 5.99, 6.01, 6.5])
+    gaps = np.asarray(jax.vmap(lambda rod: gap(machine, plain, rod, 1.0))(rods))
+    missing = np.maximum(np.maximum(1.0 - rods, rods - 6.0), 0.0)
+    assert np.all((gaps == 0) == (missing == 0))
+    assert np.all(np.abs(gaps[missing > 0] / missing[missing > 0] / 0.155 - 1) < 0.06)
+    solved = jax.vmap(
+        lambda rod: mb.assemble(mb.with_parameters(machine, {"rod": rod}), plain.state, fix=FIX, throw=False).q
+    )
+    np.testing.assert_array_equal(np.isnan(solved(rods)).any(axis=1), missing > 0)
+
+
+@pytest.mark.parametrize("rod", [0.3, 6.4])
+def test_derivatives_of_the_gap(machine, plain, rod):
+    """Forward mode, reverse mode and central differences agree; a coupler too short wants to be longer."""
+    at = (jnp.asarray(rod), jnp.asarray(1.0))
+    of = lambda rod, crank: gap(machine, plain, rod, crank)
+    forward, reverse = (np.array(d(of, (0, 1))(*at)) for d in (jax.jacfwd, jax.jacrev))
+    h = 1e-6
+    central = [
+        (of(at[0] + h, at[1]) - of(at[0] - h, at[1])) / (2 * h),
+        (of(at[0], at[1] + h) - of(at[0], at[1] - h)) / (2 * h),
+    ]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+    np.testing.assert_allclose(forward, central, rtol=1e-8)
+    assert (forward[0] < 0) == (rod < 1)
+
+
+def test_a_gap_without_constraints():
+    body = planar.Body("disk", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    assert float(mb.assembly_gap(mb.Scene([body]).compile())) == 0.0
+
+
+def test_derivatives_through_design_assembly_and_motion(machine, plain):
+    """The rocker's angle after a motion, by the length of the coupler: both modes, and differences of a tighter run."""
+
+    def angle(rod, adjoint=None, rtol=1e-8):
+        new = mb.with_parameters(machine, {"rod": rod})
+        start = mb.assemble(new, plain.state, fix=plain.fix, rates=plain.rates)
+        return mb.simulate(new, start, t1=0.4, rtol=rtol, adjoint=adjoint)["rocker"].angle[-1]
+
+    forward = jax.jit(jax.jacfwd(lambda rod: angle(rod, diffrax.ForwardMode())))(3.0)
+    reverse = jax.jit(jax.grad(angle))(3.0)
+    tight, h = jax.jit(lambda rod: angle(rod, rtol=1e-11)), 1e-4
+    central = (8 * (tight(3 + h) - tight(3 - h)) - (tight(3 + 2 * h) - tight(3 - 2 * h))) / (12 * h)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    np.testing.assert_allclose(forward, central, rtol=1e-6)

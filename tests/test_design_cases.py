@@ -1,0 +1,254 @@
+"""Designs as users write them: four-bar paths from the literature, a ride, a camber curve; all start infeasible."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import differential_evolution
+
+import jaxmb as mb
+from jaxmb.mechanisms import ride
+
+# A. Kunjur and S. Krishnamurty, "Genetic algorithms in mechanism synthesis", J. Applied Mechanisms and Robotics 4(2),
+# 1997; J. A. Cabrera, A. Simon and M. Prado, "Optimal synthesis of mechanisms with genetic algorithms", Mechanism and
+# Machine Theory 37, 2002; S. K. Acharyya and M. Mandal, "Performance of EAs for four-bar linkage synthesis", Mechanism
+# and Machine Theory 44, 2009.
+LINE = np.array([(20.0, y) for y in (20.0, 25.0, 30.0, 35.0, 40.0, 45.0)])
+ARC = np.array([(3.0, 3.0), (2.759, 3.363), (2.372, 3.663), (1.890, 3.862), (1.355, 3.943)])
+LOOP = np.array(
+    [(0.5, 1.1), (0.4, 1.1), (0.3, 1.1), (0.2, 1.0), (0.1, 0.9), (0.05, 0.75), (0.02, 0.6), (0, 0.5), (0, 0.4)]
+    + [(0.03, 0.3), (0.1, 0.25), (0.15, 0.2), (0.2, 0.3), (0.3, 0.4), (0.4, 0.5), (0.5, 0.7), (0.6, 0.9), (0.6, 1.0)]
+)
+TURN = np.deg2rad(20.0) * np.arange(18)
+LENGTHS = ("base", "crank", "coupler", "rocker")
+
+
+def turned(angle, x):
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * x[0] - s * x[1], s * x[0] + c * x[1]])
+
+
+def four_bar(lengths, scale, angle):
+    """A four-bar linkage whose lengths, place and tilt are design variables."""
+    mechanism = mb.mechanisms.four_bar(lengths=lengths[1:], base=lengths[0], angle=angle)
+    variables = {n: mb.Variable(x, (0.01, 60.0), scale, "m") for n, x in zip(LENGTHS, lengths, strict=True)}
+    variables |= {"place": mb.Variable((0.0, 0.0), (-60, 60), scale, "m"), "tilt": mb.Variable(0.0, (-7, 7), 1.0)}
+
+    def points(v):
+        end = lambda name, sign: jnp.stack([0.5 * sign * v[name], jnp.zeros(())])
+        ground = v["place"] + v["base"] * jnp.stack([jnp.cos(v["tilt"]), jnp.sin(v["tilt"])])
+        out = {"A.point_a": v["place"], "A.point_b": end("crank", -1), "B.point_a": end("crank", 1)}
+        out |= {"B.point_b": end("coupler", -1), "C.point_a": end("coupler", 1), "C.point_b": end("rocker", 1)}
+        return out | {"D.point_b": end("rocker", -1), "D.point_a": ground}
+
+    return mb.design(mechanism.system, variables, points), mechanism.state
+
+
+def path_error(system, state, target, v, angles):
+    """Squared distances of the coupler's point from a target at crank angles, one after the other; the gap, and the sine
+    of the angle between coupler and rocker, which is zero where the linkage is about to open.
+    """
+    own = mb.parameters(system)
+    system = mb.with_parameters(system, {name: x for name, x in v.items() if name in own})
+
+    def turn(guess, angle):
+        fix = {"crank.angle": angle}
+        new = mb.assemble(system, guess, fix=fix, throw=False)
+        ahead = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(new), old, new), new, guess)
+        transmission = jnp.abs(jnp.sin(new.q[8] - new.q[5]))
+        return ahead, (new.q[3:6], mb.assembly_gap(system, guess, fix=fix), transmission)
+
+    _, (coupler, gap, transmission) = jax.lax.scan(turn, state, angles + v.get("tilt", jnp.zeros(())))
+    point = jnp.stack([v["point"][0] - 0.5 * v["coupler"], v["point"][1]])
+    path = coupler[:, :2] + jax.vmap(turned, (0, None))(coupler[:, 2], point)
+    return {"error": jnp.sum((path - target) ** 2), "gap": jnp.sum(gap), "transmission": transmission}
+
+
+def closed_form_error(target, lengths, point, place, tilt, angles):
+    """The same of the better branch, by complex numbers, for many linkages at once; penalised where it cannot close."""
+    base, crank, coupler, rocker = (np.asarray(x)[..., None] for x in lengths)
+    B = crank * np.exp(1j * angles)
+    way = base - B
+    distance = np.abs(way)
+    along = (coupler**2 - rocker**2 + distance**2) / (2 * distance)
+    square = coupler**2 - along**2
+    errors = []
+    for side in (1, -1):
+        direction = way / distance * (along + 1j * side * np.sqrt(np.maximum(square, 0.0))) / coupler
+        P = place[..., None] + np.exp(1j * tilt)[..., None] * (B + direction * point[..., None])
+        errors.append(np.sum(np.abs(P - target @ [1, 1j]) ** 2, axis=-1))
+    return np.minimum(*errors) + 1e3 * np.sum(np.maximum(-square / coupler**2, 0.0), axis=-1)
+
+
+def evolved(objective, bounds, size, generations=1000):
+    """The best of a published kind of search: differential evolution, with as many evaluations."""
+    options = {"strategy": "rand1bin", "mutation": 0.6, "recombination": 0.9, "tol": 0, "polish": False, "rng": 0}
+    options |= {"popsize": size, "maxiter": generations, "vectorized": True, "updating": "deferred"}
+    return differential_evolution(lambda x: objective(np.atleast_2d(x.T)), bounds, **options).fun
+
+
+@pytest.mark.long
+def test_four_bar_through_a_line():
+    """Six points of a vertical line without timing, with a bound of the transmission angle."""
+    system, state = four_bar((35.0, 15.0, 30.0, 30.0), 20.0, 0.5)
+    start = {"base": 35.0, "crank": 15.0, "coupler": 12.0, "rocker": 9.0, "place": [40.0, 20.0], "tilt": 0.0}
+    start |= {"point": [10.0, 10.0], "angles": np.linspace(2.0, 0.8, 6)}
+    bounds = dict.fromkeys(LENGTHS, (5.0, 60.0)) | {"point": (-60.0, 60.0)}
+    best = mb.optimise(
+        lambda v: path_error(system, state, LINE, v, v["angles"]),
+        start,
+        objective="error",
+        constraints={"gap": (None, 0), "transmission": (0.2, None)},
+        system=system,
+        bounds=bounds,
+        max_iterations=500,
+    )
+    p = best.parameters
+    where = [complex(*p[name]) for name in ("point", "place")]
+    again = closed_form_error(LINE, [p[n] for n in LENGTHS], *map(np.asarray, where), p["tilt"], p["angles"])
+    print(best)
+    assert np.isnan(best.before["error"]) and best.before["gap"] > 0
+    np.testing.assert_allclose(again, best.objective, rtol=1e-4, atol=1e-12)
+
+    def objective(x):
+        angles = x[:, 9:].reshape(-1, 6)
+        numbers = x[:, :4].T, x[:, 4] + 1j * x[:, 5], x[:, 6] + 1j * x[:, 7], x[:, 8]
+        return closed_form_error(LINE, *numbers, angles)
+
+    searched = evolved(objective, [(5, 60)] * 4 + [(-60, 60)] * 4 + [(0, 2 * np.pi)] * 7, 7)
+    print("differential evolution", searched)
+    assert np.min(best.outputs["transmission"]) > 0.2 * (1 - 2e-6)
+    assert best.objective < 1e-3 and best.objective < searched
+
+
+@pytest.mark.long
+def test_four_bar_along_an_arc():
+    """Five points with prescribed crank angles from 30° to 90°."""
+    angles = np.deg2rad([30.0, 45.0, 60.0, 75.0, 90.0])
+    system, state = four_bar((6.0, 2.0, 5.0, 5.0), 5.0, angles[0])
+    best = mb.optimise(
+        lambda v: path_error(system, state, ARC, v, jnp.asarray(angles)),
+        {"base": 6.0, "crank": 2.0, "coupler": 2.5, "rocker": 1.5, "point": [1.0, 1.0]},
+        objective="error",
+        constraints={"gap": (None, 0)},
+        system=system,
+        bounds={"point": (-50.0, 50.0)},
+        max_iterations=500,
+    )
+    p = best.parameters
+    again = closed_form_error(ARC, [p[n] for n in LENGTHS], np.asarray(complex(*p["point"])), *np.zeros((2, 1)), angles)
+    print(best)
+    assert np.isnan(best.before["error"])
+    np.testing.assert_allclose(again, best.objective, rtol=1e-4, atol=1e-12)
+    objective = lambda x: closed_form_error(ARC, x[:, :4].T, x[:, 4] + 1j * x[:, 5], *np.zeros((2, len(x))), angles)
+    searched = evolved(objective, [(0.01, 50)] * 4 + [(-50, 50)] * 2, 17)
+    print("differential evolution", searched)
+    assert best.objective < 2e-6 and best.objective < searched
+
+
+@pytest.mark.long
+def test_four_bar_around_a_loop():
+    """Eighteen points of Kunjur and Krishnamurty, every 20° of the crank."""
+    system, state = four_bar((1.0, 0.4, 1.0, 1.0), 1.0, 1.0)
+    start = {"base": 1.0, "crank": 0.6, "coupler": 0.3, "rocker": 0.4, "place": [0.3, 0.1], "tilt": 0.0}
+    best = mb.optimise(
+        lambda v: path_error(system, state, LOOP, v, v["first"] + jnp.asarray(TURN)),
+        start | {"point": [0.5, 0.5], "first": 1.0},
+        objective="error",
+        constraints={"gap": (None, 0)},
+        system=system,
+        max_iterations=500,
+    )
+    p = best.parameters
+    where = [np.asarray(complex(*p[name])) for name in ("point", "place")]
+    again = closed_form_error(LOOP, [p[n] for n in LENGTHS], *where, p["tilt"], p["first"] + TURN)
+    print(best)
+    assert np.isnan(best.before["error"])
+    np.testing.assert_allclose(again, best.objective, rtol=1e-5)
+
+    def objective(x):
+        numbers = x[:, :4].T, x[:, 4] + 1j * x[:, 5], x[:, 6] + 1j * x[:, 7], x[:, 8]
+        return closed_form_error(LOOP, *numbers, x[:, 9:] + TURN)
+
+    searched = evolved(objective, [(0.01, 50)] * 4 + [(-50, 50)] * 4 + [(0, 2 * np.pi)] * 2, 10)
+    print("differential evolution", searched)
+    assert best.objective < 0.0091 and best.objective < searched
+
+
+@pytest.mark.long
+def test_camber_curve_of_a_double_wishbone():
+    """The upper ball joint and the tie rod for a camber proportional to the wheel's travel, with little bump steer."""
+    m = mb.mechanisms.get("double_wishbone")
+    known, place = mb.parameters(m.system), m.system.guess.q
+    ball, rack = np.asarray(known["upper_ball.point_a"] + place[7:10]), np.asarray(known["tie_rod.point_a"])
+    near = lambda x: mb.Variable(x, (x - 0.05, x + 0.05), unit="m")
+    variables = {"ball": near(ball), "rack": near(rack), "rod": mb.Variable(0.2, (0.05, 0.6), unit="m")}
+    suspension = mb.design(
+        m.system,
+        variables,
+        lambda v: {
+            "upper_ball.point_a": v["ball"] - place[7:10],
+            "upper_ball.point_b": v["ball"] - place[14:17],
+            "tie_rod.point_a": v["rack"],
+            "tie_rod.length": v["rod"],
+        },
+    )
+    travel = jnp.linspace(-0.06, 0.06, 7)
+
+    def curve(v):
+        s = mb.with_parameters(suspension, v)
+
+        def at(z):
+            fix = {"upright.z": place[16] + z}
+            p = mb.assemble(s, m.state, fix=fix, throw=False).q[17:21]
+            axle = 2 * jnp.stack([p[1] * p[2] - p[0] * p[3], p[0] ** 2 + p[2] ** 2 - 0.5, p[2] * p[3] + p[0] * p[1]])
+            return -jnp.arcsin(axle[2]), jnp.arctan2(axle[0], axle[1]), mb.assembly_gap(s, m.state, fix=fix)
+
+        camber, toe, gap = jax.vmap(at)(travel)
+        return {"error": jnp.sum((camber + 0.6 * travel) ** 2), "toe": toe, "camber": camber, "gap": jnp.sum(gap)}
+
+    limits = {"toe": (-5e-3, 5e-3), "gap": (None, 0)}
+    best = mb.optimise(curve, list(variables), system=suspension, objective="error", constraints=limits)
+    print(best)
+    assert best.success and np.isnan(best.before["error"])
+    assert np.max(np.abs(best.outputs["toe"])) < 5.001e-3
+    assert np.max(np.abs(best.outputs["camber"] + 0.6 * travel)) < np.deg2rad(0.2)
+
+
+@pytest.mark.long
+def test_comfort_of_a_tracked_vehicle():
+    """Torsion bars and dampers for the smoothest ride over a bump with bounded travel of the arms, from a start that
+    travels too far.
+    """
+    m = mb.mechanisms.get("tracked_vehicle", n_wheels=3, speed=5.0)
+    known = mb.parameters(m.system)
+    wheels = range(1, 4)
+    design_angle = 0.5 * (known["stop1.lower"] + known["stop1.upper"])
+    moment = known["bar1.stiffness"] * (known["bar1.free_angle"] - design_angle)
+    variables = {"bar": mb.Variable(6e4, (2e4, 2e5), unit="N m/rad"), "damper": mb.Variable(1e3, (5e2, 2e4))}
+    vehicle = mb.design(
+        m.system,
+        variables,
+        lambda v: (
+            {f"bar{k}.stiffness": v["bar"] for k in wheels}
+            | {f"bar{k}.damping": v["damper"] for k in wheels}
+            | {f"bar{k}.free_angle": design_angle + moment / v["bar"] for k in wheels}
+        ),
+    )
+    ts = jnp.linspace(0.0, 1.2, 61)
+
+    def drive(v, adjoint=None):
+        s = mb.with_parameters(vehicle, v)
+        motion = mb.simulate(
+            s, m.start(s, m.state), t1=1.2, saveat=ts, rtol=1e-5, adjoint=adjoint, throw=False, max_steps=4000
+        )
+        travel = jnp.abs(ride.arm_travel(motion))
+        return {"comfort": ride.vertical_rms(motion), "travel": jax.nn.logsumexp(200.0 * travel) / 200.0}
+
+    limits = {"travel": (None, 0.3)}
+    best = mb.optimise(
+        drive, list(variables), system=vehicle, objective="comfort", constraints=limits, max_iterations=15, tol=1e-4
+    )
+    print(best)
+    assert best.before["travel"] > 0.3
+    assert best.outputs["travel"] < 0.3 * (1 + 1e-6)

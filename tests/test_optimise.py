@@ -1,0 +1,240 @@
+"""The optimiser: methods, constraints and multipliers, trials and starts that fail, several starts, robust designs."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxmb as mb
+from jaxmb.studies.evaluation import Program, differentiable
+
+START = {"x": [-1.2, 1.0]}
+DISK = {"square": (None, 1.0)}
+
+
+def valley(v):
+    """Rosenbrock's function."""
+    x = v["x"]
+    return {"f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2, "square": jnp.sum(x * x), "x": x}
+
+
+@pytest.fixture(scope="module")
+def in_disk():
+    return mb.optimise(valley, START, objective="f", constraints=DISK)
+
+
+def test_a_constraint_and_its_multiplier(in_disk):
+    """The known optimum in the unit disk; the multiplier is what a larger disk gains."""
+    np.testing.assert_allclose(in_disk.parameters["x"], [0.7864151510, 0.6176983125], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(in_disk.objective, 0.0456748087, rtol=1e-6)
+    (constraint,) = in_disk.constraints
+    assert in_disk.success and constraint.active and constraint.before > 1.0
+    of = lambda radius: mb.optimise(valley, START, objective="f", constraints={"square": (None, radius)}).objective
+    np.testing.assert_allclose(constraint.multiplier, (of(0.999) - of(1.001)) / 0.002, rtol=1e-2)
+
+
+def test_what_is_printed(in_disk):
+    text = str(in_disk)
+    for word in ("parameter", "x[1]", "before", "after", "multiplier", "iteration", "failed", "terminated"):
+        assert word in text
+    assert in_disk.before["f"] == pytest.approx(24.2) and in_disk.iterations[0].objective == pytest.approx(24.2)
+    assert in_disk.iterations[0].violation > 0 and in_disk.trials >= len(in_disk.iterations) - 1
+
+
+def test_trust_constr_agrees(in_disk):
+    other = mb.optimise(valley, START, objective="f", constraints=DISK, method="trust-constr")
+    assert other.success
+    np.testing.assert_allclose(other.objective, in_disk.objective, rtol=1e-4)
+    np.testing.assert_allclose(other.constraints[0].multiplier, in_disk.constraints[0].multiplier, rtol=1e-2)
+
+
+@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.lbfgs()], ids=str)
+def test_bounds_by_every_method(method):
+    """The optimum on a bound: x = (0.8, 0.64)."""
+    bounds = {"x": (-3.0, [0.8, 1.5])}
+    best = mb.optimise(valley, START, objective="f", bounds=bounds, method=method, max_iterations=1000)
+    np.testing.assert_allclose(best.objective, 0.04, rtol=1e-4)
+    assert best.parameters["x"][0] <= 0.8
+
+
+def test_equations_and_bounds_of_components():
+    sides = {"square": 1.0, "x": ([0.0, None], None)}
+    with pytest.raises(ValueError, match="number, or an array"):
+        mb.optimise(valley, START, objective="f", constraints=sides)
+    sides["x"] = ([-np.inf, 0.7], None)
+    best = mb.optimise(valley, {"x": [0.9, 0.5]}, objective="f", constraints=sides)
+    np.testing.assert_allclose(best.parameters["x"], [np.sqrt(0.51), 0.7], atol=1e-6)
+    assert [c.name for c in best.constraints] == ["square", "x[0]", "x[1]"]
+    assert [c.active for c in best.constraints] == [True, False, True]
+
+
+def test_both_modes_of_derivatives_agree():
+    forward, reverse = (
+        differentiable(Program(valley, in_z, ("f", "x"), True, False), mode, 3).linearised(jnp.ones(2))
+        for in_z, mode in ((Plain(), "forward"), (Plain(), "reverse"))
+    )
+    for a, b in zip(forward, reverse, strict=True):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-13), a, b)
+
+
+class Plain:
+    size = 2
+
+    def __call__(self, z):
+        return {"x": z}
+
+
+def test_the_mode_is_the_one_that_the_function_allows():
+    """A simulation with the default adjoint has reverse mode only; one that takes `adjoint` has both."""
+    m = mb.mechanisms.get("pendulum")
+
+    def angle(v, adjoint=None):
+        new = mb.with_parameters(m.system, v)
+        motion = mb.simulate(
+            new, m.state, t1=0.1, saveat=[0.05, 0.1], solver=diffrax.Tsit5(), adjoint=adjoint, throw=False
+        )
+        return jnp.sum(motion.ys.u[-1] ** 2)
+
+    start = {"gravity.acceleration": [0.0, -9.81]}
+    bounds = {"gravity.acceleration": ([-0.1, -20.0], [0.1, -1.0])}
+    with pytest.raises(ValueError, match=r"no derivatives in forward mode.*adjoint=adjoint"):
+        mb.optimise(lambda v: angle(v), start, bounds=bounds, derivatives="forward")
+    best = [mb.optimise(f, start, bounds=bounds, max_iterations=3) for f in (angle, lambda v: angle(v))]
+    assert [b.derivatives for b in best] == ["forward", "reverse"]
+    np.testing.assert_allclose(best[0].objective, best[1].objective, rtol=1e-6)
+
+
+def edge(v):
+    """Not a number from 0.5 on, where it leads to."""
+    return jnp.where(v["x"] < 0.5, (v["x"] - 1.0) ** 2, jnp.nan)
+
+
+@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.sgd(0.4)], ids=str)
+def test_trials_that_fail_shorten_the_step(method):
+    best = mb.optimise(edge, {"x": -3.0}, method=method, max_iterations=60)
+    assert 0.45 < best.parameters["x"] < 0.5 and np.isfinite(best.objective)
+    assert not best.success
+
+
+def test_a_simulation_that_throws_is_a_trial_that_failed():
+    import equinox as eqx
+
+    thrown = lambda v: eqx.error_if((v["x"] - 1.0) ** 2, v["x"] > 0.5, "no further")
+    best = mb.optimise(thrown, {"x": -3.0}, max_iterations=30)
+    assert best.failed > 0 and 0.4 < best.parameters["x"] <= 0.5
+
+
+def open_(v):
+    """Not a number where the gap is positive."""
+    x = v["x"]
+    gap = jnp.maximum(jnp.hypot(x[0], x[1]) - 1.0, 0.0)
+    return {"f": jnp.where(gap > 0, jnp.nan, (x[0] - 0.2) ** 2 + x[1] ** 2), "gap": gap}
+
+
+def test_a_start_that_fails_is_led_to_one_that_does_not():
+    best = mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints={"gap": (None, 0)})
+    assert best.success and np.isnan(best.before["f"]) and best.before["gap"] > 0
+    np.testing.assert_allclose(best.parameters["x"], [0.2, 0.0], atol=1e-4)
+    assert "led from the start" in best.message
+    with pytest.raises(ValueError, match=r"'f' is not finite.*assembly_gap"):
+        mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f")
+    with pytest.raises(ValueError, match="no constraint that is violated leads away"):
+        mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints={"gap": (None, 9.0)})
+
+
+def hills(v):
+    """Many valleys, the deepest at zero."""
+    return {"f": jnp.sum(v["x"] ** 2 + 20.0 * (1 - jnp.cos(4.0 * v["x"])))}
+
+
+def test_several_starts_find_the_deepest_valley():
+    one = mb.optimise(hills, {"x": [2.9, -3.1]}, bounds={"x": (-4.0, 4.0)})
+    many = mb.optimise(hills, {"x": [2.9, -3.1]}, bounds={"x": (-4.0, 4.0)}, starts=64, local=3)
+    assert one.objective > 1.0 and many.objective < 1e-8
+    assert len(many.attempts) == 3 and many.attempts[0].after == min(a.after for a in many.attempts)
+    with pytest.raises(ValueError, match=r"give 'x\[0\]' both"):
+        mb.optimise(hills, {"x": [2.9, -3.1]}, starts=8)
+
+
+def test_design_variables_bring_bounds_and_scales():
+    m = mb.mechanisms.get("pendulum")
+    name = "gravity.acceleration"
+    system = mb.design(
+        m.system, {"g": mb.Variable(9.0, bounds=(5.0, 10.0))}, lambda v: {name: jnp.stack([0.0 * v["g"], -v["g"]])}
+    )
+    best = mb.optimise(lambda v: -mb.parameters(mb.with_parameters(system, v))[name][1], ["g"], system=system)
+    assert best.parameters["g"] == 5.0 and best.start["g"] == 9.0
+    narrower = mb.optimise(lambda v: v["g"], "g", system=system, bounds={"g": (6.0, None)})
+    np.testing.assert_allclose(narrower.parameters["g"], 6.0)
+    with pytest.raises(ValueError, match="reach beyond"):
+        mb.optimise(lambda v: v["g"], ["g"], system=system, bounds={"g": (4.0, None)})
+    with pytest.raises(ValueError, match="Unknown parameter 'h'"):
+        mb.optimise(lambda v: v["g"], ["h"], system=system)
+
+
+def test_mean_and_spread_of_a_robust_design():
+    """Two minima of equal depth, one of them wide: with scatter the wide one is better."""
+    depth = lambda x, at, width: jnp.exp(-(((x - at) / width) ** 2))
+    landscape = lambda v: {"f": 1.0 + v["level"] - depth(v["x"], -1.0, 0.1) - depth(v["x"], 1.0, 1.0)}
+    rng = np.random.default_rng(0)
+    samples = {"x": 0.2 * rng.standard_normal(64), "level": rng.uniform(-0.1, 0.1, 64)}
+    scattered = mb.robust(landscape, samples, weight=2.0)
+    out = scattered({"x": jnp.asarray(-0.3)})
+    values = landscape({"x": -0.3 + samples["x"], "level": samples["level"]})["f"]
+    np.testing.assert_allclose(out["f.mean"], np.mean(values))
+    np.testing.assert_allclose(out["f.spread"], np.std(values, ddof=1))
+    np.testing.assert_allclose(out["f"], np.mean(values) + 2.0 * np.std(values, ddof=1))
+    best = mb.optimise(scattered, {"x": -0.9}, objective="f", bounds={"x": (-2.0, 2.0)}, starts=16, local=2)
+    assert 0.5 < best.parameters["x"] < 1.5
+    same = mb.robust(lambda v: v["x"] * 0.0, {"x": [0.0, 1.0]}, weight=1.0)
+    assert float(jax.grad(lambda x: same({"x": x})["objective"])(1.0)) == 0.0
+    for bad, message in (
+        ({"x": [1.0]}, "two at least"),
+        ({"x": [1.0, 2.0], "y": [1.0] * 3}, "the same number"),
+        ({}, "at least one"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.robust(landscape, bad)
+
+
+@pytest.mark.parametrize(
+    "message, options",
+    [
+        ("Unknown output 'g'; there are 'f', 'square', 'x'", {"objective": "g"}),
+        ("Name the objective", {}),
+        ("must be a number, but 'x' has shape", {"objective": "x"}),
+        ("did you mean 'square'", {"objective": "f", "constraints": {"squar": (0, 1)}}),
+        ("low ≤ high", {"objective": "f", "constraints": {"square": (1, 0)}}),
+        ("one of them None at most", {"objective": "f", "constraints": {"square": (None, None)}}),
+        ("array of shape", {"objective": "f", "constraints": {"square": (None, [1.0, 2.0])}}),
+        ("low < high", {"objective": "f", "bounds": {"x": (1.0, 0.0)}}),
+        ("not within its bounds", {"objective": "f", "bounds": {"x": (0.0, 2.0)}}),
+        ("Unknown parameter with bounds 'y'", {"objective": "f", "bounds": {"y": (0.0, 2.0)}}),
+        ("must be a pair", {"objective": "f", "bounds": {"x": 2.0}}),
+        ("method must be", {"objective": "f", "method": "newton"}),
+        ("need method='slsqp'", {"objective": "f", "method": "bfgs", "constraints": {"square": (0, 1)}}),
+        ("starts must be", {"objective": "f", "starts": 0}),
+        ("local can be 2 at most", {"objective": "f", "starts": 2, "local": 3}),
+        ("tol must be positive", {"objective": "f", "tol": 0.0}),
+        ("derivatives must be", {"objective": "f", "derivatives": "both"}),
+        ("strictly within", {"objective": "f", "method": "bfgs", "bounds": {"x": (-1.2, 2.0)}}),
+    ],
+)
+def test_bad_input_is_named(message, options):
+    with pytest.raises(ValueError, match=message):
+        mb.optimise(valley, START, **options)
+
+
+def test_bad_starts_are_named():
+    for start, message in (
+        ({}, "empty"),
+        (["x"], "system="),
+        ({"x": [np.nan, 1.0]}, "NaN"),
+        ({"x": "far"}, "real number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.optimise(valley, start, objective="f")
+    with pytest.raises(ValueError, match="must return a number"):
+        mb.optimise(lambda v: {"f": None}, START)
