@@ -28,6 +28,8 @@ from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
+from .studies import cases as cases
 from .studies.identify import Identification as Identification, identify as identify
+from .studies.sweep import load_sweep as load_sweep, sweep as sweep
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load
