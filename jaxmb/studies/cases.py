@@ -31,8 +31,6 @@ class Cases:
     units: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if not self.columns:
-            raise ValueError("A sweep needs at least one parameter with its values.")
         for name, column in self.columns.items():
             good = np.isfinite(column).reshape(column.shape[0], -1).all(axis=1)
             if not good.all():
@@ -128,6 +126,8 @@ def sobol(
 
 def _named(given: Any, more: Mapping[str, Any]) -> dict[str, Any]:
     given = {} if given is None else given
+    if isinstance(given, Mapping) and not (given or more):
+        raise ValueError("A sweep needs at least one parameter with its values.")
     if not isinstance(given, Mapping):
         raise ValueError(f"Cases are values by the parameter's name, or a DataFrame or Dataset; got {given!r}.")
     for name in given:
@@ -161,7 +161,7 @@ def _range(name: str, given: Any) -> np.ndarray:
 
 
 def _of_columns(given: Mapping[str, Any]) -> Cases:
-    single = {name for name, column in given.items() if np.ndim(column) == 0}
+    single = {name for name, column in given.items() if np.isscalar(column) or getattr(column, "shape", None) == ()}
     columns = {name: _numbers(name, [column] if name in single else column) for name, column in given.items()}
     lengths = {name: column.shape[0] for name, column in columns.items() if name not in single}
     if len(set(lengths.values())) > 1:
@@ -195,6 +195,8 @@ def _of_dataset(dataset: Any) -> Cases:
                 f"The coordinate {name!r} of the cases is neither a parameter nor a dimension: "
                 f"dataset.reset_coords({name!r}) makes it a parameter, and with drop=True drops it."
             )
+    if not dataset.variables:
+        raise ValueError("The Dataset of cases is empty.")
     own = dict(dataset.data_vars) or {name: dataset[name] for name in dataset.dims if name in dataset.coords}
     sizes = {str(dim): size for dim, size in dataset.sizes.items()}
     full = {name: xarray.broadcast(variable, dataset)[0].transpose(*sizes) for name, variable in own.items()}

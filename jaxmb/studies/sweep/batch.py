@@ -103,8 +103,8 @@ def _program(batch: Batch, steps: int | None) -> Callable[[Mapping[str, Any]], R
     members = jax.vmap(member)
     if batch.devices:
         mesh, along = Mesh(np.array(batch.devices), ("member",)), PartitionSpec("member")
-        # Each device leaves its loops when its own members have ended; the check would ask diffrax's loops for values that
-        # are the same on all devices.
+        # Each device leaves its loops when its own members have ended; the check would ask diffrax's loops for values
+        # that are the same on all devices.
         members = jax.shard_map(members, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
     return jax.jit(members)
 

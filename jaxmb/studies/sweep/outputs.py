@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend import core
 
 from ...parts.names import unknown
@@ -184,6 +185,4 @@ def _numbers(program: Any) -> Iterator[Any]:
 
 
 def _is_numeric(constant: Any) -> bool:
-    return isinstance(constant, np.ndarray | np.generic | jax.Array | int | float) and not isinstance(
-        constant, jax.core.Tracer
-    )
+    return isinstance(constant, np.ndarray | np.generic | jax.Array | int | float) and not isinstance(constant, Tracer)

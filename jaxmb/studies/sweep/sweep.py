@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..cases import table
@@ -119,7 +120,7 @@ def sweep(
     path = None if store is None else Path(store)
     known = {
         "jaxmb_version": importlib.metadata.version("jaxmb") if _installed() else "not installed",
-        "x64": str(bool(jax.config.jax_enable_x64)),
+        "x64": str(jnp.result_type(float) == jnp.float64),
         "function": identity_of_function(function),
         "cases": identity_of_cases(cases),
         "outputs": str({name: (shape, str(dtype)) for name, (shape, dtype) in outputs.shapes.items()}),
