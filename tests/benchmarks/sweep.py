@@ -13,6 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
+# Before the four-bar is made, also in worker processes.
+os.environ["JAX_ENABLE_X64"] = "1"
 if sys.argv[1:] == ["devices"]:
     os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 
@@ -25,9 +27,7 @@ from jaxmb.studies.sweep import engine
 from jaxmb.studies.sweep.batch import Batch
 from jaxmb.studies.sweep.outputs import declared, statuses
 
-jax.config.update("jax_enable_x64", True)
-
-CHUNK, REPEATS = 256, 5
+CHUNK, REPEATS = 256, 25
 LONG, FAILED = [17, 101, 202], [40, 90, 250]
 
 

@@ -133,20 +133,23 @@ def _submitter(batch: Batch, store: Path | None, executor: futures.Executor) -> 
     return lambda task: executor.submit(_compute, settings, work, task)
 
 
-# The work of the last study in this process, which has its compiled programs.
+# The work of the last study in this process, which has its compiled programs; an executor may compute in threads.
 _work: dict[bytes, Work] = {}
+_lock = threading.Lock()
 
 
 def _compute(settings: dict[str, Any], work: bytes, task: Task) -> tuple[int, dict[str, np.ndarray]]:
     """Compute a chunk in a worker."""
-    if work not in _work:
-        import cloudpickle
+    with _lock:
+        if work not in _work:
+            import cloudpickle
 
-        for name, value in settings.items():
-            jax.config.update(name, value)
-        _work.clear()
-        _work[work] = Work(*cloudpickle.loads(work))
-    return _work[work](task)
+            for name, value in settings.items():
+                jax.config.update(name, value)
+            _work.clear()
+            _work[work] = Work(*cloudpickle.loads(work))
+        own = _work[work]
+    return own(task)
 
 
 def _start_worker(threads: int) -> None:

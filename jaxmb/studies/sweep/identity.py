@@ -1,5 +1,7 @@
 """What a study is, as hashes: whether a store holds the results of this one or of another."""
 
+import contextlib
+import functools
 import hashlib
 import inspect
 import re
@@ -30,6 +32,17 @@ def identity_of_cases(cases: Cases) -> str:
     return digest.hexdigest()
 
 
+def identity_of_variables(variables: Mapping[str, Any]) -> str:
+    """A hash of the names, dimensions, types, shapes and units of all variables, and of the values along dimensions."""
+    digest = hashlib.sha256()
+    for name, (dims, values, shape, attributes) in variables.items():
+        known = values if isinstance(values, np.dtype) else values.dtype
+        digest.update(f"{name} {dims} {known} {shape} {attributes}".encode())
+        if known is not values:
+            digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
 def _add(digest: Any, value: Any, module: str | None, seen: set[int]) -> None:
     """Add a value to a hash, functions by their source and by what they refer to."""
     if isinstance(value, bool | int | float | complex | str | bytes | type(None)):
@@ -48,15 +61,24 @@ def _add(digest: Any, value: Any, module: str | None, seen: set[int]) -> None:
         digest.update(f"{type(value).__name__} {len(value)}".encode())
         for item in value:
             _add(digest, item, module, seen)
+    elif isinstance(value, set | frozenset):
+        digest.update(" ".join(sorted(map(repr, value))).encode())
+    elif isinstance(value, functools.partial):
+        _add(digest, [value.func, value.args, value.keywords], module, seen)
+    elif inspect.ismethod(value):
+        _add(digest, [value.__func__, value.__self__], module, seen)
     elif inspect.isfunction(value) or inspect.isfunction(getattr(value, "__wrapped__", None)):
         seen.add(id(value))
         _add_function(digest, inspect.unwrap(value), module, seen)
     elif inspect.ismodule(value) or inspect.isclass(value) or inspect.isbuiltin(value):
         digest.update(getattr(value, "__qualname__", getattr(value, "__name__", "")).encode())
+        if inspect.isclass(value) and value.__module__ == module:
+            digest.update(_source(value) or b"")
     else:
-        # Systems and other objects: their numbers and what they say of themselves, without addresses.
+        # Systems and other objects: their numbers, and what they consist of.
         seen.add(id(value))
-        digest.update(f"{type(value).__module__}.{type(value).__qualname__}".encode())
+        digest.update(type(value).__module__.encode())
+        _add(digest, type(value), module, seen)
         leaves = jax.tree.leaves(value)
         if len(leaves) == 1 and leaves[0] is value:
             for name, item in sorted(getattr(value, "__dict__", {}).items()):
@@ -70,18 +92,24 @@ def _add_function(digest: Any, function: Any, module: str | None, seen: set[int]
     if function.__module__ != module:
         digest.update(f"{function.__module__}.{function.__qualname__}".encode())
         return
-    try:
-        digest.update(inspect.getsource(function).strip().encode())
-    except (OSError, TypeError):
-        digest.update(function.__code__.co_code + repr(_constants(function.__code__)).encode())
+    code = function.__code__
+    digest.update(_source(function) or code.co_code + repr(_constants(code)).encode())
     _add(digest, function.__defaults__, module, seen)
     _add(digest, function.__kwdefaults__, module, seen)
     for cell in function.__closure__ or ():
-        _add(digest, cell.cell_contents, module, seen)
-    for name in sorted(_names(function.__code__)):
+        with contextlib.suppress(ValueError):  # A cell that holds nothing yet.
+            _add(digest, cell.cell_contents, module, seen)
+    for name in sorted(_names(code)):
         if name in function.__globals__:
             digest.update(name.encode())
             _add(digest, function.__globals__[name], module, seen)
+
+
+def _source(value: Any) -> bytes | None:
+    try:
+        return inspect.getsource(value).strip().encode()
+    except (OSError, TypeError):
+        return None
 
 
 def _names(code: Any) -> set[str]:
@@ -90,5 +118,9 @@ def _names(code: Any) -> set[str]:
 
 
 def _constants(code: Any) -> list[str]:
-    plain = lambda constant: _constants(constant) if inspect.iscode(constant) else constant
+    def plain(constant):
+        if inspect.iscode(constant):
+            return _constants(constant)
+        return sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant
+
     return [re.sub("0x[0-9a-f]+", "", repr(plain(constant))) for constant in code.co_consts]

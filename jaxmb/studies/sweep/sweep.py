@@ -16,7 +16,7 @@ from ..cases import table
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
 from .engine import Task, here, on_executor, on_processes
-from .identity import identity_of_cases, identity_of_function
+from .identity import identity_of_cases, identity_of_function, identity_of_variables
 from .labels import described
 from .outputs import RESERVED, check_parameters, declared, step_limit
 from .progress import shown_progress
@@ -87,7 +87,9 @@ def sweep(
         `jax.distributed.initialize()`, give each call its own part of the cases and its own store, and
         `devices=jax.local_devices()`; a sweep needs no communication.
     - `progress`: whether to show what is done and the time that is left, in one line.
-    - `overwrite`: whether to replace a store that holds another sweep.
+    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases and outputs, the
+        source of its function, and the numbers and functions of the same module that this one refers to; functions that
+        it imports count by their names.
 
     **Returns:** an `xarray.Dataset`, with a dimension for each parameter of a grid, or else with the dimension
     `member`; parameters are coordinates. With the outputs there are `status`: 0 pending, 1 ok, 2 an output is not
@@ -119,11 +121,11 @@ def sweep(
     variables = described(cases, outputs, dims or {}, coords or {}, units or {})
     path = None if store is None else Path(store)
     known = {
-        "jaxmb_version": importlib.metadata.version("jaxmb") if _installed() else "not installed",
+        "jaxmb_version": _version(),
         "x64": str(jnp.result_type(float) == jnp.float64),
         "function": identity_of_function(function),
         "cases": identity_of_cases(cases),
-        "outputs": str({name: (shape, str(dtype)) for name, (shape, dtype) in outputs.shapes.items()}),
+        "outputs": identity_of_variables(variables),
     }
     before = None if path is None or overwrite else stores.study_of(path)
     if before is not None:
@@ -131,6 +133,8 @@ def sweep(
         chunk, budget = before["chunk"], before["budget"]
     size = _chunk(chunk, len(cases), processes)
     batch = Batch(function, outputs, whole_chunk(size, found), limit, None, found)
+    if before is not None and batch.chunk != chunk:
+        raise ValueError(f"The chunk of {chunk} of the store {path} cannot be divided among {len(found)} devices.")
     if budget == "auto":
         uses = limit is not None and outputs.can_be_cut_off and len(cases) >= _FEWEST_FOR_BUDGET
         batch = batch.with_budget(cases) if uses else batch
@@ -225,11 +229,11 @@ def _replace(path: Path, overwrite: bool) -> None:
         shutil.rmtree(path)
 
 
-def _installed() -> bool:
+def _version() -> str:
     try:
-        return bool(importlib.metadata.version("jaxmb"))
+        return importlib.metadata.version("jaxmb")
     except importlib.metadata.PackageNotFoundError:
-        return False
+        return "not installed"
 
 
 def _empty(described: Mapping[str, Any]) -> dict[str, np.ndarray]:
