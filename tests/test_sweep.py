@@ -290,7 +290,7 @@ def test_the_command_line(capsys, tmp_path):
 def _with_small_disk(store):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
     jax.config.update("jax_enable_x64", True)
-    grow = lambda a: {"x": a * jnp.ones(400)}
+    grow = lambda a: {"x": jnp.sin(a * jnp.arange(400.0) ** 2)}
     return mb.sweep(grow, mb.cases.table(a=np.arange(1.0, 21.0)), store, chunk=10, progress=False)
 
 

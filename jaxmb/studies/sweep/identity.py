@@ -32,14 +32,15 @@ def identity_of_cases(cases: Cases) -> str:
     return digest.hexdigest()
 
 
-def identity_of_variables(variables: Mapping[str, Any]) -> str:
-    """A hash of the names, dimensions, types, shapes and units of all variables, and of the values along dimensions."""
+def identity_of_outputs(variables: Mapping[str, Any], cases: Cases) -> str:
+    """A hash of the names, dimensions, types, shapes and units of all outputs, and of the values along dimensions."""
     digest = hashlib.sha256()
     for name, (dims, values, shape, attributes) in variables.items():
-        known = values if isinstance(values, np.dtype) else values.dtype
-        digest.update(f"{name} {dims} {known} {shape} {attributes}".encode())
-        if known is not values:
-            digest.update(np.ascontiguousarray(values).tobytes())
+        digest.update(f"{name} {attributes}".encode())
+        if isinstance(values, np.dtype):
+            digest.update(f"{dims} {values} {shape[1:]}".encode())
+        elif name not in cases.columns:
+            digest.update(f"{dims} {values.dtype} {shape}".encode() + np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
 
 

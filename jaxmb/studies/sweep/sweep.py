@@ -16,7 +16,7 @@ from ..cases import table
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
 from .engine import Task, here, on_executor, on_processes
-from .identity import identity_of_cases, identity_of_function, identity_of_variables
+from .identity import identity_of_cases, identity_of_function, identity_of_outputs
 from .labels import described
 from .outputs import RESERVED, check_parameters, declared, step_limit
 from .progress import shown_progress
@@ -125,7 +125,7 @@ def sweep(
         "x64": str(jnp.result_type(float) == jnp.float64),
         "function": identity_of_function(function),
         "cases": identity_of_cases(cases),
-        "outputs": identity_of_variables(variables),
+        "outputs": identity_of_outputs(variables, cases),
     }
     before = None if path is None or overwrite else stores.study_of(path)
     if before is not None:
