@@ -31,9 +31,11 @@ from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
 from .states.gap import assembly_gap as assembly_gap
+from .studies import cases as cases
 from .studies.identify import Identification as Identification, identify as identify
 from .studies.optimise import Optimum as Optimum, optimise as optimise
 from .studies.robust import robust as robust
+from .studies.sweep import load_sweep as load_sweep, sweep as sweep
 from .system import (
     RigidBodySystem as RigidBodySystem,
     Variable as Variable,

@@ -1,9 +1,9 @@
-"""The command line: `jaxmb mechanisms | run | report`."""
+"""The command line: `jaxmb mechanisms | run | report | sweep`."""
 
 import argparse
 import ast
 import dataclasses
-import importlib.util
+import importlib
 import json
 import os
 import sys
@@ -88,6 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--out", type=Path, help="folder for the table and the figure (default jaxmb-output/NAME)")
     report.set_defaults(command=_report)
     _add_parameters(report)
+
+    from .studies.sweep import command
+
+    command.add_to(commands)
     return parser
 
 
@@ -244,13 +248,12 @@ def _mechanism(arguments: argparse.Namespace) -> "Mechanism":
 
 def _function(where: str):
     """A function from `module:function` or `file.py:function`."""
+    from .studies.sweep.command import module_from
+
     source, _, name = where.rpartition(":")
     try:
         if source.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(Path(source).stem, source)
-            assert spec is not None and spec.loader is not None
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
+            module = module_from(source)
         else:
             sys.path.insert(0, "")
             module = importlib.import_module(source)

@@ -1,0 +1,82 @@
+"""`jaxmb sweep file.py --out runs.zarr`."""
+
+import argparse
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ...parts.names import unknown
+from .outputs import OK
+from .sweep import sweep
+
+_OPTIONS = ("dims", "coords", "units")
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to a parser's commands."""
+    command = commands.add_parser(
+        "sweep",
+        help="compute a function of your own for many cases",
+        description="Compute a function of your own for many cases, and write what it returns to a zarr store. A sweep "
+        "that was interrupted goes on with the same command.",
+    )
+    command.add_argument(
+        "source",
+        help="file.py, which defines `function` and `cases` as jaxmb.sweep takes them, and perhaps `dims`, `coords` "
+        "and `units`; or file.py:function:cases with other names",
+    )
+    command.add_argument("--out", type=Path, required=True, help="folder of the store, such as runs.zarr")
+    command.add_argument("--processes", type=int, default=1, help="processes on this machine (default %(default)d)")
+    command.add_argument("--chunk", type=int, help="members computed together (default 256 or fewer)")
+    command.add_argument("--overwrite", action="store_true", help="replace a store that holds another sweep")
+    command.set_defaults(command=_sweep)
+
+
+def module_from(source: str) -> ModuleType:
+    """A user's file as a module, which cannot be imported by its name."""
+    spec = importlib.util.spec_from_file_location(Path(source).stem, source)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{source} is no Python file.")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _sweep(arguments: argparse.Namespace) -> None:
+    source, *names = arguments.source.split(":")
+    if len(names) not in (0, 2):
+        raise ValueError(f"The source must be file.py or file.py:function:cases, got {arguments.source!r}.")
+    if not Path(source).is_file():
+        raise ValueError(f"There is no file {source}.")
+    try:
+        module = module_from(source)
+        function, cases = (_named(module, source, name) for name in (names or ("function", "cases")))
+        found = sweep(
+            function,
+            cases,
+            arguments.out,
+            **{name: getattr(module, name) for name in _OPTIONS if hasattr(module, name)},
+            chunk=arguments.chunk,
+            processes=arguments.processes,
+            overwrite=arguments.overwrite,
+        )
+    except (ValueError, RuntimeError, OSError):
+        raise
+    except Exception as error:
+        # Whatever the user's file or function raises.
+        reason = str(error).split("\n")[0]
+        raise RuntimeError(f"{source}: {type(error).__name__}: {reason}") from error
+    status = found["status"].to_numpy()
+    print(f"Wrote {arguments.out}: {status.size} members, {int(np.sum(status != OK))} of them failed.")
+    words = found["status"].attrs["flag_meanings"].split()
+    for code in np.unique(status[status != OK]):
+        print(f"  {int(np.sum(status == code))} {words[code]}: {found['message'].to_numpy()[status == code][0]}")
+
+
+def _named(module: ModuleType, source: str, name: str) -> Any:
+    if not hasattr(module, name):
+        raise unknown(f"name in {source}", name, [known for known in vars(module) if not known.startswith("_")])
+    return getattr(module, name)

@@ -1,0 +1,188 @@
+"""What a swept function returns: arrays by name, and how each member ended."""
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.extend import core
+
+from ...parts.names import unknown
+
+PENDING, OK, NOT_FINITE = 0, 1, 2
+RESERVED = ("member", "status", "message", "num_steps", "result")
+
+
+class Returned(NamedTuple):
+    """What one member returned: outputs by name, and from its `result`, if it gave one, how it ended and its steps."""
+
+    values: dict[str, Any]
+    result: Any
+    steps: Any
+
+
+class Outputs(NamedTuple):
+    """What is known of the outputs before anything is computed: shapes and types by name, whether steps are counted,
+    and the name and message of each status.
+    """
+
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype]]
+    steps: bool
+    statuses: tuple[tuple[str, str], ...]
+
+    @property
+    def can_be_cut_off(self) -> bool:
+        """Whether a member tells that it has used up its steps."""
+        return self.steps and any(name == "max_steps_reached" for name, _ in self.statuses)
+
+
+def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixed: Any) -> Returned:
+    """Call the function for one member, and sort what it returns."""
+    given = function(**parameters, **fixed)
+    if not isinstance(given, Mapping):
+        raise ValueError(
+            f"The function of a sweep must return a dictionary of outputs by name, got {type(given).__name__}."
+        )
+    given = dict(given)
+    result, steps = given.pop("result", None), None
+    if result is not None:
+        steps = getattr(result, "stats", {}).get("num_steps")
+        result = getattr(result, "result", result)
+        if not hasattr(result, "_enumeration"):
+            raise ValueError(f"The output 'result' must be a trajectory or its result, got {type(result).__name__}.")
+    values = dict(_flat("", given))
+    for name in values:
+        if name in RESERVED or name in parameters:
+            raise ValueError(f"An output cannot have the name {name!r}, which a sweep or its cases use; rename it.")
+    if not values:
+        raise ValueError("The function of a sweep returned no outputs.")
+    return Returned(values, result, steps)
+
+
+def _flat(prefix: str, given: Mapping[str, Any]):
+    for name, value in given.items():
+        if not isinstance(name, str) or "/" in name:
+            raise ValueError(f"The name of an output must be a string without '/', got {prefix}{name!r}.")
+        if isinstance(value, Mapping):
+            yield from _flat(f"{prefix}{name}.", value)
+            continue
+        array = jnp.asarray(value) if isinstance(value, bool | int | float | complex | np.ndarray) else value
+        if not isinstance(array, jax.Array) or np.dtype(getattr(array.dtype, "name", "O")).kind not in "biufc":
+            hint = "; give a trajectory itself as 'result'" if hasattr(value, "stats") else ""
+            raise ValueError(f"The output {prefix + name!r} must be an array of numbers, got {value!r:.80}{hint}.")
+        yield prefix + name, array
+
+
+def check_parameters(function: Callable[..., Any], names: Any) -> None:
+    """Raise a `ValueError` where the cases and the arguments of the function differ."""
+    try:
+        arguments = inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return  # A callable without a signature tells at its first call.
+    kinds = inspect.Parameter
+    named = {n: a for n, a in arguments.items() if a.kind in (kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY)}
+    if not any(a.kind == kinds.VAR_KEYWORD for a in arguments.values()):
+        for name in names:
+            if name not in named:
+                raise unknown("parameter of the function", name, named)
+    for name, argument in arguments.items():
+        needed = argument.default is kinds.empty and argument.kind not in (kinds.VAR_KEYWORD, kinds.VAR_POSITIONAL)
+        if needed and name not in names and name != "max_steps":
+            raise ValueError(f"The function needs the parameter {name!r}, of which the cases give no values.")
+
+
+def step_limit(function: Callable[..., Any], names: Any) -> int | None:
+    """The default of the function's argument `max_steps`; None if it has no such argument or the cases give it."""
+    try:
+        argument = inspect.signature(function).parameters.get("max_steps")
+    except (TypeError, ValueError):
+        return None
+    if argument is None or "max_steps" in names:
+        return None
+    default = 65536 if argument.default is argument.empty else argument.default
+    if not isinstance(default, int):
+        raise ValueError(f"The default of the function's argument max_steps must be an integer, got {default!r}.")
+    return default
+
+
+def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **fixed: Any) -> Outputs:
+    """Trace the function twice, with the parameters of one member: what it returns, which must be the same.
+
+    **Raises:** `ValueError` for what is no dictionary of arrays, and for a function that is not pure: one that gives
+    other names, shapes or numbers when it is traced again.
+    """
+    abstract = {
+        k: jax.ShapeDtypeStruct(np.shape(v), jax.dtypes.canonicalize_dtype(v.dtype)) for k, v in example.items()
+    }
+    # A new lambda each time, since JAX remembers what it has traced.
+    trace = lambda: jax.make_jaxpr(lambda p: returned(function, p, **fixed), return_shape=True)(abstract)
+    (program, found), (again, found_again) = trace(), trace()
+    first, second = outputs_of(found), outputs_of(found_again)
+    check_same(first, second)
+    if list(_numbers(program)) != list(_numbers(again)):
+        raise ValueError(
+            "The function is not pure: traced twice, it has other numbers in it, as from numpy.random or from "
+            "something that it changes. Make such numbers parameters of the cases."
+        )
+    return first
+
+
+def outputs_of(found: Returned) -> Outputs:
+    """The outputs of one member, from the shapes that tracing gives."""
+    statuses = [("pending", "Not computed yet."), ("ok", ""), ("not_finite", "An output is not finite.")]
+    if found.result is not None:
+        kind = found.result._enumeration
+        # Equinox has no public way from the numbers of an enumeration to their names.
+        statuses += [(name, kind[item]) for name, item in kind._name_to_item.items()][1:]
+    shapes = {name: (tuple(value.shape), np.dtype(value.dtype)) for name, value in found.values.items()}
+    return Outputs(shapes, found.steps is not None, tuple(statuses))
+
+
+def check_same(first: Outputs, other: Outputs) -> None:
+    """Raise a `ValueError` if the function returned something else than at first."""
+    if first == other:
+        return
+    names = sorted(set(first.shapes) ^ set(other.shapes))
+    differing = names or [name for name in first.shapes if first.shapes[name] != other.shapes[name]] or ["result"]
+    raise ValueError(
+        "The function is not pure, or its outputs depend on max_steps: traced again, it returned other names, shapes "
+        f"or types of {', '.join(map(repr, differing))}."
+    )
+
+
+def statuses(found: Returned) -> np.ndarray:
+    """The status of each member of a batch, shape (members,)."""
+    members = next(iter(found.values.values())).shape[0]
+    finite = np.ones(members, bool)
+    for value in found.values.values():
+        if value.dtype.kind in "fc":
+            finite &= np.isfinite(value).reshape(members, -1).all(axis=1)
+    ended = np.where(finite, OK, NOT_FINITE)
+    if found.result is not None:
+        kind, code = found.result._enumeration, np.asarray(found.result._value)
+        names = list(kind._name_to_item)
+        # After an event the saved times that are left hold infinity, as in diffrax.
+        by_event = code == (names.index("event_occurred") if "event_occurred" in names else -1)
+        ended = np.where(code == 0, ended, np.where(by_event, OK, code + NOT_FINITE))
+    return ended.astype(np.int16)
+
+
+def _numbers(program: Any) -> Iterator[Any]:
+    """The operations of a traced program by name, and the literals and constants in it, as bytes."""
+    if isinstance(program, core.ClosedJaxpr):
+        yield from (np.asarray(c).tobytes() for c in program.consts if _is_numeric(c))
+        program = program.jaxpr
+    is_program = lambda x: isinstance(x, core.ClosedJaxpr | core.Jaxpr)
+    for equation in program.eqns:
+        yield equation.primitive.name
+        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, core.Literal))
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):
+            if is_program(inner):
+                yield from _numbers(inner)
+
+
+def _is_numeric(constant: Any) -> bool:
+    return isinstance(constant, np.ndarray | np.generic | jax.Array | int | float) and not isinstance(constant, Tracer)

@@ -1,0 +1,258 @@
+"""A function of named parameters over many cases."""
+
+import contextlib
+import importlib.metadata
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..cases import table
+from . import dataset, store as stores
+from .batch import Batch, whole_chunk
+from .engine import Task, here, on_executor, on_processes
+from .identity import identity_of_cases, identity_of_function, identity_of_outputs
+from .labels import described
+from .outputs import RESERVED, check_parameters, declared, step_limit
+from .progress import shown_progress
+
+# Large enough that what a chunk costs besides its members does not count, small enough that little is lost.
+_CHUNK = 256
+# With fewer members it takes longer to compile a second program than any of them can hold up the others.
+_FEWEST_FOR_BUDGET = 64
+
+
+def sweep(
+    function: Callable[..., Mapping[str, Any]],
+    cases: Any,
+    store: str | Path | None = None,
+    *,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    coords: Mapping[str, Any] | None = None,
+    units: Mapping[str, str] | None = None,
+    chunk: int | None = None,
+    budget: int | Literal["auto"] | None = "auto",
+    processes: int = 1,
+    executor: Executor | None = None,
+    devices: int | Sequence[Any] | None = None,
+    progress: bool = True,
+    overwrite: bool = False,
+) -> Any:
+    """Compute a function for many cases of its parameters.
+
+    ```python
+    def motion(stiffness, speed):
+        changed = mb.with_parameters(system, {"spring.stiffness": stiffness})
+        state = mb.assemble(changed, rates={"crank.angle": speed}, throw=False)
+        sol = mb.simulate(changed, state, t1=1.0, saveat=ts, throw=False)
+        return {"angle": sol["crank"].angle, "result": sol}
+
+    cases = mb.cases.grid(stiffness=np.logspace(2, 4, 50), speed=np.linspace(0.0, 5.0, 40))
+    runs = mb.sweep(motion, cases, "runs.zarr", dims={"angle": ["time"]}, coords={"time": ts}, processes=4)
+    runs["angle"].sel(stiffness=1e3, method="nearest").plot()
+    ```
+
+    **Main arguments:**
+
+    - `function`: gets the parameters of one member by keyword, as JAX arrays, and returns a dictionary of outputs by
+        name: arrays of any shape; a dictionary within it gives `outer.inner`. Under the name `result` it may return a
+        `Trajectory` (of `simulate(..., throw=False)`), or its `result`, which becomes the member's status and message,
+        and its number of steps. The function is pure and traced by JAX: parameters are not known as numbers in it.
+    - `cases`: from `jaxmb.cases.grid`, `table` or `sobol`; or whatever `table` takes: columns of equal length by
+        name, a pandas DataFrame, an xarray Dataset.
+    - `store`: a folder to write to, as zarr format 3; it must be seen by all processes. Without it the result is in
+        memory only. If it holds a part of this very sweep, only what is missing is computed, so that a sweep that was
+        killed goes on with the same call, and ends with the same bits. It can be read at any time: `load_sweep`.
+    - `dims`, `coords`, `units`: names of the dimensions of an output by its name, default `angle_0`, `angle_1`, …;
+        values along a dimension by its name; and units by the name of a parameter, output or dimension.
+
+    **Other arguments:**
+
+    - `chunk`: members that are computed together, default 256 or fewer; what is lost when a process is killed, and what
+        takes memory. The store keeps it.
+    - `budget`: most steps of a member in a chunk. Members that run together take as long as the slowest of them. So if
+        the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`, members that
+        use up the budget are computed anew with the default of `max_steps`, a few together. Default `"auto"`: chosen
+        from the steps of 16 members all over the cases; None: no budget.
+    - `processes`: on this machine, each with its share of the cores. A process that dies is replaced.
+    - `executor`: any `concurrent.futures.Executor` instead: Dask's `client.get_executor()`,
+        `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves.
+    - `devices`: a number of `jax.local_devices()`, or a list of them, among which the members of a chunk are divided,
+        each device with loops of its own. On several hosts, each with devices, start the same script on every host with
+        `jax.distributed.initialize()`, give each call its own part of the cases and its own store, and
+        `devices=jax.local_devices()`; a sweep needs no communication.
+    - `progress`: whether to show what is done and the time that is left, in one line.
+    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases and outputs, the
+        source of its function, and the numbers and functions of the same module that this one refers to; functions that
+        it imports count by their names.
+
+    **Returns:** an `xarray.Dataset`, with a dimension for each parameter of a grid, or else with the dimension
+    `member`; parameters are coordinates. With the outputs there are `status`: 0 pending, 1 ok, 2 an output is not
+    finite, and further numbers by `flag_meanings` of its attributes; `message`, empty if ok; and `num_steps` if it is
+    known. A member that fails costs nothing to the others. With a store, a list of members is read when it is looked
+    at.
+
+    **Raises:** `ValueError` for names that are unknown, missing, or there twice, for values that do not fit, for a
+    function that returns no dictionary of arrays or is not pure, and for a store of another sweep; `OSError` if the
+    store cannot be written, as on a full disk: what is done is kept, and the same call again goes on; `RuntimeError` if
+    processes die again and again; `ImportError` without the packages of `jaxmb[studies]`. An interruption (Ctrl-C)
+    keeps what is done as well.
+
+    That a sweep ends with the same bits however often it was interrupted holds for one kind of processor, one version
+    of the packages and one `chunk`, also between processes and executors.
+    """
+    dataset.packages(*(("xarray",) if store is None else ("xarray", "zarr")))
+    cases = table(cases)
+    for name in cases.columns:
+        if name in RESERVED:
+            raise ValueError(f"A parameter cannot have the name {name!r}, which the result of a sweep uses.")
+    check_parameters(function, cases.columns)
+    _check_engine(processes, executor, devices)
+    found = _devices(devices)
+    limit = step_limit(function, cases.columns)
+    outputs = declared(
+        function, {n: c[0] for n, c in cases.columns.items()}, **({} if limit is None else {"max_steps": limit})
+    )
+    variables = described(cases, outputs, dims or {}, coords or {}, units or {})
+    path = None if store is None else Path(store)
+    known = {
+        "jaxmb_version": _version(),
+        "x64": str(jnp.result_type(float) == jnp.float64),
+        "function": identity_of_function(function),
+        "cases": identity_of_cases(cases),
+        "outputs": identity_of_outputs(variables, cases),
+    }
+    before = None if path is None or overwrite else stores.study_of(path)
+    if before is not None:
+        _check_same_study(path, before, known, chunk, budget)
+        chunk, budget = before["chunk"], before["budget"]
+    size = _chunk(chunk, len(cases), processes)
+    batch = Batch(function, outputs, whole_chunk(size, found), limit, None, found)
+    if before is not None and batch.chunk != chunk:
+        raise ValueError(f"The chunk of {chunk} of the store {path} cannot be divided among {len(found)} devices.")
+    if budget == "auto":
+        uses = limit is not None and outputs.can_be_cut_off and len(cases) >= _FEWEST_FOR_BUDGET
+        batch = batch.with_budget(cases) if uses else batch
+    elif budget is not None:
+        batch = batch.limited(_checked_budget(batch, budget))
+    attrs = dataset.attributes(cases, {**known, "chunk": batch.chunk, "budget": batch.budget})
+    computed = _empty(variables) if path is None else {}
+    count, done = -(-len(cases) // batch.chunk), {}
+    if path is not None:
+        with _clear_errors(path):
+            if before is None:
+                _replace(path, overwrite)
+                stores.create(path, variables, attrs, batch.chunk)
+            done = {index: values["status"] for index, values in stores.chunks(stores.Store(path, batch.chunk), count)}
+    own = lambda index: slice(index * batch.chunk, (index + 1) * batch.chunk)
+    tasks = (Task(index, cases[own(index)]) for index in range(count) if index not in done)
+    with shown_progress(progress, cases, done) as advance, _clear_errors(path):
+        for index, values in _chunks(batch, path, tasks, processes, executor):
+            for name, value in values.items() if path is None else ():
+                computed[name][own(index)] = value
+            advance(values["status"])
+    if path is None:
+        return dataset.in_memory(variables, attrs, computed)
+    stores.remove_leftovers(path)
+    return dataset.load_sweep(path)
+
+
+def _chunks(batch: Batch, path: Path | None, tasks: Iterator[Task], processes: int, executor: Executor | None):
+    if executor is not None:
+        return on_executor(batch, path, tasks, executor)
+    return here(batch, path, tasks) if processes == 1 else on_processes(batch, path, tasks, processes)
+
+
+def _check_engine(processes: Any, executor: Any, devices: Any) -> None:
+    if not isinstance(processes, int | np.integer) or isinstance(processes, bool) or processes < 1:
+        raise ValueError(f"processes must be an integer of at least 1, got {processes!r}.")
+    if executor is not None and not isinstance(executor, Executor):
+        raise ValueError(
+            f"executor must be a concurrent.futures.Executor, got {executor!r}; Dask's is client.get_executor()."
+        )
+    if (processes > 1) + (executor is not None) + (devices is not None) > 1:
+        raise ValueError("Give one of processes, executor and devices; the others have no effect beside it.")
+
+
+def _devices(given: Any) -> tuple[Any, ...]:
+    if given is None:
+        return ()
+    there = jax.local_devices()
+    if isinstance(given, int | np.integer):
+        if not 1 <= given <= len(there):
+            raise ValueError(f"devices must be between 1 and the {len(there)} that JAX has here, got {given}.")
+        return tuple(there[:given])
+    if not (isinstance(given, Sequence) and given and all(isinstance(device, jax.Device) for device in given)):
+        raise ValueError(f"devices must be a number or a list of jax.local_devices(), got {given!r}.")
+    return tuple(given)
+
+
+def _chunk(given: Any, members: int, processes: int) -> int:
+    if given is None:
+        return min(_CHUNK, -(-members // processes))
+    if not isinstance(given, int | np.integer) or isinstance(given, bool) or given < 1:
+        raise ValueError(f"chunk must be an integer of at least 1, got {given!r}.")
+    return min(int(given), members)
+
+
+def _checked_budget(batch: Batch, budget: Any) -> int:
+    if not isinstance(budget, int | np.integer) or budget < 1:
+        raise ValueError(f"budget must be 'auto', None or an integer of at least 1, got {budget!r}.")
+    if batch.max_steps is None or not batch.outputs.can_be_cut_off:
+        raise ValueError(
+            "A budget needs a function with an argument max_steps that hands it to simulate(..., max_steps=max_steps) "
+            "and that returns the trajectory as 'result'."
+        )
+    return int(budget)
+
+
+def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, str], chunk: Any, budget: Any) -> None:
+    differing = [name.replace("jaxmb_version", "version of jaxmb") for name in known if before.get(name) != known[name]]
+    if differing:
+        raise ValueError(
+            f"The store {path} holds another sweep: the {' and '.join(differing)} differ. Give another path, or "
+            "overwrite=True to replace it."
+        )
+    for name, given, kept in (("chunk", chunk, before["chunk"]), ("budget", budget, before["budget"])):
+        if given not in (None, "auto", kept):
+            raise ValueError(f"The store {path} was begun with {name}={kept}, got {given!r}; leave it out to go on.")
+
+
+def _replace(path: Path, overwrite: bool) -> None:
+    """Remove the store of another sweep, and nothing else."""
+    if overwrite and stores.study_of(path) is not None:
+        shutil.rmtree(path)
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("jaxmb")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _empty(described: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    return {
+        name: np.zeros(shape, values)
+        for name, (_, values, shape, _) in described.items()
+        if isinstance(values, np.dtype)
+    }
+
+
+@contextlib.contextmanager
+def _clear_errors(path: Path | None) -> Iterator[None]:
+    """Say of a write that failed that nothing is lost."""
+    try:
+        yield
+    except OSError as error:
+        if path is None:
+            raise
+        raise OSError(
+            f"The store {path} cannot be written: {error}. The chunks that are done are kept; make room or give "
+            "access, and the same call again goes on."
+        ) from error

@@ -1,0 +1,131 @@
+"""Sweeps: cost over a bare `jax.vmap`, a batch with members that fail and that take long, devices against processes,
+and whole studies from the command line.
+
+Run it with `NPROC=1 python tests/benchmarks/sweep.py overhead | long | devices`, and the studies with
+`MEMBERS=100000 jaxmb sweep tests/benchmarks/sweep_four_bar.py --out four_bar.zarr --processes 2` and
+`MEMBERS=2000 jaxmb sweep tests/benchmarks/sweep_vehicle.py --out vehicle.zarr --processes 2`.
+"""
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+# Before the four-bar is made, also in worker processes.
+os.environ["JAX_ENABLE_X64"] = "1"
+if sys.argv[1:] == ["devices"]:
+    os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+
+import jax
+import numpy as np
+from sweep_four_bar import four_bar
+
+import jaxmb as mb
+from jaxmb.studies.sweep import engine
+from jaxmb.studies.sweep.batch import Batch
+from jaxmb.studies.sweep.outputs import declared, statuses
+
+CHUNK, REPEATS = 256, 8
+LONG, FAILED = [17, 101, 202], [40, 90, 250]
+
+
+def fastest(*runs, repeats=REPEATS, clock=time.process_time):
+    """The shortest time of each of several runs, which take turns; of the processor, which others may use as well."""
+    best = np.full(len(runs), np.inf)
+    for _ in range(repeats):
+        for k, run in enumerate(runs):
+            start = clock()
+            jax.block_until_ready(run())
+            best[k] = min(best[k], clock() - start)
+    return best
+
+
+def timed(run):
+    start = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - start
+
+
+def batch_of(cases, **options):
+    return Batch(four_bar, declared(four_bar, {k: v[0] for k, v in cases.columns.items()}, max_steps=65536), **options)
+
+
+def overhead(chunks=8):
+    """Chunks of a sweep, computed and written, against a bare `jax.vmap` of the function, and against a single run."""
+    folder = tempfile.mkdtemp()
+    store = Path(folder) / "runs.zarr"
+    cases = mb.cases.table(length=np.linspace(0.8, 1.1, chunks * CHUNK), t1=np.full(chunks * CHUNK, 0.5))
+    bare = jax.jit(jax.vmap(lambda length, t1: {"angle": four_bar(length, t1)["angle"]}))
+    parts = [cases[slice(k * CHUNK, (k + 1) * CHUNK)] for k in range(chunks)]
+    begin = time.perf_counter()
+    mb.sweep(four_bar, cases, store, chunk=CHUNK, budget=None, progress=False)
+    print(f"the whole sweep with compiling: {time.perf_counter() - begin:.1f} s")
+    work = engine.Work(batch_of(cases, chunk=CHUNK, max_steps=65536), store)
+    swept = lambda: [work(engine.Task(k, part)) for k, part in enumerate(parts)] and None
+    plain = lambda: [np.asarray(bare(**part)["angle"]) for part in parts]
+    swept(), plain()
+    times = fastest(swept, plain)
+    print(f"{chunks} chunks: sweep {times[0]:.3f} s, bare vmap {times[1]:.3f} s, ratio {times[0] / times[1]:.3f}")
+    single = jax.jit(lambda length, t1: four_bar(length, t1)["angle"])
+    first = {k: v[0] for k, v in cases.columns.items()}
+    single(**first)
+    (alone,) = fastest(lambda: [single(**first) for _ in range(20)])
+    shutil.rmtree(folder)
+    print(f"a member {1e3 * times[0] / len(cases):.3f} ms, a single run {1e3 * alone / 20:.3f} ms")
+
+
+def long():
+    """256 members, 3 of which fail and 3 of which take ten times the steps, against the good ones alone."""
+    length, t1 = np.linspace(0.8, 1.1, CHUNK), np.full(CHUNK, 0.5)
+    good = {"length": length, "t1": t1}
+    length, t1 = length.copy(), t1.copy()
+    t1[LONG], length[FAILED] = 5.0, 9.0
+    mixed = mb.cases.table(length=length, t1=t1)
+    full = batch_of(mixed, chunk=CHUNK, max_steps=65536)
+    chosen = full.with_budget(mixed)
+    run, alone = chosen.compiled(), full.compiled()
+    found, steps = run(mixed.columns), np.asarray(alone(good).steps)
+    words = [full.outputs.statuses[code][0] for code in statuses(found)]
+    own = np.asarray(found.steps)
+    print(f"budget {chosen.budget}, steps of the good {steps.min()} to {steps.max()}, of the long {own[LONG]}")
+    print(f"failed: {sorted({words[k] for k in FAILED})}, steps {own[FAILED]}")
+    times = fastest(lambda: run(mixed.columns), lambda: alone(good), lambda: alone(mixed.columns))
+    print(f"with a budget {times[0]:.3f} s, the good alone {times[1]:.3f} s, mixed without a budget {times[2]:.3f} s")
+    print(f"ratio {times[0] / times[1]:.2f}, without a budget {times[2] / times[1]:.2f}")
+
+
+def devices(chunks=8):
+    """Two devices against two processes, each with its compiled programs, and against one device."""
+    import concurrent.futures as futures
+    import multiprocessing
+
+    size = 2 * CHUNK
+    cases = mb.cases.table(length=np.linspace(0.8, 1.1, chunks * size), t1=np.full(chunks * size, 0.5))
+    parts = [cases[slice(k * size, (k + 1) * size)] for k in range(chunks)]
+    two = batch_of(cases, chunk=size, max_steps=65536, devices=tuple(jax.devices()[:2])).compiled()
+    on_devices = lambda: [two(part) for part in parts] and None
+    print(f"first run on devices {timed(on_devices):.1f} s")
+    context = multiprocessing.get_context("spawn")
+    os.environ.pop("XLA_FLAGS")
+    with futures.ProcessPoolExecutor(2, mp_context=context) as pool:
+        halves = [{k: v[j * CHUNK : (j + 1) * CHUNK] for k, v in part.items()} for part in parts for j in (0, 1)]
+        on_processes = lambda: list(pool.map(in_process, halves)) and None
+        print(f"first run on processes {timed(on_processes):.1f} s")
+        times = fastest(on_devices, on_processes, clock=time.perf_counter)
+    print(f"devices {times[0]:.3f} s, processes {times[1]:.3f} s, ratio {times[0] / times[1]:.2f}")
+
+
+_run = []
+
+
+def in_process(columns):
+    """A chunk in a worker, whose program is compiled once."""
+    if not _run:
+        _run.append(batch_of(mb.cases.table(columns), chunk=CHUNK, max_steps=65536).compiled())
+    return np.asarray(_run[0](columns).values["angle"])
+
+
+if __name__ == "__main__":
+    {"overhead": overhead, "long": long, "devices": devices}[sys.argv[1]]()

@@ -1,0 +1,388 @@
+"""Sweeps of small functions: outputs, status, stores, refusals; killed and damaged ones."""
+
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sweeping
+import xarray as xr
+from sweeping import CASES, CHUNKS, files, forked, marks, run, spring, wait_for
+
+import jaxmb as mb
+from jaxmb.cli import main
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    store = tmp_path_factory.mktemp("sweep") / "runs.zarr"
+    return store, run(store)
+
+
+def test_outputs_of_any_shape_over_a_grid(tmp_path):
+    def function(a, p):
+        return {
+            "x": a * p,
+            "y": {"m": jnp.outer(p, p) * a, "n": jnp.int32(2)},
+            "z": a > 1.0,
+            "w": jax.lax.complex(a, p[0]),
+        }
+
+    cases = mb.cases.grid(a=[1.0, 2.0, 3.0], p=[[1.0, 2.0], [3.0, 4.0]])
+    options = {"dims": {"x": ["axis"]}, "coords": {"axis": [7, 8]}, "units": {"a": "m", "x": "N", "axis": "s"}}
+    found = mb.sweep(function, cases, chunk=4, progress=False, **options)
+    assert found["x"].dims == ("a", "p_index", "axis") and found["y.m"].dims == ("a", "p_index", "y.m_0", "y.m_1")
+    for i, a in enumerate([1.0, 2.0, 3.0]):
+        for j, p in enumerate(np.array([[1.0, 2.0], [3.0, 4.0]])):
+            np.testing.assert_array_equal(found["x"][i, j], a * p)
+            np.testing.assert_array_equal(found["y.m"][i, j], a * np.outer(p, p))
+            np.testing.assert_array_equal(found["w"][i, j], a + 1j * p[0])
+            assert found["z"][i, j] == (a > 1) and found["y.n"][i, j] == 2
+    assert found["x"].attrs == {"units": "N"} and found["a"].attrs == {"units": "m"} and found["p"].shape == (2, 2)
+    assert np.all(found["status"] == 1) and np.all(found["message"] == "")
+    kept = mb.sweep(function, cases, tmp_path / "s", chunk=4, progress=False, **options)
+    xr.testing.assert_identical(kept, found)
+
+
+def test_a_plain_reader_opens_the_store(undisturbed):
+    store, found = undisturbed
+    plain = xr.open_zarr(store, chunks=None)
+    np.testing.assert_array_equal(plain["wave"], found["wave"])
+    assert set(plain.coords) == {"a", "b"} and plain["status"].attrs["flag_meanings"].split()[1] == "ok"
+    assert (
+        plain.attrs["x64"] == "True" and plain.attrs["chunk"] == sweeping.CHUNK and len(plain.attrs["function"]) == 64
+    )
+    assert json.loads((store / "wave" / "zarr.json").read_text())["zarr_format"] == 3
+
+
+def test_values_equal_a_bare_vmap_and_failures_cost_nothing_to_others(undisturbed):
+    _, found = undisturbed
+    bare = jax.jit(jax.vmap(spring))(jnp.asarray(CASES.columns["a"]), jnp.asarray(CASES.columns["b"]))
+    np.testing.assert_allclose(found["wave"], bare["wave"], rtol=1e-14, atol=1e-15)
+    np.testing.assert_array_equal(found["status"], np.where(CASES.columns["a"] < 1.5, 2, 1))
+    assert found["message"].to_numpy()[0] == "An output is not finite." and found["more.count"].dtype == np.int32
+
+
+def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_damaged_only_what_is(undisturbed, tmp_path, monkeypatch):
+    store = tmp_path / "runs.zarr"
+    shutil.copytree(undisturbed[0], store)
+    before = files(store)
+    computed = []
+    engine = sys.modules["jaxmb.studies.sweep.engine"]
+    own = engine.Work.__call__
+    monkeypatch.setattr(engine.Work, "__call__", lambda work, task: (computed.append(task.place), own(work, task))[1])
+    xr.testing.assert_identical(run(store).load(), undisturbed[1].load())
+    assert computed == []
+    # A flipped bit, an empty file, a file that is gone, a mark that is gone, a leftover of a killed writer.
+    wave = store / "wave" / "c"
+    flipped = bytearray((wave / "3" / "0").read_bytes())
+    flipped[20] ^= 4
+    (wave / "3" / "0").write_bytes(flipped)
+    (wave / "5" / "0").write_bytes(b"")
+    (wave / "7" / "0").unlink()
+    (store / "status" / "c" / "9").unlink()
+    (store / "status" / "c" / "9.0123.partial").write_bytes(b"half")
+    with pytest.warns(UserWarning, match="damaged") as warned:
+        run(store)
+    assert len(warned) == 3 and computed == [3, 5, 7, 9] and files(store) == before
+
+
+def test_a_store_can_be_read_while_it_is_written(undisturbed, tmp_path):
+    store = tmp_path / "runs.zarr"
+    shutil.copytree(undisturbed[0], store)
+    for place in ("status/c/4", "wave/c/4/0", "more.count/c/4", "more.square/c/4"):
+        (store / place).unlink()
+    found = mb.load_sweep(store)
+    assert np.all(found["status"][40:50] == 0) and np.all(np.isnan(found["wave"][40:50]))
+    assert np.all(found["message"][40:50] == "Not computed yet.") and np.all(found["status"][50:] != 0)
+
+
+def test_the_store_of_another_study_is_refused(undisturbed, tmp_path):
+    store = tmp_path / "runs.zarr"
+    shutil.copytree(undisturbed[0], store)
+    before = files(store)
+    factor = 2.0
+    other = lambda a, b: {"wave": a * b * factor}
+    with pytest.raises(ValueError, match=r"another sweep: the function and outputs differ.*overwrite=True"):
+        mb.sweep(other, CASES, store, progress=False)
+    with pytest.raises(ValueError, match="the cases differ"):
+        mb.sweep(spring, mb.cases.table(a=[1.0], b=[2.0]), store, progress=False)
+    with pytest.raises(ValueError, match="begun with chunk=10, got 20"):
+        mb.sweep(spring, CASES, store, chunk=20, progress=False)
+    assert files(store) == before
+    cases = mb.cases.table(a=[1.0], b=[2.0])
+    assert mb.sweep(other, cases, store, overwrite=True, progress=False)["wave"].item() == 4.0
+    # A number that the function refers to is a part of the study.
+    factor = 3.0
+    with pytest.raises(ValueError, match="the function differ"):
+        mb.sweep(other, cases, store, progress=False)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("x")
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match="holds no sweep"):
+            mb.sweep(other, cases, tmp_path / "mine", overwrite=overwrite, progress=False)
+    assert (tmp_path / "mine" / "thesis.txt").exists()
+
+
+def _counting():
+    calls = []
+
+    def function(a):
+        calls.append(0)
+        return {f"x{len(calls)}": a}
+
+    return function
+
+
+def _random():
+    generator = np.random.default_rng(0)
+    return lambda a: {"x": a + generator.standard_normal()}
+
+
+@pytest.mark.parametrize(
+    "function, options, message",
+    [
+        (lambda a: a, {}, "must return a dictionary of outputs by name, got"),
+        (lambda a: {}, {}, "no outputs"),
+        (lambda a: {"x": "word"}, {}, "'x' must be an array of numbers, got 'word'"),
+        (lambda a: {"x": {"y": (a, a)}}, {}, "'x.y' must be an array"),
+        (lambda a: {"a": a}, {}, "cannot have the name 'a'"),
+        (lambda a: {"x": a, "result": 3}, {}, "'result' must be a trajectory"),
+        (lambda alpha: {"x": alpha}, {}, "Unknown parameter of the function 'a'"),
+        (lambda a, b: {"x": a}, {}, "needs the parameter 'b'"),
+        (_counting(), {}, "not pure.*names, shapes or types of 'x1', 'x2'"),
+        (_random(), {}, "not pure: traced twice, it has other numbers"),
+        (lambda a: {"x": a + jnp.zeros((2,)) + jnp.zeros((3,))}, {}, "shapes"),
+        (lambda a: {"x": a}, {"dims": {"y": []}}, "Unknown output in dims 'y'"),
+        (lambda a: {"x": a}, {"dims": {"x": ["t"]}}, "must be a list of 0 names"),
+        (lambda a: {"x": a * jnp.ones(2)}, {"dims": {"x": ["a"]}}, "'a' of 'x' has the name of something else"),
+        (lambda a: {"x": a * jnp.ones((2, 3))}, {"dims": {"x": ["t", "t"]}}, "length 2, but in 'x' 3"),
+        (lambda a: {"x": a * jnp.ones(2)}, {"dims": {"x": ["time"]}, "coords": {"tim": [1]}}, "mean 'time'"),
+        (lambda a: {"x": a * jnp.ones(2)}, {"dims": {"x": ["t"]}, "coords": {"t": [1]}}, "must be 2 numbers"),
+        (lambda a: {"x": a}, {"units": {"y": "m"}}, "Unknown name in units 'y'"),
+        (lambda a: {"x": a}, {"units": "m"}, "units must be a dictionary"),
+        (lambda a: {"x": a}, {"chunk": 0}, "chunk must be"),
+        (lambda a: {"x": a}, {"processes": 0}, "processes must be"),
+        (lambda a: {"x": a}, {"executor": 3}, "executor must be a concurrent"),
+        (lambda a: {"x": a}, {"devices": 99}, "devices must be between 1"),
+        (lambda a: {"x": a}, {"devices": 1, "processes": 2}, "Give one of"),
+        (lambda a: {"x": a}, {"budget": 5}, "needs a function with an argument max_steps"),
+    ],
+)
+def test_what_does_not_fit_is_named(function, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        mb.sweep(function, mb.cases.table(a=[1.0, 2.0]), progress=False, **options)
+
+
+def _steps(n, budget, max_steps=100):
+    """As a simulation that takes n steps: what is cut off is not a number."""
+    del budget
+    done = n <= max_steps
+    taken = jax.lax.while_loop(lambda k: (k < n) & (k < max_steps), lambda k: k + 1, 0)
+    result = diffrax.RESULTS.where(done, diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached)
+    result = diffrax.RESULTS.where(n == 3, diffrax.RESULTS.singular, result)
+    return {"n2": jnp.where(done, n * n, -1), "result": _Solution(result, {"num_steps": taken})}
+
+
+class _Solution:
+    def __init__(self, result, stats):
+        self.result, self.stats = result, stats
+
+
+def test_members_beyond_the_budget_are_computed_anew():
+    n = np.full(200, 10)
+    n[[5, 50, 120]], n[[7, 9]], n[77] = 90, 300, 3
+    function = lambda n, max_steps=100: _steps(n, None, max_steps)
+    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=64)
+    assert found.attrs["budget"] == 11
+    np.testing.assert_array_equal(found["n2"], np.where(n <= 100, n * n, -1))
+    np.testing.assert_array_equal(found["num_steps"], np.minimum(n, 100))
+    words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
+    assert list(np.flatnonzero(words == "max_steps_reached")) == [7, 9] and words[77] == "singular"
+    assert np.sum(words == "ok") == 197 and "maximum number of solver steps" in str(found["message"][7].item())
+    for budget in (None, 50, 1000):
+        other = mb.sweep(function, mb.cases.table(n=n), progress=False, budget=budget)
+        assert other.drop_attrs().identical(found.drop_attrs()), budget
+
+
+@pytest.mark.long
+def test_motions_that_fail_have_a_status():
+    mechanism = mb.mechanisms.get("pendulum")
+    name = next(name for name in mb.parameters(mechanism.system) if name.endswith("mass"))
+
+    def motion(mass):
+        system = mb.with_parameters(mechanism.system, {name: mass})
+        sol = mb.simulate(system, mechanism.state, t1=0.1, rtol=1e-5, throw=False)
+        return {"q": sol.ys.q[-1], "result": sol}
+
+    found = mb.sweep(motion, mb.cases.table(mass=[1.0, -1.0, 2.0]), progress=False)
+    words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
+    assert list(words) == ["ok", "invalid_parameters", "ok"] and "not of the sign" in str(found["message"][1].item())
+    assert np.all(np.isnan(found["q"][1])) and np.all(found["num_steps"][::2] > 0)
+    np.testing.assert_allclose(found["q"][0], found["q"][2], rtol=1e-12)
+
+
+def test_a_thread_pool_is_an_executor(undisturbed, tmp_path):
+    with ThreadPoolExecutor(1) as executor:
+        run(tmp_path / "runs.zarr", executor=executor)
+    assert files(tmp_path / "runs.zarr") == files(undisturbed[0])
+
+
+def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
+    engine, store = sys.modules["jaxmb.studies.sweep.engine"], tmp_path / "runs.zarr"
+    own = engine.Work.__call__
+
+    def interrupted(work, task):
+        if task.place == 5:
+            raise KeyboardInterrupt
+        return own(work, task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(engine.Work, "__call__", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(store)
+    assert marks(store) == 5
+    run(store)
+    assert files(store) == files(undisturbed[0])
+
+
+def test_progress_tells_the_time_left_and_failures(capsys):
+    mb.sweep(lambda a: {"x": jnp.sqrt(a)}, mb.cases.table(a=[-1.0, 1.0]))
+    shown = capsys.readouterr().err.strip().split("\r")[-1]
+    assert "2/2" in shown and "00:00" in shown and "1 failed" in shown and "\n" not in shown
+
+
+def test_the_command_line(capsys, tmp_path):
+    file = tmp_path / "study.py"
+    file.write_text(
+        "import jax.numpy as jnp, numpy as np, jaxmb as mb\n"
+        "def function(a, b):\n    return {'x': jnp.sqrt(a) * b}\n"
+        "cases = mb.cases.grid(a=[-1.0, 4.0], b=np.arange(3.0))\nunits = {'x': 'm'}\n"
+        "def bad(a, b):\n    return {'x': float(a)}\n"
+    )
+    words = ["sweep", str(file), "--out", str(tmp_path / "runs.zarr"), "--chunk", "2"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "6 members, 3 of them failed" in out and "3 not_finite: An output is not finite." in out
+    found = mb.load_sweep(tmp_path / "runs.zarr")
+    np.testing.assert_array_equal(found["x"].sel(a=4.0), [0.0, 2.0, 4.0])
+    assert found["x"].attrs == {"units": "m"}
+    for source, code, message in (
+        ("study.py", 2, "There is no file"),
+        (f"{file}:function", 2, "must be file.py or file.py:function:cases"),
+        (f"{file}:functon:cases", 2, "did you mean 'function'"),
+        (f"{file}:bad:cases", 1, "ConcretizationTypeError"),
+    ):
+        assert main(["sweep", source, *words[2:]]) == code
+        assert message in capsys.readouterr().err
+
+
+def _with_small_disk(store):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+    jax.config.update("jax_enable_x64", True)
+    grow = lambda a: {"x": jnp.sin(a * jnp.arange(400.0) ** 2)}
+    return mb.sweep(grow, mb.cases.table(a=np.arange(1.0, 21.0)), store, chunk=10, progress=False)
+
+
+@pytest.mark.long
+def test_a_full_disk_is_a_clear_error(tmp_path):
+    refused = pytest.raises(OSError, match=r"cannot be written.*The chunks that are done are kept")
+    with ProcessPoolExecutor(1, mp_context=forked()) as processes, refused:
+        processes.submit(_with_small_disk, tmp_path / "runs.zarr").result()
+    assert not list((tmp_path / "runs.zarr").rglob("*.partial"))
+
+
+@pytest.mark.long
+def test_killed_five_times_it_ends_with_the_same_bits(undisturbed, tmp_path):
+    store, random = tmp_path / "runs.zarr", np.random.default_rng()
+    done = []
+    for count in np.sort(random.integers(1, CHUNKS - 5, 5)):
+        process = forked().Process(target=run, args=(store,))
+        process.start()
+        wait_for(store, count)
+        process.join(random.uniform(0.0, 0.005))
+        process.kill()
+        process.join()
+        done.append(marks(store))
+    assert done == sorted(done) and done[0] < CHUNKS
+    run(store)
+    assert files(store) == files(undisturbed[0])
+
+
+@pytest.mark.long
+def test_workers_and_the_session_killed(undisturbed, tmp_path):
+    """Workers die one after another, then the session with all of its workers; nothing stays behind."""
+    store, killed = tmp_path / "runs.zarr", []
+
+    def kill():
+        for count in (5, 25, 45):
+            wait_for(store, count)
+            workers = [p for p in multiprocessing.active_children() if p.name.startswith("SpawnProcess")]
+            os.kill(workers[0].pid, signal.SIGKILL)
+            killed.append(workers[0].pid)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    run(store, processes=2)
+    thread.join()
+    assert len(killed) == 3 and files(store) == files(undisturbed[0])
+
+    other = tmp_path / "other.zarr"
+    session = forked().Process(target=run, args=(other,), kwargs={"processes": 2})
+    session.start()
+    wait_for(other, 3)
+    with open(f"/proc/{session.pid}/task/{session.pid}/children") as children:
+        workers = [int(pid) for pid in children.read().split()]
+    session.kill()
+    session.join()
+    assert marks(other) < CHUNKS
+    run(other)
+    assert files(other) == files(undisturbed[0])
+    assert not any(_runs(pid) for pid in workers)
+
+
+def _runs(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().split(") ")[1][0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")
+def test_a_dask_cluster_that_loses_workers(undisturbed, tmp_path):
+    from distributed import Client, LocalCluster
+
+    store = tmp_path / "runs.zarr"
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        workers = list(client.run(os.getpid).values())
+        thread = threading.Thread(target=lambda: (wait_for(store, 10), os.kill(workers[0], signal.SIGKILL)))
+        thread.start()
+        run(store, executor=client.get_executor())
+        thread.join()
+        assert workers[0] not in client.run(os.getpid).values()
+    assert files(store) == files(undisturbed[0])
+
+
+@pytest.mark.long
+def test_a_lambda_and_a_closure_go_to_processes(tmp_path):
+    factor = jnp.asarray(3.0)
+    found = mb.sweep(lambda a: {"x": factor * a}, mb.cases.grid(a=[1.0, 2.0]), processes=2, chunk=1, progress=False)
+    np.testing.assert_array_equal(found["x"], [3.0, 6.0])
+    handle = open(__file__)  # noqa: SIM115
+    with handle, pytest.raises(ValueError, match="cannot be sent to other processes"):
+        mb.sweep(lambda a: {"x": a + 0 * handle.fileno()}, mb.cases.grid(a=[1.0, 2.0]), processes=2, progress=False)
