@@ -20,10 +20,12 @@ from .parts.base import (
     rows_of,
 )
 from .parts.boundary import check_kernels
-from .parts.fields import anonymous, declarations
+from .parts.fields import anonymous, declarations, inner_parts
 from .parts.forces import Gravity
+from .parts.frames import AbstractFrame, LinkFrame
 from .parts.joint_parts import AbstractCoordinatePart
 from .parts.names import unknown
+from .parts.on_frames import framed, on_frames
 from .parts.planar.kinematics import PLANE
 from .parts.servo import Servo
 from .parts.spatial.kinematics import SPACE
@@ -35,6 +37,7 @@ from .system.groups import (
     BodyGroup,
     ConstraintGroup,
     ForceGroup,
+    FrameGroup,
     NonIdealGroup,
     VelocityConstraintGroup,
     servo_group,
@@ -53,8 +56,9 @@ class Scene(eqx.Module):
     order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    including drivers, rolling and `Servo`; `forces`: force elements, joint friction, and at most one `Gravity`.
-    `"ground"` names the fixed world.
+    including drivers, rolling and `Servo`; `forces`: force elements, joint friction, and at most one `Gravity`;
+    `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies. `"ground"` names the fixed
+    world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
@@ -63,6 +67,7 @@ class Scene(eqx.Module):
     bodies: tuple[Any, ...] = eqx.field(converter=tuple)
     joints: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
     forces: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
+    frames: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
 
     def __check_init__(self):
         _check_kinds(self)
@@ -92,21 +97,31 @@ class Scene(eqx.Module):
         )
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
+        frames = _frames(self)
+        index |= {name: index[_body_of(frame)] for name, frame in frames.items()}
         gravity, parts, laws, joints = None, [], [], {}
         # Parts of joints after the joints that they act on.
         for part in sorted((*self.joints, *self.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
             if isinstance(part, AbstractNonIdeal):
-                joint, own = joints[part.joint]
-                laws.append((part.resolve(space, joint, given[list(own)]), own))
+                joint, own, on = joints[part.joint]
+                if any(on) and getattr(part, "point", None) is not None:
+                    raise ValueError(f"{part.label}: leave point out; {joint.label} is on frames, and has its own.")
+                laws.append((part.resolve(space, on_frames(joint, on), given[list(own)]), own))
             elif isinstance(part, AbstractCoordinatePart):
-                joint, own = joints[part.joint_name]
-                parts.append((part.of_joint(joint).resolve(space, given[list(own)]), own))
+                joint, own, on = joints[part.joint_name]
+                resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
+                parts.append((on_frames(resolved, on), own))
             elif isinstance(part, AbstractLink):
                 own = tuple(index[name] for name in part.bodies)
+                moving = [k for k in own if k < len(self.bodies)]
+                if len({*moving}) < len(moving):
+                    raise ValueError(f"{part.label} connects two frames of one body: {', '.join(part.bodies)}.")
+                on = tuple(frames.get(name) for name in part.bodies)
                 poses = given[list(own)]
-                resolved = _call(part, "resolve", space, poses)
-                joints[part.name] = resolved, own
+                resolved = _call(part, "resolve", space, framed(space, on, poses) if any(on) else poses)
+                joints[part.name] = resolved, own, on
                 components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
+                components = tuple(on_frames(component, on) for component in components)
                 _check_rotation(resolved, components, own, layout, poses)
                 parts += [(component, own) for component in components]
             else:
@@ -127,8 +142,9 @@ class Scene(eqx.Module):
                 NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
             ),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
+            frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
             guess=guess,
-            length=_length([part for part, _ in parts], guess, layout),
+            length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
             layout=layout,
             body_names=tuple(body.name for body in self.bodies),
             gravity_name="" if gravity is None else gravity.name,
@@ -137,6 +153,38 @@ class Scene(eqx.Module):
             elimination=None,
         )
         return with_structure(system)
+
+
+def _frames(scene: Scene) -> dict[str, AbstractFrame]:
+    """Frames by name with their bases, also those of bodies whose mass centre is not their origin."""
+    given = {frame.name: frame for frame in scene.frames}
+    bodies = {body.name: body for body in scene.bodies}
+    out: dict[str, Any] = {
+        name: LinkFrame(name=name, body=name, centre=body.centre)
+        for name, body in bodies.items()
+        if getattr(body, "centre", None) is not None
+    }
+
+    def based(name, path):
+        if name in out or name not in given:
+            return
+        frame = given[name]
+        if name in path:
+            raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
+        if frame.body not in (*given, *bodies, GROUND):
+            raise ValueError(f"{frame.label}: {unknown('body', frame.body, [*bodies, GROUND, *given])}")
+        based(frame.body, (*path, name))
+        frame.check(scene.bodies[0].dimension)
+        out[name] = frame.with_fields(base=out.get(frame.body))
+
+    for name in given:
+        based(name, ())
+    return out
+
+
+def _body_of(frame: AbstractFrame) -> str:
+    """The name of the body that a frame is fixed in."""
+    return frame.body if frame.base is None else _body_of(frame.base)
 
 
 def _check_program(servo, space, bodies):
@@ -165,8 +213,11 @@ def _check_kinds(scene: Scene):
             raise ValueError(f"forces must hold force elements, joint friction, or Gravity, got {part!r}.")
     if sum(not isinstance(part, AbstractForce | AbstractNonIdeal) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
+    for frame in scene.frames:
+        if not isinstance(frame, AbstractFrame):
+            raise ValueError(f"frames must hold planar.Frame or spatial.Frame, got {frame!r}.")
     dimension = scene.bodies[0].dimension
-    for part in (*scene.bodies, *scene.joints, *scene.forces):
+    for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
         if dimension not in part.dimensions:
             here, there = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
             raise ValueError(f"{part.label} is {there}, but the scene is {here}; use the {here} part of that name.")
@@ -174,16 +225,16 @@ def _check_kinds(scene: Scene):
 
 def _check_names(scene: Scene):
     seen = {GROUND}
-    for part in (*scene.bodies, *scene.joints, *scene.forces):
+    for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
         if part.name in seen:
             raise ValueError(
-                f"The name {part.name!r} is used twice; every body, joint and force needs its own"
+                f"The name {part.name!r} is used twice; every body, joint, force and frame needs its own"
                 + (" ('ground' is the fixed world)." if part.name == GROUND else ".")
             )
         if not part.name or "." in part.name:
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(part.name)
-    known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND])
+    known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
     is_joint = lambda part: isinstance(part, kinds) and not isinstance(part, AbstractCoordinatePart)
@@ -223,6 +274,11 @@ def _strength(part, space, poses):
         return jnp.abs(part.wrenches(space, poses, velocities, jnp.zeros((), poses.dtype)))
     rows = rows_of(part, space, poses)
     return jnp.sum(jnp.abs(rows), axis=0)
+
+
+def _held(part):
+    """The parts that a part holds."""
+    return (inner for _, inner in inner_parts(part))
 
 
 def _length(parts, guess, layout):

@@ -70,7 +70,7 @@ class Trajectory(eqx.Module):
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
-    `BodyMotion`, and `trajectory["hip"]` that of a joint's own coordinates, a `JointMotion`; of a system in generalized
+    `BodyMotion`, and `trajectory["hip"]` that of a joint or frame, a `PartMotion`; of a system in generalized
     coordinates it is that of a coordinate, shape (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
@@ -91,10 +91,10 @@ class Trajectory(eqx.Module):
         names = self.system.motion_names()
         if name in names:
             return self._motion(name)
-        joints = dict.fromkeys(known.split(".")[0] for known in self.system.joint_coordinates())
-        if name in joints:
-            return JointMotion(self, name)
-        raise unknown("body or joint" if self.system.has_bodies else "coordinate", name, (*names, *joints))
+        parts = dict.fromkeys(known.split(".")[0] for known in self.system.quantities())
+        if name in parts:
+            return PartMotion(self, name)
+        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, (*names, *parts))
 
     @_of_each_member
     def _motion(self, name):
@@ -272,26 +272,25 @@ class Trajectory(eqx.Module):
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
 
 
-class JointMotion:
-    """The own coordinates of a joint along a motion, as attributes: `.angle`, `.angle_rate`, `.angle_acceleration` of
-    a hinge, `.displacement`, … of a slide; see the joints of `planar` and `spatial`. Axis 0 is time, after the batch's
-    axes.
+class PartMotion:
+    """What can be measured of a joint or a frame along a motion, as attributes: of a hinge `.angle`, `.angle_rate`,
+    `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them, and the classes
+    of joints and frames describe them. Axis 0 is time, after the batch's axes.
 
-    An angle is continued over full turns; saved times must be so close that its change between two of them differs by
-    less than half a turn from that by the trapezoidal rule of its rate.
+    An angle of a joint is continued over full turns; saved times must be so close that its change between two of them
+    differs by less than half a turn from that by the trapezoidal rule of its rate.
     """
 
     def __init__(self, trajectory: Trajectory, name: str):
         self._trajectory, self._name = trajectory, name
 
     def __dir__(self) -> list[str]:
-        known = (name.split(".") for name in self._trajectory.system.joint_coordinates())
-        own = [field for joint, field in known if joint == self._name]
-        return [f"{field}{end}" for field in own for end in ("", "_rate", "_acceleration")]
+        known = (name.split(".") for name in self._trajectory.system.quantities())
+        return [field for part, field in known if part == self._name]
 
     def __getattr__(self, field: str) -> Array:
         if field.startswith("_") or field not in dir(self):
-            raise AttributeError(f"The joint {self._name!r} has {', '.join(dir(self))}; got {field!r}.")
+            raise AttributeError(f"{self._name!r} has {', '.join(dir(self))}; got {field!r}.")
         return self._trajectory.quantity(f"{self._name}.{field}")
 
 

@@ -44,9 +44,14 @@ class AbstractPart(eqx.Module):
         checks.check_kinds(self, self.label)
 
     @property
+    def kind(self) -> str:
+        """The type of the part, for descriptions and error messages."""
+        return type(self).__name__
+
+    @property
     def label(self) -> str:
         """The type and name of the part, for error messages."""
-        return f"{type(self).__name__} {getattr(self, 'name', '')!r}"
+        return f"{self.kind} {getattr(self, 'name', '')!r}"
 
     def check(self, dimension: int | None = None) -> None:
         """Raise a `ValueError` that names the part and the field if a number is invalid.
@@ -63,6 +68,10 @@ class AbstractPart(eqx.Module):
         """A copy with these numbers in fields that are None."""
         missing = {name: fields.as_parameter(value) for name, value in values.items() if getattr(self, name) is None}
         return type(self).with_fields(self, **missing) if missing else self
+
+    def named(self, name: str) -> Self:
+        """A copy with another name."""
+        return type(self).with_fields(self, name=name)
 
     def with_fields(self, **values: Any) -> Self:
         """A copy with some fields replaced."""

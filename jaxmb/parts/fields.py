@@ -46,7 +46,8 @@ class Declaration:
 
     - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
         several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
-        another part of the scene, `"state"` for a number of the initial guess, which is not a parameter.
+        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess,
+        which is not a parameter.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
@@ -284,6 +285,11 @@ def part(of: Any) -> Any:
     return _field(Declaration("part", of=of | None), default=None, kw_only=True)
 
 
+def parts() -> Any:
+    """Other parts by some keys, in the same way."""
+    return _field(Declaration("parts", of=dict), default_factory=dict, kw_only=True)
+
+
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """A module whose numbers are parameters, `"part.field.number"`.
 
@@ -313,13 +319,25 @@ def anonymous(part: Any) -> Any:
             value = None
         elif kind == "part" or (kind == "law" and hasattr(value, "bodies")):
             value = None if value is None else anonymous(value)
+        elif kind == "parts":
+            value = {key: anonymous(own) for key, own in value.items()}
         object.__setattr__(out, field, value)
     return out
 
 
-def parts_of(part: Any) -> tuple[str, ...]:
-    """The fields that hold other parts."""
-    return tuple(name for name, own in declarations(type(part)).items() if own.kind == "part")
+def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
+    for name, own in declarations(type(part)).items():
+        value = getattr(part, name)
+        if own.kind == "part" and value is not None:
+            held = [((*prefix, name), value)]
+        elif own.kind == "parts":
+            held = [((*prefix, name, key), inner) for key, inner in value.items()]
+        else:
+            continue
+        for keys, inner in held:
+            yield keys, inner
+            yield from inner_parts(inner, keys)
 
 
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
@@ -330,7 +348,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declara
     declared = declarations(type(part))
     for field in field_names(type(part)):
         own = declared.get(field, _ANY_NUMBER)
-        if own.kind not in ("state", "part"):
+        if own.kind not in ("state", "part", "parts"):
             yield from _paths(getattr(part, field), (field,), (field,), own)
 
 

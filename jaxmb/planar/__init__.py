@@ -19,6 +19,7 @@ from ..parts.planar.forces import (
     Torque as Torque,
     TorsionalSpringDamper as TorsionalSpringDamper,
 )
+from ..parts.planar.frames import Frame as Frame
 from ..parts.planar.joints import (
     Distance as Distance,
     Fixed as Fixed,

@@ -19,6 +19,7 @@ from ..parts.spatial.forces import (
     Torque as Torque,
     TorsionalSpringDamper as TorsionalSpringDamper,
 )
+from ..parts.spatial.frames import Frame as Frame
 from ..parts.spatial.joints import (
     Cylindrical as Cylindrical,
     Distance as Distance,

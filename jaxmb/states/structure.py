@@ -224,7 +224,7 @@ def _check_determined(system, implied):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
             if others:
                 raise ValueError(
-                    f"{type(g.group.part).__name__} {name!r} needs the force of {joint!r}, which is not determined: "
+                    f"{g.group.part.kind} {name!r} needs the force of {joint!r}, which is not determined: "
                     f"rows of {', '.join(sorted(others))} imply one another. Remove the redundant ones."
                 )
 

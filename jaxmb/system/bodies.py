@@ -20,12 +20,14 @@ from .coordinates import coordinate_names, rate_names
 from .describe import describe_scene
 from .design_variables import DesignVariables, description_rows, in_range
 from .equation import AbstractSystem, Ranks
+from .frame_motion import frame_quantities
 from .group_inputs import signals_of, with_signals
 from .groups import (
     AbstractConstraintGroup,
     BodyGroup,
     ConstraintGroup,
     ForceGroup,
+    FrameGroup,
     NonIdealGroup,
     ServoGroup,
     VelocityConstraintGroup,
@@ -70,6 +72,7 @@ class AbstractBodySystem(AbstractSystem):
     implied: tuple[Implied, ...] = eqx.field(static=True)
     elimination: EliminationOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
+    frames: tuple[FrameGroup, ...] = ()
 
     # Sizes
 
@@ -169,7 +172,7 @@ class AbstractBodySystem(AbstractSystem):
 
     @property
     def _groups(self):
-        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal")
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames")
         return {kind: getattr(self, kind) for kind in kinds}
 
     @property
@@ -185,7 +188,7 @@ class AbstractBodySystem(AbstractSystem):
     def describe(self):
         kinds: dict[str, list[str]] = {}
         for g in self.bodies:
-            kinds.setdefault(type(g.group.part).__name__, []).extend(g.group.names)
+            kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
         return describe_scene(
             self,
             spatial=self.spatial,
@@ -200,6 +203,7 @@ class AbstractBodySystem(AbstractSystem):
             gravity=self._gravity_name,
             implied=self.implied,
             design=description_rows(self.design),
+            frames=self.frames,
         )
 
     # Views of a motion
@@ -219,7 +223,8 @@ class AbstractBodySystem(AbstractSystem):
                     self.reaction(name, ts, ys, solved.multipliers), field
                 )
                 out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
-        return out | joint_quantities(self, self.joint_coordinates())
+        out |= joint_quantities(self, self.joint_coordinates())
+        return out | frame_quantities(self, self.frames, self.layout)
 
     def joint_coordinates(self):
         return joint_coordinates(self.constraints, self.layout)

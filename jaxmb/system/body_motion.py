@@ -45,7 +45,7 @@ def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
     for group in groups:
         stacked = group.group
         for k, of_parts in enumerate(stacked.body_index.T):
-            anchors = stacked.part.anchor(k)
+            anchors = jax.vmap(lambda part, k=k: part.anchor(k))(stacked.part)
             if anchors is None:
                 continue
             for body, point in zip(of_parts, np.asarray(anchors), strict=True):

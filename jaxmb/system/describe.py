@@ -56,12 +56,13 @@ def describe_scene(
     gravity: str | None,
     implied: Sequence[Any],
     design: Sequence[tuple[str, str, str]] = (),
+    frames: Sequence[Any] = (),
 ) -> Description:
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well.
 
     **Arguments:** `bodies`: names by kind; `joints`: groups of constraints, with a note on each kind; `forces`, `laws`:
     groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows;
-    `design`: rows on the design variables.
+    `design`: rows on the design variables; `frames`: groups of frames.
     """
     count = sum(map(len, bodies.values()))
     grubler = system.nu - system.velocity_rows
@@ -76,7 +77,7 @@ def describe_scene(
     if normalizations:
         with_them = f"{system.nq}, with {normalizations} normalisations; rank of all {system.coordinate_rows} rows"
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
-    kind = lambda g: type(g.group.part).__name__
+    kind = lambda g: g.group.part.kind
     tables = {
         "bodies": [(kind, shorten(names), "") for kind, names in bodies.items() if names],
         "joints": [(kind(g), shorten(g.group.names), f"{g.rows} rows each" + note) for gs, note in joints for g in gs],
@@ -85,6 +86,7 @@ def describe_scene(
             *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in laws),
             *((kind(g), shorten(g.group.names), "") for g in forces),
         ],
+        "frames": [(kind(g), shorten(g.group.names), "") for g in frames],
         "design variables": list(design),
     }
     specialised = specialised_constraints(system)

@@ -34,10 +34,10 @@ def with_signals(
     **Raises:** `ValueError` for a number that must be constant, and for one that jumps where positions depend on it.
     """
     new: dict[tuple[str, int], list[Input]] = {}
-    varying = set()
+    varying, of_frames = set(), {number.name for number in stacked_numbers({"frames": groups["frames"]})}
     for number in stacked_numbers(groups):
         signal = signals.get(number.name)
-        if signal is None or number.kind == "bodies":
+        if signal is None or number.kind in ("bodies", "frames") or number.name in of_frames:
             continue
         if number.kind in _BIND_POSITIONS and not signal.continuous:
             raise ValueError(
@@ -50,8 +50,8 @@ def with_signals(
     for name in signals:
         if name not in varying:
             raise ValueError(
-                f"{name!r} must be constant: masses, moments of inertia, gravity and the gains of servos cannot be "
-                "inputs."
+                f"{name!r} must be constant: masses, moments of inertia, frames, gravity and the gains of servos "
+                "cannot be inputs."
             )
     return {
         kind: tuple(_with_inputs(g, new.get((kind, k), ())) for k, g in enumerate(of_kind))

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
-from ..parts.fields import anonymous, entry, parts_of
+from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal
 from ..parts.space import AbstractSpace
 from .layout import Layout
@@ -33,7 +33,8 @@ class Input(eqx.Module):
 
 class Group(eqx.Module):
     """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
-    numbers by functions of time; `inner`: for each field that holds another part, the names of those parts.
+    numbers by functions of time; `inner`: where the parts hold other parts, the keys that lead there and the names of
+    these.
     """
 
     part: Any
@@ -41,7 +42,7 @@ class Group(eqx.Module):
     bodies: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     layout: Layout = eqx.field(static=True)
     inputs: tuple[Input, ...] = ()
-    inner: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True, default=())
+    inner: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = eqx.field(static=True, default=())
 
     def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
         """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
@@ -88,22 +89,19 @@ def stack(
     group.
     """
     groups: dict[Any, list] = {}
-    fields: dict[Any, tuple[str, ...]] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
         if key not in groups and check is not None:
             check(part, layout.space, len(bodies))
-        inner = [getattr(part, field).name for field in parts_of(part)]
-        groups.setdefault(key, []).append((leaves, part.name, bodies, inner))
-        fields[key] = parts_of(part)
+        groups.setdefault(key, []).append((leaves, part.name, bodies, list(inner_parts(part))))
     out = []
     for key, members in groups.items():
         # NumPy, since XLA would compile a program for thousands of operands.
         columns = zip(*(member[0] for member in members), strict=True)
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
-        inner = tuple((field, tuple(m[3][k] for m in members)) for k, field in enumerate(fields[key]))
+        inner = tuple((keys, tuple(m[3][k][1].name for m in members)) for k, (keys, _) in enumerate(members[0][3]))
         out.append(Group(jtu.tree_unflatten(key[0], leaves), names, bodies, layout, inner=inner))
     return tuple(out)
 
@@ -289,6 +287,25 @@ class ForceGroup(eqx.Module):
             return jnp.zeros((), poses.dtype)
         single = lambda at, poses: at(t).energy(self.group.layout.space, poses, t)
         return jnp.sum(self.group.map(single, self.group.gather(poses)))
+
+
+class FrameGroup(eqx.Module):
+    """Stacked frames."""
+
+    group: Group
+
+    def poses(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts p"]:
+        """Prepared poses of the frames."""
+        space = self.group.layout.space
+        return self.group.map(lambda at, x: at(t).pose(space, x[0]), self.group.gather(poses))
+
+    def velocities(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> Float[Array, "parts v"]:
+        """Velocities of the frames."""
+        space = self.group.layout.space
+        own = self.group.gather(poses), self.group.gather(velocities)
+        return self.group.map(lambda at, x, v: at(t).velocity(space, x[0], v[0]), *own)
 
 
 class ServoGroup(AbstractConstraintGroup):

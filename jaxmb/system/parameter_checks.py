@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool
 
 from ..linalg.arrays import is_traced
 from ..parts.checks import in_range
-from ..parts.fields import entry, paths
+from ..parts.fields import entry, inner_parts, paths
 from ..parts.servo import Servo
 
 
@@ -28,16 +28,16 @@ def check_parts(groups: Iterable[Any], names: Collection[str], dimension: int) -
 
 def stacked_part(group: Any, name: str = "") -> Any:
     """The part of a group, with a leading axis on every number unless it is a group of one without the axis."""
-    part = group.group.part.with_fields(name=name)
+    part = group.group.part.named(name)
     return Servo(part, group.damping, group.stiffness) if hasattr(group, "damping") else part
 
 
 def are_in_range(parts: Iterable[Any]) -> bool | Bool[Array, ""]:
     """Whether all numbers of some parts that are traced are as the parts declare them; True if none are traced."""
     ok: Any = True
-    for part in parts:
-        for keys, _, declared in paths(part):
-            value = entry(part, keys)
+    for own in (own for part in parts for own in (part, *(inner for _, inner in inner_parts(part)))):
+        for keys, _, declared in paths(own):
+            value = entry(own, keys)
             if is_traced(value):
                 ok = ok & in_range(declared, value)
     return ok

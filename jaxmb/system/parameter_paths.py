@@ -29,7 +29,7 @@ def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumb
             # Numbers of another part that these parts hold keep the name of that part.
             stacked = group.group
             sources = [((), stacked.part, stacked.names)]
-            sources += [((field,), getattr(stacked.part, field), names) for field, names in stacked.inner]
+            sources += [(keys, entry(stacked.part, keys), names) for keys, names in stacked.inner]
             for prefix, part, names in sources:
                 own = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
                 for k, name in enumerate(names):

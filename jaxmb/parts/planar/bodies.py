@@ -5,6 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
+from ...linalg.rotations import rotate_2d
 from .. import fields
 from ..base import AbstractBody, AbstractPlanarPart
 
@@ -31,15 +32,31 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
 
 
 class Body(AbstractRigidBody):
-    """A rigid body; its frame has its origin in the mass centre.
+    """A rigid body; its frame has its origin in the mass centre, or with `centre` elsewhere.
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
     mass centre, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and
-    `angular_velocity` [rad/s] likewise.
+    `angular_velocity` [rad/s] likewise; `centre` [m], shape (2,), the mass centre in the body's frame: points that
+    parts have on the body, `position` and `velocity` are then those of the frame and its origin. (The motion of the
+    body, `Trajectory["name"]`, is that of the mass centre; a `Frame` on the body shows that of the origin.)
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")
     inertia: fields.Number = fields.parameter(unit="kg m²", sign="positive")
+    centre: fields.Number = fields.parameter(shape=("d",), unit="m", optional=True)
+
+    def pose(self):
+        pose = super().pose()
+        if self.centre is None:
+            return pose
+        return pose + np.append(rotate_2d(self.angle, self.centre), 0.0)
+
+    def velocities(self):
+        velocities = super().velocities()
+        if self.centre is None:
+            return velocities
+        arm = np.asarray(rotate_2d(self.angle, self.centre))
+        return velocities + self.angular_velocity * np.array([-arm[1], arm[0], 0.0])
 
 
 class PointMass(AbstractPlanarPart, AbstractBody):

@@ -46,7 +46,7 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
 
 
 class Body(AbstractRigidBody):
-    """A rigid body; its frame has its origin in the mass centre.
+    """A rigid body; its frame has its origin in the mass centre, or with `centre` elsewhere.
 
     **Arguments:**
 
@@ -57,12 +57,29 @@ class Body(AbstractRigidBody):
         first) from body to world: a guess that `assemble` improves.
     - `velocity` [m/s], shape (3,), of the mass centre in the world frame, and `angular_velocity` [rad/s], shape (3,),
         in the body frame, likewise.
+    - `centre` [m], shape (3,), the mass centre in the body's frame: points that parts have on the body, `position` and
+        `velocity` are then those of the frame and its origin. (The motion of the body, `Trajectory["name"]`, is that of
+        the mass centre; a `Frame` on the body shows that of the origin.)
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")
     inertia: fields.Number = fields.parameter(
         shape=None, unit="kg m²", sign="positive definite", converter=inertia_matrix
     )
+    centre: fields.Number = fields.parameter(shape=("d",), unit="m", optional=True)
+
+    def pose(self):
+        pose = super().pose()
+        if self.centre is None:
+            return pose
+        return pose + np.append(rot.rotate(pose[3:], self.centre), np.zeros(4))
+
+    def velocities(self):
+        velocities = super().velocities()
+        if self.centre is None:
+            return velocities
+        moving = rot.rotate(rot.normalize(self.orientation), rot.cross(self.angular_velocity, self.centre))
+        return velocities + np.append(moving, np.zeros(3))
 
 
 def _check_inertia(body: AbstractRigidBody) -> None:

@@ -1,0 +1,89 @@
+"""Named frames fixed in bodies, which parts may act on and whose motion may be observed."""
+
+import abc
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..linalg.arrays import namespace
+from . import fields
+from .base import AbstractPart
+from .space import AbstractSpace, Point, Pose, Velocity, Wrench
+
+
+class AbstractFrame(AbstractPart):
+    """A frame fixed in a body, or in another frame, which is then its `base`; a scene fills that in.
+
+    A part that names a frame in place of a body sees the pose and the velocity of the frame: points and axes that are
+    given with the part are in the frame's axes, from its origin.
+    """
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    base: Any = fields.part(AbstractPart)
+
+    @abc.abstractmethod
+    def own_pose(self, space: AbstractSpace, pose: Pose) -> Pose:
+        """The frame's pose from that of its base."""
+
+    @abc.abstractmethod
+    def own_velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
+        """The frame's velocity from pose and velocity of its base."""
+
+    @abc.abstractmethod
+    def own_wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
+        """The wrench on the base that is equivalent to one on the frame."""
+
+    @abc.abstractmethod
+    def own_point(self, point: Point) -> Point:
+        """The point of the base [m] at a point of the frame."""
+
+    # From the body itself.
+
+    def pose(self, space: AbstractSpace, pose: Pose) -> Pose:
+        """The frame's pose from that of the body; with prepared quantities if the body's has them."""
+        found = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
+        return space.prepare(found) if pose.shape[0] > space.pose_size else found
+
+    def velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
+        """The frame's velocity from pose and velocity of the body."""
+        if self.base is not None:
+            pose, velocity = self.base.pose(space, pose), self.base.velocity(space, pose, velocity)
+        return self.own_velocity(space, pose, velocity)
+
+    def wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
+        """The wrench on the body that is equivalent to one on the frame."""
+        if self.base is None:
+            return self.own_wrench(space, pose, wrench)
+        return self.base.wrench(space, pose, self.own_wrench(space, self.base.pose(space, pose), wrench))
+
+    def point(self, point: Point) -> Point:
+        """The point of the body [m] at a point of the frame."""
+        own = self.own_point(point)
+        return own if self.base is None else self.base.point(own)
+
+
+class LinkFrame(AbstractFrame):
+    """The frame that a body is given in if its mass centre is not the origin.
+
+    **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are those of the body.
+    """
+
+    centre: fields.Number = fields.parameter(shape=("d",), unit="m")
+
+    def own_pose(self, space, pose):
+        xp = namespace(pose, self.centre)
+        d = space.dimension
+        return xp.concatenate([space.point(pose, -self.centre), pose[d : space.pose_size]])
+
+    def own_velocity(self, space, pose, velocity):
+        d = space.dimension
+        return jnp.concatenate([space.point_velocity(pose, velocity, -self.centre), velocity[d:]])
+
+    def own_wrench(self, space, pose, wrench):
+        d = space.dimension
+        moment = jnp.concatenate([jnp.zeros_like(wrench[:d]), wrench[d:]])
+        return space.point_force(pose, -self.centre, wrench[:d]) + moment
+
+    def own_point(self, point):
+        return point - self.centre

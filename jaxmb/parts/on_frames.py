@@ -1,0 +1,143 @@
+"""Parts that act on frames instead of bodies: their kernels see the poses of the frames."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..linalg.arrays import namespace
+from . import fields
+from .base import (
+    AbstractConstraint,
+    AbstractForce,
+    AbstractLink,
+    AbstractPart,
+    AbstractPotentialForce,
+    AbstractVelocityConstraint,
+)
+from .frames import AbstractFrame
+from .servo import Servo
+from .space import AbstractSpace
+
+
+def framed(space: AbstractSpace, frames: tuple[AbstractFrame | None, ...], poses: Any) -> Any:
+    """Poses of frames from those of their bodies, shape (k, p); unchanged where there is no frame."""
+    own = [pose if frame is None else frame.pose(space, pose) for frame, pose in zip(frames, poses, strict=True)]
+    return namespace(*own).stack(own)
+
+
+def on_frames(part: AbstractLink, frames: tuple[AbstractFrame | None, ...]) -> AbstractLink:
+    """A part with every number filled in, on the frames of its bodies, if there are any."""
+    given = {str(k): frame for k, frame in enumerate(frames) if frame is not None}
+    if not given:
+        return part
+    # A concrete class: the program of a servo is a constraint that acts on accelerations.
+    if isinstance(part, Servo):
+        return part.with_fields(program=on_frames(part.program, frames))
+    if isinstance(part, AbstractConstraint):
+        return ConstraintOnFrames(part=part, frames=given)
+    if isinstance(part, AbstractVelocityConstraint):
+        return VelocityConstraintOnFrames(part=part, frames=given)
+    assert isinstance(part, AbstractForce)
+    return ForceOnFrames(part=part, frames=given)
+
+
+class AbstractOnFrames(AbstractPart):
+    """A `part` on `frames`, by the number of the body."""
+
+    part: Any = fields.part(AbstractLink)
+    frames: Any = fields.parts()
+
+    @property
+    def name(self):
+        return self.part.name
+
+    @property
+    def bodies(self):
+        return self.part.bodies
+
+    @property
+    def dimensions(self):
+        return self.part.dimensions
+
+    @property
+    def kind(self):
+        return self.part.kind
+
+    @property
+    def label(self):
+        return self.part.label
+
+    def check(self, dimension=None):
+        self.part.check(dimension)
+
+    def named(self, name):
+        return self.with_fields(part=self.part.named(name))
+
+    def anchor(self, k):
+        point, frame = self.part.anchor(k), self.frames.get(str(k))
+        return point if frame is None or point is None else frame.point(point)
+
+    def _poses(self, space, poses):
+        rows = [self.frames[str(k)].pose(space, x) if str(k) in self.frames else x for k, x in enumerate(poses)]
+        return jnp.stack(rows)
+
+    def _velocities(self, space, poses, velocities):
+        own = lambda k, x, v: self.frames[str(k)].velocity(space, x, v) if str(k) in self.frames else v
+        return jnp.stack([own(k, x, v) for k, (x, v) in enumerate(zip(poses, velocities, strict=True))])
+
+
+class ConstraintOnFrames(AbstractOnFrames, AbstractConstraint):
+    """A position constraint on frames."""
+
+    @property
+    def rows(self):
+        return self.part.rows
+
+    @property
+    def rheonomic(self):
+        return self.part.rheonomic
+
+    @property
+    def periodic(self):
+        return self.part.periodic
+
+    def residual(self, space, poses, t):
+        return self.part.residual(space, self._poses(space, poses), t)
+
+    def coordinates(self, space, poses):
+        return self.part.coordinates(space, self._poses(space, poses))
+
+
+class VelocityConstraintOnFrames(AbstractOnFrames, AbstractVelocityConstraint):
+    """A velocity constraint on frames."""
+
+    @property
+    def rows(self):
+        return self.part.rows
+
+    @property
+    def linear(self):
+        return self.part.linear
+
+    @property
+    def homogeneous(self):
+        return self.part.homogeneous
+
+    def residual(self, space, poses, velocities, t):
+        return self.part.residual(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
+
+
+class ForceOnFrames(AbstractOnFrames, AbstractPotentialForce):
+    """A force law on frames."""
+
+    @property
+    def conservative(self):
+        return self.part.conservative
+
+    def wrenches(self, space, poses, velocities, t):
+        own = self.part.wrenches(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
+        to_body = lambda k, x, w: self.frames[str(k)].wrench(space, x, w) if str(k) in self.frames else w
+        return jnp.stack([to_body(k, x, w) for k, (x, w) in enumerate(zip(poses, own, strict=True))])
+
+    def energy(self, space, poses, t):
+        return self.part.energy(space, self._poses(space, poses), t)

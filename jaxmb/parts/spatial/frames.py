@@ -1,0 +1,41 @@
+"""A frame fixed in a spatial body."""
+
+import jax.numpy as jnp
+
+from ...linalg.arrays import namespace
+from ...linalg.rotations import multiply, rotate, unrotate
+from .. import fields
+from ..base import AbstractSpatialPart
+from ..frames import AbstractFrame
+
+
+class Frame(AbstractSpatialPart, AbstractFrame):
+    """A frame fixed in a body, or in another frame.
+
+    Joints, forces and contacts may name it in place of a body. Along a motion it has `position`, `velocity` and
+    `acceleration` of its origin (world axes), `orientation` (Euler parameters), and in the frame's own axes
+    `angular_velocity` (what a gyroscope measures), `angular_acceleration` and `specific_force`, what an accelerometer
+    measures: acceleration less gravity [m/s²].
+
+    **Arguments:** `body`: the name of a body or frame; `position` [m], shape (3,), of its origin, and `orientation`,
+    shape (4,), unit Euler parameters from its axes to those of the body, in that body's frame.
+    """
+
+    position: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0), sizes=False)
+    orientation: fields.Number = fields.attitude(default=(1.0, 0.0, 0.0, 0.0))
+
+    def own_pose(self, space, pose):
+        attitude = multiply(pose[3:7], self.orientation)
+        return namespace(pose).concatenate([space.point(pose, self.position), attitude])
+
+    def own_velocity(self, space, pose, velocity):
+        turning = unrotate(self.orientation, velocity[3:])
+        return jnp.concatenate([space.point_velocity(pose, velocity, self.position), turning])
+
+    def own_wrench(self, space, pose, wrench):
+        moment = rotate(self.orientation, wrench[3:])
+        at_origin = space.point_force(pose, self.position, wrench[:3])
+        return at_origin + jnp.concatenate([jnp.zeros_like(moment), moment])
+
+    def own_point(self, point):
+        return self.position + rotate(self.orientation, point)
