@@ -29,5 +29,7 @@ from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
 from .studies.identify import Identification as Identification, identify as identify
+from .studies.linearisation import Linearisation as Linearisation
+from .studies.linearise import linearise as linearise
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load
