@@ -28,8 +28,11 @@ from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
+from .studies.floquet import Floquet as Floquet, floquet as floquet
 from .studies.identify import Identification as Identification, identify as identify
 from .studies.linearisation import Linearisation as Linearisation
 from .studies.linearise import linearise as linearise
+from .studies.root_locus import RootLocus as RootLocus, root_locus as root_locus
+from .studies.steady import steady_motion as steady_motion
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load

@@ -81,7 +81,7 @@ def linear_equations(
 ) -> LinearEquations:
     own = perturbations(system, t, state, names)
     field, _ = vector_field(system, t, state)
-    rate = _fastest(system, state, field)
+    rate = fastest(system, state, field)
     moving = rate > 0
     later = jnp.where(moving, 0.4 / jnp.where(moving, rate, 1.0), 1.0)
 
@@ -111,22 +111,16 @@ def linear_equations(
     def judge(move, after):
         residual = here.rates - (move.rate @ at + move.constant)
         largest = jnp.max(jnp.abs(residual) / units) / omega
-        differs = jnp.abs(after.by_states - move.turn @ here.by_states) / (units[:, None] * widths[None, :] * omega)
-        shifted = jnp.abs(after.rates - move.turn @ here.rates) / (units * omega)
-        of_inputs = jnp.abs(after.by_inputs - move.turn @ here.by_inputs) / units[:, None]
-        size = jnp.max(jnp.abs(here.by_inputs) / units[:, None], axis=0, initial=0.0)
-        of_outputs = jnp.abs(after.outputs_by_states - here.outputs_by_states) / widths[None, :]
-        scale = jnp.max(jnp.abs(here.outputs_by_states) / widths[None, :], axis=1, initial=0.0)
-        through = jnp.abs(after.outputs_by_inputs - here.outputs_by_inputs)
-        direct = jnp.max(jnp.abs(here.outputs_by_inputs), axis=1, initial=0.0)
-        constant = jnp.concatenate(
-            [
-                ((jnp.max(differs, initial=0.0) <= same) & (jnp.max(shifted) <= same + allowed))[None],
-                jnp.max(of_inputs, axis=0, initial=0.0) <= same * size,
-                (jnp.max(of_outputs, axis=1, initial=0.0) <= same * scale)
-                & (jnp.max(through, axis=1, initial=0.0) <= same * direct),
-            ]
+        rows = units[:, None]
+        pairs = (
+            (after.by_states / (rows * widths[None, :]), move.turn @ here.by_states / (rows * widths[None, :])),
+            (after.rates / units, move.turn @ here.rates / units),
         )
+        states = jnp.stack([jnp.max(jnp.abs(a - b)) <= (same + allowed) * omega for a, b in pairs])
+        inputs = _unchanged(after.by_inputs.T / units[None, :], (move.turn @ here.by_inputs).T / units[None, :], same)
+        outputs = _unchanged(after.outputs_by_states / widths[None, :], here.outputs_by_states / widths[None, :], same)
+        through = _unchanged(after.outputs_by_inputs, here.outputs_by_inputs, same)
+        constant = jnp.concatenate([jnp.all(states)[None], inputs, outputs & through])
         return residual, largest, largest <= allowed, constant
 
     residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], found))
@@ -176,7 +170,14 @@ def _local(system, t, x, basis, inputs, outputs):
     return _Local(rates, field[:, :k], field[:, k:], seen[:, :k], seen[:, k:], rows[:, k:])
 
 
-def _fastest(system, state, field):
+def _unchanged(after, before, same):
+    """Which rows of a matrix are the same."""
+    size = jnp.max(jnp.abs(before), axis=1, initial=0.0)
+    rounding = 1e-6 * same * jnp.max(size, initial=0.0)
+    return jnp.max(jnp.abs(after - before), axis=1, initial=0.0) <= same * size + rounding
+
+
+def fastest(system, state, field):
     """The largest rate of the motion [1/s], lengths in units of the system's size."""
     speeds = jnp.max(jnp.abs(state.u) / system.velocity_scale(), initial=0.0)
     return lax.stop_gradient(jnp.maximum(speeds, jnp.max(jnp.abs(field.q) / system.coordinate_scale())))

@@ -127,7 +127,7 @@ def _refusal(system, t, state, names, found: LinearEquations, labels):
                 "or others."
             )
     if not found.steady:
-        return not_steady(system, found.residual, bool(found.moving))
+        return _not_steady(system, found)
     constant = np.asarray(found.constant)
     if not constant[0]:
         return (
@@ -148,22 +148,26 @@ def _refusal(system, t, state, names, found: LinearEquations, labels):
     )
 
 
-def not_steady(system: AbstractSystem, residual, moving: bool) -> str:
-    """A message about the rates that remain where there should be none."""
-    remains = np.asarray(residual)
-    rates, accelerations = remains[: system.nq], remains[system.nq :]
+def remaining(system: AbstractSystem, residual) -> str:
+    """The accelerations that remain where there should be none, for messages."""
+    left = np.asarray(residual)
+    rates, accelerations = left[: system.nq], left[system.nq :]
     labels = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
-    worst = [k for k in np.argsort(-np.abs(accelerations))[:4] if abs(accelerations[k]) > 1e-6 * np.abs(remains).max()]
+    worst = [k for k in np.argsort(-np.abs(accelerations))[:4] if abs(accelerations[k]) > 1e-6 * np.abs(left).max()]
     listed = ", ".join(f"{labels[k]} ({accelerations[k]:.3g})" for k in worst)
-    left = f"accelerations remain along {listed}" if listed else f"rates of {np.abs(rates).max():.3g} 1/s differ"
-    if moving:
+    if listed:
+        return f"accelerations remain along {listed}, in m/s² and rad/s²"
+    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from those of a uniform motion"
+
+
+def _not_steady(system, found):
+    left = remaining(system, found.residual)
+    if found.moving:
         return (
-            f"The state is no steady motion: {left} that no uniform motion of all bodies has, in m/s² and rad/s². "
-            "jaxmb.steady_motion finds one near it; about a periodic motion use jaxmb.floquet."
+            f"The state is no steady motion: {left}, which no uniform motion of all bodies has. jaxmb.steady_motion "
+            "finds one near it; about a periodic motion use jaxmb.floquet."
         )
-    return (
-        f"The state is no equilibrium: {left}, in m/s² and rad/s². jaxmb.equilibrium(system, state) finds one near it."
-    )
+    return f"The state is no equilibrium: {left}. jaxmb.equilibrium(system, state) finds one near it."
 
 
 def _moving(system, t, state):

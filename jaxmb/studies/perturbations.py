@@ -100,13 +100,17 @@ def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinat
     return names
 
 
-def coordinate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Callable[[State], Array]:
-    """A coordinate as a function of the state: an entry of q, a displacement from a state, or a quantity."""
+def coordinate_function(
+    system: AbstractSystem, t: Scalar, at: State | None, name: str
+) -> Callable[[State], Array]:
+    """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if that is given, or a
+    quantity.
+    """
     known = system.coordinate_names()
     if name in known and len(known[name]) == 1:
         return lambda state: state.q[known[name][0]]
-    displacements = displacement_names(system)
-    if name in displacements:
+    displacements = [] if at is None else displacement_names(system)
+    if at is not None and name in displacements:
         row = _displacements(system, t, at)[displacements.index(name)]
         return lambda state: row @ (state.q - at.q)
     return _quantity(system, t, name, "coordinate", [*(k for k, v in known.items() if len(v) == 1), *displacements])
