@@ -189,7 +189,7 @@ def _spectrum(linear):
 
 @eqx.filter_jit
 def _response(linear, omega):
-    dtype = jnp.result_type(linear.A.dtype, jnp.complex64)
+    dtype = np.result_type(linear.A.dtype, np.complex64)
     A, B, C, D = (x.astype(dtype) for x in (linear.A, linear.B, linear.C, linear.D))
     shift = lambda w: lax.complex(jnp.zeros_like(w), w) * jnp.eye(len(linear.states), dtype=dtype)
     return jax.vmap(lambda w: C @ jnp.linalg.solve(shift(w) - A, B) + D)(omega)
