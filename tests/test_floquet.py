@@ -29,7 +29,11 @@ def parametric():
 def monodromy(delta, epsilon):
     """Of Mathieu's equation, by direct integration."""
     run = lambda y: scipy.integrate.solve_ivp(
-        lambda t, y: [y[1], -(delta + epsilon * np.cos(t)) * y[0]], (0, 2 * np.pi), y, rtol=1e-12, atol=1e-13,
+        lambda t, y: [y[1], -(delta + epsilon * np.cos(t)) * y[0]],
+        (0, 2 * np.pi),
+        y,
+        rtol=1e-12,
+        atol=1e-13,
         method="DOP853",
     ).y[:, -1]
     return np.stack([run([1.0, 0.0]), run([0.0, 1.0])], axis=1)
@@ -59,7 +63,7 @@ def test_the_tongues_of_mathieu():
     assert traces[2] < -2.0
     h = 1e-5
     slope = (np.trace(monodromy(borders[0] + h, epsilon)) - np.trace(monodromy(borders[0] - h, epsilon))) / (2 * h)
-    assert jax.jit(jax.jacfwd(trace))(borders[0]) == pytest.approx(slope, rel=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(trace))(borders[0]), slope, rtol=1e-5)
 
 
 @functools.cache
@@ -71,7 +75,11 @@ def shaken():
         planar.Prismatic("guide", "ground", "block", point=(0.0, 0.0), axis=(0.0, 1.0)),
         planar.Revolute("pin", "block", "rod", point=(0.0, 0.0)),
         planar.Driver(
-            "shaker", "ground", "block", quantity="y", motion=lambda t, p: p["stroke"] * (jnp.cos(7.0 * t) - 1.0),
+            "shaker",
+            "ground",
+            "block",
+            quantity="y",
+            motion=lambda t, p: p["stroke"] * (jnp.cos(7.0 * t) - 1.0),
             parameters={"stroke": 0.02},
         ),
     ]

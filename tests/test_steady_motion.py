@@ -31,7 +31,8 @@ def test_a_conical_pendulum_runs_in_its_circle_and_nutates():
     linear = mb.linearise(system, state)
     # ω² = Ω² (1 + 3 cos²α); the azimuth and a change of the cone make a double zero.
     found = np.asarray(linear.eigenvalues)
-    np.testing.assert_allclose(found[2:].imag, rate * np.sqrt(1 + 3 * np.cos(angle) ** 2) * np.array([1, -1]), rtol=1e-9)
+    nutation = rate * np.sqrt(1 + 3 * np.cos(angle) ** 2)
+    np.testing.assert_allclose(found[2:].imag, [nutation, -nutation], rtol=1e-9)
     assert np.max(np.abs(found[:2])) < 1e-6 and np.max(np.abs(found[2:].real)) < 1e-9
 
 
@@ -44,15 +45,15 @@ def test_the_speed_of_a_cone_is_differentiable():
 
     exact = lambda a: np.sqrt(G / (2.0 * np.cos(a)))
     slope = 0.5 * exact(0.6) * np.tan(0.6)
-    assert jax.jit(jax.jacfwd(speed))(0.6) == pytest.approx(slope, rel=1e-8)
-    assert jax.jit(jax.grad(speed))(0.6) == pytest.approx(slope, rel=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(speed))(0.6), slope, rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.grad(speed))(0.6), slope, rtol=1e-8)
     angles = np.array([0.5, 0.6])
     np.testing.assert_allclose(jax.jit(jax.vmap(speed))(angles), exact(angles), rtol=1e-9)
 
 
 def test_a_flyball_governor_balances_its_springs():
     """Stationary values of V − ½ Ω² J over the arms' angle and the slider's height."""
-    speed, stiffness, ball, a0 = 8.0, 2e3, 5.0, np.pi / 6
+    speed, stiffness, ball = 8.0, 2e3, 5.0
     mechanism = mechanisms.get("flyball", stiffness=stiffness, damping=20.0)
     state = mb.steady_motion(mechanism.system, mechanism.state, rates={"shaft.wz": speed})
     rod, cube = 0.3, 3.0
@@ -70,15 +71,10 @@ def test_a_flyball_governor_balances_its_springs():
         J = 2 * (rod * point(0.5)[0] ** 2 + ball * point(1.0)[0] ** 2 + own)
         return V - 0.5 * speed**2 * J
 
-    slope = lambda x, h=1e-4: np.array(
-        [(effective(x + h * e) - effective(x - h * e)) / (2 * h) for e in np.eye(2)]
-    )
-    a, s = scipy.optimize.fsolve(slope, [0.3, 0.6], xtol=1e-12)
+    slope = lambda x, h=1e-4: np.array([(effective(x + h * e) - effective(x - h * e)) / (2 * h) for e in np.eye(2)])
+    _, s = scipy.optimize.fsolve(slope, [0.3, 0.6], xtol=1e-12)
     names = mechanism.system.coordinate_names()
     assert float(state.q[names["slider.z"][0]]) == pytest.approx(s, abs=1e-4)
-    motion = mechanism.system.motion("arm1", jax.tree.map(lambda x: x[None], state))
-    tilt = 2 * np.arctan2(np.linalg.norm(motion.orientation[0, 1:]), motion.orientation[0, 0])
-    assert a0 != a and np.isfinite(tilt)
     linear = mb.linearise(mechanism.system, state, coordinates=["slider.z"])
     assert np.max(linear.eigenvalues.real) < 1e-6 and len(linear.states) == 6
 
@@ -107,8 +103,12 @@ def test_a_disk_in_a_steady_circle():
     names = given.system.rate_names()
     rates = {f"disk.{w}": float(given.state.u[names[f"disk.{w}"][0]]) for w in ("wx", "wy", "wz")}
     moved = given.state.u + 0.05 * np.sin(np.arange(6.0))
+    guess = mb.assemble(given.system, mb.State(given.state.q, moved))
     state = mb.steady_motion(
-        given.system, mb.assemble(given.system, mb.State(given.state.q, moved)), rates={k: rates[k] for k in ("disk.wz", "disk.wx")}, fix={"disk.z": float(given.state.q[2])}
+        given.system,
+        guess,
+        fix={"disk.z": float(given.state.q[2])},
+        rates={"disk.wx": rates["disk.wx"], "disk.wz": rates["disk.wz"]},
     )
     np.testing.assert_allclose(state.u[4], rates["disk.wy"], rtol=1e-8)
     np.testing.assert_allclose(state.q[2], given.state.q[2], rtol=1e-10)
@@ -137,7 +137,7 @@ def test_ignorable_coordinates_of_a_lagrangian():
     s, c = np.sin(float(state.q[0])), G / 16.0
     J = 2.0 + s**2
     # At constant angular momentum: ω² = Ω² s² (1 + 4 c² / J).
-    assert np.max(linear.frequencies) == pytest.approx(4.0 * s * np.sqrt(1 + 4 * c**2 / J), rel=1e-9)
+    assert float(np.max(linear.frequencies)) == pytest.approx(4.0 * s * np.sqrt(1 + 4 * c**2 / J), rel=1e-9)
     with pytest.raises(ValueError, match="No steady motion"):
         mb.steady_motion(hoop, rates={"phi": 4.0})
 
@@ -146,9 +146,9 @@ def test_what_is_no_steady_motion():
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
     system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -G))]).compile()
-    with pytest.raises(ValueError, match="No steady motion was found with rod.angle prescribed"):
+    with pytest.raises(ValueError, match=r"No steady motion was found with rod.angle prescribed"):
         mb.steady_motion(system, rates={"rod.angle": 3.0})
-    with pytest.raises(ValueError, match="Unknown coordinate 'rod.angel'"):
+    with pytest.raises(ValueError, match=r"Unknown coordinate 'rod.angel'"):
         mb.steady_motion(system, fix={"rod.angel": 3.0})
     with pytest.raises(ValueError, match="Unknown coordinate 'x'"):
         mb.steady_motion(system, ignorable=["x"])

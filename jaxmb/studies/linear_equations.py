@@ -126,7 +126,8 @@ def linear_equations(
     residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], found))
     # The first displacement that carries the motion along and leaves its equations as they are; else the nearest one.
     good = steady & constant[:, 0]
-    best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest)))
+    nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
+    best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)
     bound = jnp.max(jnp.abs(here.rows_by_inputs), axis=0, initial=0.0) > 0
     ok = jnp.all(own.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
     return LinearEquations(

@@ -177,7 +177,8 @@ def _spectrum(linear):
         # States without effect on others follow the others: (λ − A_ii) v_i = A_ik v_k.
         follows = (~kept & quick)[:, None]
         matrix = jnp.where(follows & ~kept[None, :], value * unit - A, unit)
-        return jnp.linalg.solve(matrix, jnp.where(follows[:, 0], A @ jnp.where(kept, vector, jnp.zeros_like(vector)), vector))
+        pushed = A @ jnp.where(kept, vector, jnp.zeros_like(vector))
+        return jnp.linalg.solve(matrix, jnp.where(follows[:, 0], pushed, vector))
 
     vectors = jax.vmap(complete, in_axes=(0, 1, 0), out_axes=1)(values, vectors, quick)
     nq, scale = linear.system.nq, linear.system.coordinate_scale()

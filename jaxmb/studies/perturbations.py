@@ -85,7 +85,8 @@ def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinat
         () if coordinates is None else checked_names("coordinate", coordinates),
         None if rates is None else checked_names("rate", rates),
     )
-    for kind, given, most in zip(("coordinate", "rate"), (names.coordinates, names.rates or ()), counts(system)):
+    given_names = names.coordinates, names.rates or ()
+    for kind, given, most in zip(("coordinate", "rate"), given_names, counts(system), strict=True):
         if len(given) > most:
             raise ValueError(
                 f"There are {most} independent {kind}s, and {len(given)} are named: {', '.join(given)}. Name fewer; "
@@ -100,9 +101,7 @@ def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinat
     return names
 
 
-def coordinate_function(
-    system: AbstractSystem, t: Scalar, at: State | None, name: str
-) -> Callable[[State], Array]:
+def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, name: str) -> Callable[[State], Array]:
     """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if that is given, or a
     quantity.
     """
@@ -136,7 +135,8 @@ def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Arra
     q, u = state.q, state.u
     if _has_invariants(system):
         moves = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
-        rows, scale, rank = system.jacobian(t, q, u)[: system.position_rows], system.velocity_scale(), system.position_rank
+        rows, scale = system.jacobian(t, q, u)[: system.position_rows], system.velocity_scale()
+        rank = system.position_rank
     else:
         moves = jnp.eye(system.nq, dtype=q.dtype)
         rows, scale, rank = system.coordinate_jacobian(t, q), system.coordinate_scale(), system.coordinate_rank
@@ -165,13 +165,8 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
 
     if names.rates is None:
         given = jnp.zeros((0, nq + system.nu), state.q.dtype)
-        preferred = _gradients(
-            [
-                lambda x, f=coordinate_function(system, t, state, name): _rate(system, t, f, x)
-                for name in names.coordinates
-            ],
-            state,
-        )
+        own = [coordinate_function(system, t, state, name) for name in names.coordinates]
+        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in own], state)
     else:
         given = _gradients([rate_function(system, t, state, name) for name in names.rates], state)
         preferred = given[:0]
@@ -180,7 +175,8 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
     candidates = jnp.concatenate([preferred, velocities])
     chosen = jnp.zeros(len(displacements), bool).at[picked].set(True)
     chosen = chosen if len(displacements) == system.nu else jnp.zeros(system.nu, bool)
-    weight = jnp.where(chosen, _CHOSEN, 1.0) / jnp.where(_turns(system, rates=True), 1.0 / _TURN, system.velocity_scale())
+    speeds = jnp.where(_turns(system, rates=True), 1.0 / _TURN, system.velocity_scale())
+    weight = jnp.where(chosen, _CHOSEN, 1.0) / speeds
     along_velocities = preferred[:, nq:] @ alone
     largest = jnp.max(jnp.abs(along_velocities), axis=1, initial=0.0)
     weight = jnp.concatenate([_NAMED / jnp.where(largest > 0, largest, 1.0), weight])

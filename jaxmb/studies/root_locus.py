@@ -70,7 +70,7 @@ def root_locus(
     case = _case(system, name, state)
     given = np.asarray(real_array("root_locus: values", values, np.result_type(float), None))
     if given.ndim != 1 or given.size < 2 or not np.all(np.isfinite(given)):
-        raise ValueError(f"root_locus: values must be a vector of at least two finite numbers, got shape {given.shape}.")
+        raise ValueError(f"root_locus: values must be a vector of at least two finite numbers, got {values!r}.")
     # The first one names the states, and says what is wrong.
     first = linearise(*case(given[0]), t=t, coordinates=coordinates, rates=rates)
     chosen = first.states[: first.coordinates], first.states[first.coordinates :]
@@ -108,9 +108,10 @@ def _case(system: Any, name: str, state: Any) -> Callable[[Any], tuple[AbstractS
     if name not in known:
         raise unknown("parameter", name, known)
     if known[name].shape != ():
-        raise ValueError(f"root_locus: {name!r} has shape {known[name].shape}, and values are numbers; give a function.")
+        shape = known[name].shape
+        raise ValueError(f"root_locus: {name!r} has shape {shape}, and values are numbers; give a function.")
     if state is None:
-        raise ValueError("root_locus needs the state of each system: state=mb.equilibrium, or a function of the system.")
+        raise ValueError("root_locus needs the state of each system: state=jaxmb.equilibrium, or another function.")
 
     def of_parameter(value):
         changed = with_parameters(system, {name: value})

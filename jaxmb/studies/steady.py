@@ -160,9 +160,7 @@ def _search(
     inverse = pseudoinverse(jax.jacfwd(lambda z: residual(now, z))(z))
     free = jnp.eye(z.size, dtype=z.dtype) - inverse @ jax.jacfwd(lambda z: residual(now, z))(z)
     good = solved & jnp.all(jnp.isfinite(inverse))
-    equations = lambda x: jnp.where(
-        good, inverse @ residual((system, t, values), x) + free @ (x - z), x - z
-    )
+    equations = lambda x: jnp.where(good, inverse @ residual((system, t, values), x) + free @ (x - z), x - z)
     solution = unknowns(scale * root(equations, z, lambda _, x: x))
     state = State(system.normalize(solution.state.q), solution.state.u)
 
@@ -178,7 +176,8 @@ def _search(
     differs = jnp.concatenate([there.q, there.u]) - move.turn @ joined
     sizes = jnp.concatenate(units) * rate
     rows = system.coordinate_residual(t + 0.4 / rate, after.q)
-    same = (jnp.max(jnp.abs(differs) / sizes) <= 1e3 * tol) & (jnp.max(jnp.abs(rows), initial=0.0) <= 1e3 * tol * length)
+    same = jnp.max(jnp.abs(differs) / sizes) <= 1e3 * tol
+    same = same & (jnp.max(jnp.abs(rows), initial=0.0) <= 1e3 * tol * length)
     remaining = joined - (move.rate @ at + move.constant)
     count = len(chosen[0]) + len(chosen[1])
     unmet = left[left.size - count :]
