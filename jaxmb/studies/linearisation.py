@@ -133,7 +133,9 @@ class Linearisation(eqx.Module):
             if value.imag < 0:
                 continue
             text = f"{value.real:.5g}" + (f" ± {value.imag:.5g}i" if value.imag > 0 else "")
-            own = shares[: self.coordinates, k]
+            # A change of speed alone, which nothing depends on, displaces nothing at first.
+            displaced = np.any(shares[: self.coordinates, k])
+            own = shares[: self.coordinates, k] if displaced else shares[:, k]
             largest = [self.states[j] for j in np.argsort(-own)[:3] if own[j] > 0.05 * own.max()]
             lines.append(f"{k:>4}  {text:>24}  {size:>9.5g}  {ratio:>8.4f}  {', '.join(largest)}")
         return "\n".join(lines)

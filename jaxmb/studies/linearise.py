@@ -49,7 +49,7 @@ def linearise(
     - `system`, `state`: a compiled scene, or another system, and a consistent state of it, from `equilibrium`,
         `steady_motion` or `assemble`.
     - `t`: the time, for drivers [s].
-    - `inputs`: names of parameters, `"motor.value"`, or of their components, `"push.force[0]"`.
+    - `inputs`: names of parameters, `"motor.torque"`, or of their components, `"push.force[0]"`.
     - `outputs`: names of quantities that `Trajectory.quantity` takes, `"rod.position"`, `"A.force"`, or components.
     - `coordinates`: names of coordinates that should be states: entries of q, `"crank.angle"`; displacements and small
         turns of spatial bodies about their own axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a
