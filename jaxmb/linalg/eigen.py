@@ -1,5 +1,7 @@
 """Eigenvalues and eigenvectors of a real matrix without symmetry, with derivatives where they are simple."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +36,7 @@ def eigen(
 
 
 @eigen.defjvp
-def _eigen_jvp(primals, tangents):
+def _eigen_jvp(primals, tangents) -> Any:
     (A, kept), (dA, _) = primals, tangents
     values, vectors, own = eigen(A, kept)
     both = kept[:, None] & kept[None, :]

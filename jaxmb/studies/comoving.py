@@ -35,6 +35,19 @@ class AbstractCarrier(eqx.Module):
     def field(self, state: State) -> State:
         """`S(x)`: the rates of q and u of everything that is carried along."""
 
+    def moved(self, state: State, time: Float[Array, ""]) -> State:
+        """The state that a state is carried to in a time, of at most about one radian."""
+        constant = self.field(jax.tree.map(jnp.zeros_like, state))
+
+        def add(carry, k):
+            total, term = carry
+            term = jax.tree.map(lambda a, b: (a - b) * time / k, self.field(term), constant)
+            return (jax.tree.map(jnp.add, total, term), term), None
+
+        first = jax.tree.map(lambda x: time * x, self.field(state))
+        orders = jnp.arange(2, _TERMS, dtype=state.q.dtype)
+        return lax.scan(add, (jax.tree.map(jnp.add, state, first), first), orders)[0][0]
+
     def displacement(self, like: State, time: Float[Array, ""]) -> "Displacement":
         """The field and the displacement in a time, of at most about one radian, as matrices."""
         join = lambda state: jnp.concatenate([state.q, state.u])

@@ -1,6 +1,7 @@
 """The stability of periodic motions by Floquet's multipliers."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -101,10 +102,10 @@ def floquet(
     check_system("floquet", system)
     state = checked_guess("floquet", system, state)
     t = jnp.asarray(checked_time("floquet", t, state.q.dtype))
-    period = real_array("floquet: period", period, state.q.dtype)
-    if not is_traced(period) and not 0 < period < np.inf:
+    length: Any = real_array("floquet: period", period, state.q.dtype)
+    if not is_traced(length) and not 0 < length < np.inf:
         raise ValueError(f"floquet: period must be positive and finite, got {period}.")
-    period = jnp.asarray(period)
+    period = jnp.asarray(length)
     rtol = real_array("floquet: rtol", rtol, state.q.dtype)
     names = check_state_names(system, t, state, coordinates, rates)
     free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]

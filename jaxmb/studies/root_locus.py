@@ -32,7 +32,7 @@ class RootLocus(eqx.Module):
     def stable(self, least: float = 1e-6) -> np.ndarray:
         """Whether no eigenvalue at a value has a positive real part, above this fraction of the largest one."""
         sizes = np.max(np.abs(self.eigenvalues), axis=1)
-        return np.all(self.eigenvalues.real <= least * sizes[:, None], axis=1)
+        return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
 
 
 def root_locus(
@@ -95,7 +95,8 @@ def root_locus(
     return RootLocus(name, given, *_followed(found, shapes), first.states)
 
 
-def _case(system: Any, name: str, state: Any) -> Callable[[Any], tuple[AbstractSystem, State]]:
+def _case(system: Any, name: str, state: Any) -> Any:
+    """A function of a value that returns a system and its state."""
     if not isinstance(name, str):
         raise ValueError(f"root_locus: name must be text, got {name!r}.")
     if not isinstance(system, AbstractSystem):

@@ -130,6 +130,7 @@ def _search(
     rate = fastest(frozen[0], frozen[2], vector_field(*frozen[:3])[0])
     # Where the guess does not move, the prescribed rates are all that is known of the motion.
     rate = jnp.where(rate > 0, rate, 1.0)
+    later = 0.4 / rate
     length, units = frozen[0].length, (frozen[0].coordinate_scale(), rate * frozen[0].velocity_scale())
     like = unknowns(start)
     of_twist = eqx.tree_at(
@@ -138,7 +139,8 @@ def _search(
     scale = ravel_pytree(eqx.tree_at(lambda x: x.state, of_twist, State(*units)))[0]
 
     def residual(arguments, z):
-        return _residual(*arguments, chosen, advancing, unknowns(scale * z), (*units, rate))
+        system, t, values = arguments
+        return _residual(system, t, values, chosen, advancing, unknowns(scale * z), (*units, rate), later)
 
     def correct(z):
         step = -pseudoinverse(jax.jacfwd(lambda z: residual(now, z))(z)) @ residual(now, z)
@@ -164,23 +166,13 @@ def _search(
     solution = unknowns(scale * root(equations, z, lambda _, x: x))
     state = State(system.normalize(solution.state.q), solution.state.u)
 
-    # The same a little later, where everything has been carried.
-    field = vector_field(system, t, state)[0]
-    carrier = _carrier(system, solution, field, advancing)
-    move = carrier.displacement(state, 0.4 / rate)
-    at = jnp.concatenate([state.q, state.u])
-    later = move.turn @ at + move.shift
-    after = State(later[: system.nq], later[system.nq :])
-    joined = jnp.concatenate([field.q, field.u])
-    there = vector_field(system, t + 0.4 / rate, after)[0]
-    differs = jnp.concatenate([there.q, there.u]) - move.turn @ joined
-    sizes = jnp.concatenate(units) * rate
-    rows = system.coordinate_residual(t + 0.4 / rate, after.q)
-    same = jnp.max(jnp.abs(differs) / sizes) <= 1e3 * tol
-    same = same & (jnp.max(jnp.abs(rows), initial=0.0) <= 1e3 * tol * length)
-    remaining = joined - (move.rate @ at + move.constant)
-    count = len(chosen[0]) + len(chosen[1])
-    unmet = left[left.size - count :]
+    # The same at another time, and what remains now.
+    check = _residual(system, t, values, chosen, advancing, solution, (*units, rate), 0.7 * later)
+    same = jnp.max(jnp.abs(check)) <= 1e3 * tol
+    carrier = _carrier(system, solution, system.rates(t, state.q, state.u), advancing)
+    field, carried = vector_field(system, t, state)[0], carrier.field(state)
+    remaining = jnp.concatenate([field.q - carried.q, field.u - carried.u])
+    unmet = left[left.size - len(chosen[0]) - len(chosen[1]) :]
     return _Found(state, remaining, unmet, solved, solved & same)
 
 
@@ -193,9 +185,11 @@ def _start(system, t, guess, advancing):
     return _Unknowns(guess, together.turning[1], together.travel[1, 0])
 
 
-def _carrier(system, unknowns, field, advancing) -> AbstractCarrier:
+def _carrier(system, unknowns, rates, advancing) -> AbstractCarrier:
+    """What carries a motion along: all bodies together, or only the coordinates that advance."""
     if advancing or not system.has_bodies:
-        return Advance(field.q)
+        moves = np.isin(np.arange(system.nq), advancing)
+        return Advance(jnp.where(moves, rates, 0.0))
     return _bodies(system, unknowns)
 
 
@@ -216,25 +210,26 @@ def _bodies(system, unknowns):
     return Bodies(unknowns.turning, travel, spins - own, index)
 
 
-def _residual(system, t, values, chosen, advancing, unknowns, units):
-    """All equations of a steady motion, in units of the system's size and of the fastest rate."""
+def _residual(system, t, values, chosen, advancing, unknowns, units, later):
+    """All equations of a steady motion, in units of the system's size and of the fastest rate: at the state, and where
+    it is carried to in a while. Balance at one time does not last where the surroundings change.
+    """
     state = unknowns.state
-    field = vector_field(system, t, state)[0]
-    if advancing or not system.has_bodies:
-        held = np.setdiff1d(np.arange(system.nq), advancing)
-        balance = [(field.q / units[0])[held] / units[2], field.u / units[1] / units[2]]
-    else:
-        carried = _bodies(system, unknowns).field(state)
-        balance = [
-            (field.q - carried.q) / units[0] / units[2],
-            (field.u - carried.u) / units[1] / units[2],
-        ]
+    carrier = _carrier(system, unknowns, system.rates(t, state.q, state.u), advancing)
+    sizes, rate, length = jnp.concatenate(units[:2]), units[2], system.length
+
+    def balance(t, at):
+        field, carried = vector_field(system, t, at)[0], carrier.field(at)
+        left = jnp.concatenate([field.q - carried.q, field.u - carried.u]) / (sizes * rate)
+        rows = system.coordinate_residual(t, at.q) / length
+        return jnp.concatenate([left, rows, system.velocity_residual(t, at.q, at.u) / (length * rate)])
+
+    both = jax.tree.map(lambda *x: jnp.stack(x), state, carrier.moved(state, later))
     names = [coordinate_function(system, t, None, name) for name in chosen[0]]
     names += [rate_function(system, t, state, name) for name in chosen[1]]
     reached = jnp.stack([f(state) for f in names]) - values if names else values
-    rows = system.coordinate_residual(t, state.q) / system.length
-    moving = system.velocity_residual(t, state.q, state.u) / (system.length * units[2])
-    return jnp.concatenate([*balance, rows, moving, reached])
+    balances = jax.vmap(balance)(jnp.stack([t, t + later]), both)
+    return jnp.concatenate([balances.reshape(-1), reached])
 
 
 def _not_found(system, found, names):
