@@ -1,4 +1,8 @@
-"""Pictures of motions. Needs the extra `jaxmb[plot]`; matplotlib is imported when a figure is made."""
+"""Pictures of motions and of their stability.
+
+Needs the extra `jaxmb[plot]`; matplotlib is imported when a figure is made.
+"""
 
 from .mechanism import plot_mechanism as plot_mechanism
 from .motion import plot_motion as plot_motion
+from .root_locus import plot_root_locus as plot_root_locus

@@ -1,0 +1,59 @@
+"""Eigenvalues and eigenvectors of a real matrix without symmetry, with derivatives where they are simple."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float
+
+
+@jax.custom_jvp
+def eigen(
+    A: Float[Array, "n n"], kept: Bool[Array, "n"]
+) -> tuple[Complex[Array, "n"], Complex[Array, "n n"], Bool[Array, "n"]]:
+    """Eigenvalues and right eigenvectors of the block of a matrix that some rows and columns form.
+
+    Derivatives of a simple eigenvalue and of its eigenvector follow from the equation `A v = λ v` with one component
+    of v held; that of λ is `wᵀ dA v / wᵀ v`, w the left eigenvector. Of a repeated eigenvalue they do not exist and
+    are not finite.
+
+    **Arguments:** `A`; `kept`: which rows and columns count. The others have eigenvalues zero.
+
+    **Returns:** the eigenvalues in order of their sizes, of a pair the one with positive imaginary part first; the
+    eigenvectors as columns, their largest component is one; and which of them are of the kept block.
+    """
+    block = jnp.where(kept[:, None] & kept[None, :], A, jnp.zeros_like(A))
+    values, vectors = jnp.linalg.eig(block)
+    order = jnp.lexsort((-values.imag, jnp.abs(values)))
+    values, vectors = values[order], vectors[:, order]
+    largest = jnp.argmax(jnp.abs(vectors), axis=0)
+    vectors = vectors / jnp.take_along_axis(vectors, largest[None, :], axis=0)
+    # A row and a column of zeros are an eigenvector of their own.
+    own = jnp.sum(jnp.where(kept[:, None], 0.0, jnp.abs(vectors)), axis=0) < 0.5
+    return values, vectors, own
+
+
+@eigen.defjvp
+def _eigen_jvp(primals, tangents) -> Any:
+    (A, kept), (dA, _) = primals, tangents
+    values, vectors, own = eigen(A, kept)
+    both = kept[:, None] & kept[None, :]
+    A, dA = (jnp.where(both, x, 0.0).astype(vectors.dtype) for x in (A, dA))
+    largest = jnp.argmax(jnp.abs(lax.stop_gradient(vectors)), axis=0)
+    n = A.shape[0]
+    unit = jnp.eye(n + 1, dtype=A.dtype)
+
+    def of_one(value, vector, k, of_block):
+        bordered = jnp.zeros_like(unit).at[:n, :n].set(A - value * unit[:n, :n])
+        bordered = bordered.at[:n, n].set(-vector).at[n, :n].set(unit[k, :n])
+        # Rows that do not count are held; a mode of such a row does not change.
+        bordered = jnp.where(jnp.append(kept, True)[:, None], bordered, unit)
+        bordered = jnp.where(of_block, bordered, unit)
+        change = jnp.linalg.solve(bordered, jnp.append(-(dA @ vector), jnp.zeros((), A.dtype)))
+        change = jnp.where(of_block, change, jnp.zeros_like(change))
+        return change[n], change[:n]
+
+    dvalues, dvectors = jax.vmap(of_one, in_axes=(0, 1, 0, 0), out_axes=(0, 1))(values, vectors, largest, own)
+    return (values, vectors, own), (dvalues, dvectors, np.zeros(own.shape, jax.dtypes.float0))

@@ -1,0 +1,186 @@
+"""The stability of periodic motions by Floquet's multipliers."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from .._types import Scalar, State
+from ..linalg.arrays import is_traced
+from ..linalg.eigen import eigen
+from ..linalg.failure import not_a_number_where
+from ..parts.names import unknown
+from ..simulate import simulate
+from ..states.arguments import check_system, checked_guess, checked_time
+from ..states.consistency import consistent
+from ..system import AbstractSystem
+from ..system.arguments import real_array
+from .linearise import state_labels
+from .perturbations import check_state_names, perturbations
+from .quantities import checked_names
+
+# The largest distance between the ends of a periodic motion, in units of the system's size, radians and the period; at
+# least this multiple of the tolerance of integration.
+_CLOSED, _OF_TOLERANCE = 1e-6, 1e4
+
+
+class Floquet(eqx.Module):
+    """The linear map of small perturbations over one period of a periodic motion. `print` shows its multipliers.
+
+    **Fields:** `monodromy` (k, k): the perturbations after a period from those before it; `states`, their names, of
+    which the first `coordinates` are coordinates and the others rates; `basis` (nq + nu, k): the changes of all
+    coordinates and velocities with them; `period` [s].
+    """
+
+    monodromy: Float[Array, "k k"]
+    states: tuple[str, ...] = eqx.field(static=True)
+    coordinates: int = eqx.field(static=True)
+    basis: Float[Array, "n k"]
+    period: Array
+
+    @property
+    def multipliers(self) -> Complex[Array, "k"]:
+        """Eigenvalues of the monodromy matrix, the largest first: the motion is unstable if one exceeds 1 in size.
+        That of the motion itself is 1 where nothing depends on time. Simple ones are differentiable.
+        """
+        kept = jnp.ones(len(self.states), bool)
+        return eigen(self.monodromy, kept)[0][::-1]
+
+    @property
+    def exponents(self) -> Complex[Array, "k"]:
+        """`log(multiplier) / period` [1/s], up to multiples of `2πi / period`."""
+        values = self.multipliers
+        return jnp.log(values) / self.period.astype(values.dtype)
+
+    def __str__(self) -> str:
+        if is_traced(self.monodromy) or self.monodromy.ndim != 2:
+            return repr(self)
+        lines = [f"period {float(self.period):.6g} s", f"{'multiplier':>26}  {'size':>10}  {'growth [1/s]':>12}"]
+        for value, exponent in zip(np.asarray(self.multipliers), np.asarray(self.exponents), strict=True):
+            text = f"{value.real:.6g} {'-' if value.imag < 0 else '+'} {abs(value.imag):.6g}i"
+            lines.append(f"{text:>26}  {abs(value):>10.6g}  {exponent.real:>12.5g}")
+        return "\n".join(lines)
+
+
+def floquet(
+    system: AbstractSystem,
+    state: State,
+    period: Scalar,
+    *,
+    t: Scalar = 0.0,
+    coordinates: Sequence[str] | None = None,
+    rates: Sequence[str] | None = None,
+    ignorable: Sequence[str] = (),
+    rtol: Scalar = 1e-10,
+    solver: diffrax.AbstractSolver | None = None,
+) -> Floquet:
+    """Find Floquet's multipliers of a periodic motion, in independent coordinates.
+
+    The motion and its derivatives with respect to all independent perturbations of its start are integrated over one
+    period, on the constraints.
+
+    **Arguments:**
+
+    - `system`, `state`: a compiled scene, or another system, and a consistent state of the motion at the time `t` [s].
+    - `period` [s], positive.
+    - `coordinates`, `rates`: names of states, as in `linearise`.
+    - `ignorable`: names of coordinates that may advance in a period, on which nothing depends: the place of a vehicle.
+        Angles of bodies may make whole turns.
+    - `rtol`, `solver`: of `simulate`.
+
+    **Returns:** a `Floquet`; differentiable with respect to the parameters, the state and the period in forward mode.
+
+    **Raises:** `ValueError` for unknown names, a period that is not positive, a state that violates the constraints,
+    and a motion that does not return after the period, with the coordinates in which it differs. Under a trace the
+    result is NaN instead.
+    """
+    check_system("floquet", system)
+    state = checked_guess("floquet", system, state)
+    t = jnp.asarray(checked_time("floquet", t, state.q.dtype))
+    length: Any = real_array("floquet: period", period, state.q.dtype)
+    if not is_traced(length) and not 0 < length < np.inf:
+        raise ValueError(f"floquet: period must be positive and finite, got {period}.")
+    period = jnp.asarray(length)
+    rtol = real_array("floquet: rtol", rtol, state.q.dtype)
+    names = check_state_names(system, t, state, coordinates, rates)
+    free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]
+    state = consistent(system, t, State(system.normalize(state.q), state.u))
+    own = eqx.filter_jit(perturbations)(system, t, state, names)
+    if not is_traced(own.regular) and not np.all(np.asarray(own.regular)):
+        raise ValueError("The state is singular, or the named coordinates or rates are not independent in it.")
+    end, pushed = _flow(system, state, own.basis, t, period, rtol, solver)
+    distance, pushed = _return(system, state, end, pushed, np.concatenate([np.zeros(0, int), *free]))
+    sizes = jnp.concatenate([system.coordinate_scale(), system.velocity_scale() * 2 * np.pi / period])
+    far = jnp.abs(distance) / sizes > jnp.maximum(_CLOSED, _OF_TOLERANCE * jnp.asarray(rtol))
+    bad = jnp.any(far) | ~jnp.all(own.regular) | ~jnp.all(jnp.isfinite(pushed))
+    monodromy = own.reading @ pushed
+    if is_traced((monodromy, bad)):
+        monodromy = not_a_number_where(bad, monodromy, (system, state, t, period))
+    elif not bool(jnp.all(jnp.isfinite(pushed))):
+        raise RuntimeError("The motion or its derivatives could not be integrated over the period; simulate it to see.")
+    elif bad:
+        raise ValueError(_open(system, period, np.asarray(distance), np.asarray(far)))
+    return Floquet(monodromy, state_labels(system, names, own), own.coordinates, own.basis, period)
+
+
+def _indices(system, name):
+    names = system.coordinate_names()
+    if name not in names:
+        raise unknown("coordinate", name, names)
+    return np.array(names[name], int)
+
+
+@eqx.filter_jit
+def _flow(system, state, basis, t, period, rtol, solver):
+    """The state after the period, and its derivatives along the perturbations."""
+    nq = system.nq
+
+    def run(z):
+        start = State(state.q + basis[:nq] @ z, state.u + basis[nq:] @ z)
+        motion = simulate(
+            system, start, t0=t, t1=t + period, rtol=rtol, solver=solver, adjoint=diffrax.ForwardMode(), throw=False
+        )
+        end = jnp.concatenate([motion.ys.q[-1], motion.ys.u[-1]])
+        return end, end
+
+    pushed, end = jax.jacfwd(run, has_aux=True)(jnp.zeros(basis.shape[1], basis.dtype))
+    return end, pushed
+
+
+def _return(system, state, end, pushed, free):
+    """The distance of the end of a motion from its start, and the derivatives there; whole turns of bodies and the
+    sign of their Euler parameters do not count.
+    """
+    q, nq = end[: system.nq], system.nq
+    names = system.coordinate_names()
+    sign = jnp.ones(end.size, end.dtype)
+    distance = jnp.concatenate([q - state.q, end[nq:] - state.u])
+    for body in system.motion_names() if system.has_bodies else ():
+        if (attitude := names.get(f"{body}.orientation")) is not None:
+            index = np.array(attitude)
+            sign = sign.at[index].set(jnp.where(jnp.dot(q[index], state.q[index]) < 0, -1.0, 1.0))
+        elif (angle := names.get(f"{body}.angle")) is not None:
+            index = np.array(angle)
+            turn = 2 * np.pi * jnp.round(distance[index] / (2 * np.pi))
+            distance = distance.at[index].add(-turn)
+    # p and −p are the same attitude.
+    back = sign * end - jnp.concatenate([state.q, state.u])
+    distance = jnp.where(sign < 0, back, distance).at[free].set(0.0)
+    return distance, sign[:, None] * pushed
+
+
+def _open(system, period, distance, far):
+    labels = {index[0]: name for name, index in system.coordinate_names().items() if len(index) == 1}
+    rates = {index[0]: f"the rate of {name}" for name, index in system.rate_names().items() if len(index) == 1}
+    name = lambda k: labels[k] if k < system.nq else rates[k - system.nq]
+    worst = [k for k in np.argsort(-np.abs(distance)) if far[k]][:4]
+    listed = ", ".join(f"{name(k)} ({distance[k]:.3g})" for k in worst)
+    return (
+        f"The motion does not return after {float(period):.6g} s: it differs in {listed}. Give its period and a state "
+        "on it; coordinates on which nothing depends may be named as ignorable."
+    )

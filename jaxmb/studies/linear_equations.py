@@ -1,0 +1,193 @@
+"""The linear equations about a state: derivatives of the equations of motion along its independent perturbations.
+
+Small perturbations of a motion `ẋ = X(x)` on the constraints are tangent to them, and to first order `δẋ = DX δx`
+depends on no extension of X off the constraints. So A follows from derivatives of the full equations along a basis of
+the tangent space, without multipliers among the unknowns. Forces on dependent coordinates count to second order, since
+the accelerations are those of the constrained system.
+
+About a steady motion perturbations are seen from a frame that is carried along (`comoving`), in which the equations are
+constant. That they are is found out by comparing them with those a little later.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar, State
+from ..formulations import accelerations
+from ..manifold.manifold import all_rows_formulation
+from ..system import AbstractSystem, Solved, parameters, with_parameters
+from .comoving import carriers
+from .perturbations import Perturbations, StateNames, perturbations
+from .quantities import measured
+
+# Accelerations that remain may be this fraction of those that the applied forces alone would cause, and this fraction
+# of what displacements by the system's size would cause: assembled states are this exact.
+_UNBALANCED, _ROUNDING = 1e-6, 1e-9
+# Relative change of the equations along a steady motion that counts as none.
+_SAME = 1e-6
+
+
+def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
+    """q̇ and u̇ of a state, and the multipliers."""
+    udot, multipliers = accelerations(system, all_rows_formulation(system), t, state.q, state.u)
+    return State(system.rates(t, state.q, state.u), udot), multipliers
+
+
+class LinearEquations(NamedTuple):
+    """The linear equations and what was found out about them.
+
+    `residual`: what remains of X − S at the state, (n,), `steady` whether it vanishes; `moving`, whether anything
+    moves; `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 + inputs +
+    outputs,); `bound`: which inputs move constraints.
+    """
+
+    A: Float[Array, "k k"]
+    B: Float[Array, "k i"]
+    C: Float[Array, "o k"]
+    D: Float[Array, "o i"]
+    perturbations: Perturbations
+    residual: Float[Array, "n"]
+    steady: Bool[Array, ""]
+    moving: Bool[Array, ""]
+    constant: Bool[Array, "all"]
+    bound: Bool[Array, "i"]
+    ok: Bool[Array, ""]
+
+
+class _Local(NamedTuple):
+    """Values and derivatives along the states (k) and the inputs (i) at one state."""
+
+    rates: Float[Array, "n"]
+    by_states: Float[Array, "n k"]
+    by_inputs: Float[Array, "n i"]
+    outputs_by_states: Float[Array, "o k"]
+    outputs_by_inputs: Float[Array, "o i"]
+    rows_by_inputs: Float[Array, "m i"]
+
+
+@eqx.filter_jit
+def linear_equations(
+    system: AbstractSystem,
+    t: Array,
+    state: State,
+    names: StateNames,
+    inputs: tuple[tuple[str, int], ...],
+    outputs: tuple[tuple[str, int], ...],
+) -> LinearEquations:
+    own = perturbations(system, t, state, names)
+    field, _ = vector_field(system, t, state)
+    rate = fastest(system, state, field)
+    moving = rate > 0
+    later = jnp.where(moving, 0.4 / jnp.where(moving, rate, 1.0), 1.0)
+
+    # The state itself, and where each displacement carries it, with the same perturbations.
+    moves = jax.vmap(lambda carrier: carrier.displacement(state, later))(carriers(system, state, field, system.length))
+    at = jnp.concatenate([state.q, state.u])
+    points = jnp.concatenate([at[None], jax.vmap(lambda move: move.turn @ at + move.shift)(moves)])
+    bases = jnp.concatenate([own.basis[None], jax.vmap(lambda move: move.turn @ own.basis)(moves)])
+    times = jnp.concatenate([t[None], jnp.broadcast_to(t + later, (len(points) - 1,))])
+    local = jax.vmap(lambda t, x, basis: _local(system, t, x, basis, inputs, outputs))
+    found = local(times, points, bases)
+    here = jax.tree.map(lambda x: x[0], found)
+
+    # What is left in the frame of each displacement, in units of the states' sizes and the fastest rate.
+    sizes = jnp.concatenate([system.coordinate_scale(), system.velocity_scale()])
+    kq = own.coordinates
+    widths = jnp.max(jnp.abs(own.basis) / sizes[:, None], axis=0)
+    entries = jnp.abs(here.by_states[system.nq :]) / (system.velocity_scale()[:, None] * widths[None, :])
+    omega = rate + jnp.max(entries[:, kq:], initial=0.0) + jnp.sqrt(jnp.max(entries[:, :kq], initial=0.0))
+    omega = jnp.where(omega > 0, omega, 1.0)
+    units = jnp.concatenate([system.coordinate_scale(), omega * system.velocity_scale()])
+    widths = jnp.max(jnp.abs(own.basis) / units[:, None], axis=0)
+    single = jnp.finfo(at.dtype).eps > 1e-10
+    unbalanced, rounding, same = (3e-4, 1e-5, 1e-3) if single else (_UNBALANCED, _ROUNDING, _SAME)
+    allowed = unbalanced * (_applied(system, t, state) + rate**2) / omega**2 + rounding
+
+    def judge(move, after):
+        residual = here.rates - (move.rate @ at + move.constant)
+        largest = jnp.max(jnp.abs(residual) / units) / omega
+        rows = units[:, None]
+        pairs = (
+            (after.by_states / (rows * widths[None, :]), move.turn @ here.by_states / (rows * widths[None, :])),
+            (after.rates / units, move.turn @ here.rates / units),
+        )
+        states = jnp.stack([jnp.max(jnp.abs(a - b)) <= (same + allowed) * omega for a, b in pairs])
+        inputs = _unchanged(after.by_inputs.T / units[None, :], (move.turn @ here.by_inputs).T / units[None, :], same)
+        outputs = _unchanged(after.outputs_by_states / widths[None, :], here.outputs_by_states / widths[None, :], same)
+        through = _unchanged(after.outputs_by_inputs, here.outputs_by_inputs, same)
+        constant = jnp.concatenate([jnp.all(states)[None], inputs, outputs & through])
+        return residual, largest, largest <= allowed, constant
+
+    residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], found))
+    # The first displacement that carries the motion along and leaves its equations as they are; else the nearest one.
+    good = steady & constant[:, 0]
+    nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
+    best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)
+    bound = jnp.max(jnp.abs(here.rows_by_inputs), axis=0, initial=0.0) > 0
+    ok = jnp.all(own.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
+    return LinearEquations(
+        own.reading @ (here.by_states - moves.rate[best] @ own.basis),
+        own.reading @ here.by_inputs,
+        here.outputs_by_states,
+        here.outputs_by_inputs,
+        own,
+        residuals[best],
+        steady[best],
+        moving,
+        constant[best],
+        bound,
+        ok,
+    )
+
+
+def _local(system, t, x, basis, inputs, outputs):
+    """Values and derivatives at a state, by one forward derivative."""
+    nq, k = system.nq, basis.shape[1]
+    names = tuple(dict.fromkeys(name for name, _ in inputs))
+    known = parameters(system) if names else {}
+
+    def evaluate(changes):
+        values = {name: known[name] for name in names}
+        for (name, place), change in zip(inputs, changes[k:], strict=True):
+            value = values[name]
+            values[name] = jnp.ravel(value).at[place].add(change.astype(value.dtype)).reshape(value.shape)
+        changed = with_parameters(system, values) if names else system
+        there = x + basis @ changes[:k]
+        state = State(there[:nq], there[nq:])
+        field, multipliers = vector_field(changed, t, state)
+        rates = jnp.concatenate([field.q, field.u])
+        seen = measured(changed, outputs, t, state, Solved(field.u, multipliers))
+        rows = jnp.zeros(0, x.dtype)
+        if names:
+            residuals = changed.position_residual(t, state.q), changed.velocity_residual(t, state.q, state.u)
+            rows = jnp.concatenate(residuals)
+        return (rates, seen, rows), rates
+
+    (field, seen, rows), rates = jax.jacfwd(evaluate, has_aux=True)(jnp.zeros(k + len(inputs), x.dtype))
+    return _Local(rates, field[:, :k], field[:, k:], seen[:, :k], seen[:, k:], rows[:, k:])
+
+
+def _unchanged(after, before, same):
+    """Which rows of a matrix are the same."""
+    size = jnp.max(jnp.abs(before), axis=1, initial=0.0)
+    rounding = 1e-6 * same * jnp.max(size, initial=0.0)
+    return jnp.max(jnp.abs(after - before), axis=1, initial=0.0) <= same * size + rounding
+
+
+def fastest(system, state, field):
+    """The largest rate of the motion [1/s], lengths in units of the system's size."""
+    speeds = jnp.max(jnp.abs(state.u) / system.velocity_scale(), initial=0.0)
+    return lax.stop_gradient(jnp.maximum(speeds, jnp.max(jnp.abs(field.q) / system.coordinate_scale())))
+
+
+def _applied(system, t, state):
+    """The largest acceleration that applied forces would cause without constraints, in the same units."""
+    if not system.positive_definite_mass:
+        return jnp.zeros((), state.q.dtype)
+    free = system.inertia(t, state.q, state.u).solve(system.force(t, state.q, state.u))
+    return jnp.max(jnp.abs(free) / system.velocity_scale())

@@ -1,0 +1,204 @@
+"""The linear equations of small motions: eigenvalues, modes and frequency responses."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
+
+from .._types import Scalar, State
+from ..linalg.arrays import is_traced
+from ..linalg.eigen import eigen
+from ..manifold import project_normalized
+from ..system import AbstractSystem
+from ..system.arguments import real_array
+
+# A column of A below this fraction of the largest, in units of the states' sizes, has no effect.
+_NO_EFFECT = 1e-10
+
+
+class Mode(eqx.Module):
+    """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
+
+    **Fields:** `eigenvalue` λ [1/s]; `q` and `u`, the shape in all coordinates and velocities, complex, (nq,) and
+    (nu,); the displacement that is largest in units of the system's size is one; `system`, `state`, `t`.
+    """
+
+    eigenvalue: Complex[Array, ""]
+    q: Complex[Array, "nq"]
+    u: Complex[Array, "nu"]
+    system: AbstractSystem
+    state: State
+    t: Array
+
+    def at(self, phase: Scalar, amplitude: Scalar) -> State:
+        """The state nearest to the mode at a phase [rad], on the constraints; for pictures, and to start a simulation.
+
+        **Arguments:** `amplitude`: of the largest displacement, in units of the system's size, or in radians.
+        """
+        dtype, given = self.state.q.dtype, (("phase", phase), ("amplitude", amplitude))
+        phase, amplitude = (jnp.asarray(real_array(f"Mode.at: {name}", x, dtype)) for name, x in given)
+        shown = lambda shape: amplitude * (jnp.cos(phase) * shape.real - jnp.sin(phase) * shape.imag)
+        moved = State(self.state.q + shown(self.q), self.state.u + shown(self.u))
+        return project_normalized(self.system, self.t, moved)
+
+
+class Linearisation(eqx.Module):
+    """`ż = A z + B w`, `y = C z + D w`: small changes of states z, inputs w and outputs y. `print` shows its modes.
+
+    **Fields:**
+
+    - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.
+    - `states`, `inputs`, `outputs`: their names. The first `coordinates` states are coordinates, the others rates.
+    - `basis` (nq + nu, k): the changes of all coordinates and velocities with the states; `system`, `state`, `t`.
+    """
+
+    A: Float[Array, "k k"]
+    B: Float[Array, "k i"]
+    C: Float[Array, "o k"]
+    D: Float[Array, "o i"]
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    coordinates: int = eqx.field(static=True)
+    basis: Float[Array, "n k"]
+    system: AbstractSystem
+    state: State
+    t: Array
+
+    @property
+    def eigenvalues(self) -> Complex[Array, "k"]:
+        """Eigenvalues of A [1/s] in order of their sizes. Simple ones are differentiable; derivatives of others are
+        not finite.
+        """
+        return _spectrum(self)[0]
+
+    @property
+    def vectors(self) -> Complex[Array, "k k"]:
+        """Eigenvectors as columns, in the states; see `Mode` for their size."""
+        return _spectrum(self)[1]
+
+    @property
+    def frequencies(self) -> Float[Array, "k"]:
+        """`|λ|` of every eigenvalue [rad/s], the natural frequency of a vibration without its damping."""
+        return _size(self.eigenvalues)
+
+    @property
+    def damping_ratios(self) -> Float[Array, "k"]:
+        """`−Re λ / |λ|` of every eigenvalue; zero where the eigenvalue is."""
+        values = self.eigenvalues
+        size = _size(values)
+        return jnp.where(size > 0, -values.real / jnp.where(size > 0, size, 1.0), 0.0)
+
+    @property
+    def ignorable(self) -> Bool[Array, "k"]:
+        """States that have no effect on others, or only on such states. Their eigenvalues are zero."""
+        return ~_effective(self)
+
+    def mode(self, k: int) -> Mode:
+        """The mode of the k-th eigenvalue.
+
+        **Raises:** `ValueError` for a number that no eigenvalue has.
+        """
+        count = len(self.states)
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or not -count <= k < count:
+            raise ValueError(f"There are {count} modes, numbered from 0, got {k!r}.")
+        values, vectors = _spectrum(self)
+        shape = self.basis.astype(vectors.dtype) @ vectors[:, k]
+        nq = self.system.nq
+        return Mode(values[k], shape[:nq], shape[nq:], self.system, self.state, self.t)
+
+    def frequency_response(self, omega: ArrayLike) -> Complex[Array, "frequencies o i"]:
+        """`C (iω − A)⁻¹ B + D` at angular frequencies [rad/s], shape (frequencies, outputs, inputs).
+
+        **Raises:** `ValueError` for frequencies that are no vector of real numbers, and without inputs or outputs.
+        """
+        if not self.inputs or not self.outputs:
+            raise ValueError("A frequency response needs inputs and outputs: linearise(..., inputs=, outputs=).")
+        omega = jnp.asarray(real_array("omega", omega, self.A.dtype, None))
+        if omega.ndim != 1:
+            raise ValueError(f"omega must be a vector of angular frequencies, got shape {omega.shape}.")
+        return _response(self, omega)
+
+    def __str__(self) -> str:
+        if is_traced(self.A) or self.A.ndim != 2:
+            return repr(self)
+        values, vectors = map(np.asarray, _spectrum(self))
+        shares = np.abs(vectors) * np.asarray(_widths(self))[:, None]
+        lines = [f"{'mode':>4}  {'eigenvalue [1/s]':>24}  {'[rad/s]':>9}  {'damping':>8}  largest states"]
+        for k, (value, size, ratio) in enumerate(
+            zip(values, np.asarray(self.frequencies), np.asarray(self.damping_ratios), strict=True)
+        ):
+            if value.imag < 0:
+                continue
+            text = f"{value.real:.5g}" + (f" ± {value.imag:.5g}i" if value.imag > 0 else "")
+            # A change of speed alone, which nothing depends on, displaces nothing at first.
+            displaced = np.any(shares[: self.coordinates, k])
+            own = shares[: self.coordinates, k] if displaced else shares[:, k]
+            largest = [self.states[j] for j in np.argsort(-own)[:3] if own[j] > 0.05 * own.max()]
+            lines.append(f"{k:>4}  {text:>24}  {size:>9.5g}  {ratio:>8.4f}  {', '.join(largest)}")
+        return "\n".join(lines)
+
+
+def _widths(linear):
+    """The sizes of the changes of the whole state by each state, in units of the system's size and radians, and these
+    times the fastest rate.
+    """
+    R, nq, kq = jnp.abs(linear.basis), linear.system.nq, linear.coordinates
+    by_coordinates = jnp.max(R[:nq, :kq] / linear.system.coordinate_scale()[:, None], axis=0)
+    by_rates = jnp.max(R[nq:, kq:] / linear.system.velocity_scale()[:, None], axis=0)
+    scaled = jnp.abs(linear.A[kq:]) * by_rates[:, None]
+    stiffness, damping = scaled[:, :kq] / by_coordinates[None, :], scaled[:, kq:] / by_rates[None, :]
+    omega = jnp.max(damping, initial=0.0) + jnp.sqrt(jnp.max(stiffness, initial=0.0))
+    return jnp.concatenate([by_coordinates, by_rates / jnp.where(omega > 0, omega, 1.0)])
+
+
+def _effective(linear):
+    """Which states have an effect on others that have one, or on themselves."""
+    widths = _widths(linear)
+    effects = jnp.abs(linear.A) * widths[:, None] / widths[None, :]
+    least = _NO_EFFECT * jnp.max(effects, initial=0.0)
+
+    def reduce(_, kept):
+        return kept & (jnp.max(jnp.where(kept[:, None], effects, 0.0), axis=0) > least)
+
+    return lax.fori_loop(0, len(linear.states), reduce, jnp.ones(len(linear.states), bool))
+
+
+@eqx.filter_jit
+def _spectrum(linear):
+    """Eigenvalues, and eigenvectors in all states."""
+    kept = lax.stop_gradient(_effective(linear))
+    values, vectors, own = eigen(linear.A, kept)
+    A, unit = linear.A.astype(values.dtype), jnp.eye(len(linear.states), dtype=values.dtype)
+    size = lax.stop_gradient(jnp.abs(values))
+    quick = own & (size > _NO_EFFECT * jnp.max(size, initial=0.0))
+
+    def complete(value, vector, quick):
+        # States without effect on others follow the others: (λ − A_ii) v_i = A_ik v_k.
+        follows = (~kept & quick)[:, None]
+        matrix = jnp.where(follows & ~kept[None, :], value * unit - A, unit)
+        pushed = A @ jnp.where(kept, vector, jnp.zeros_like(vector))
+        return jnp.linalg.solve(matrix, jnp.where(follows[:, 0], pushed, vector))
+
+    vectors = jax.vmap(complete, in_axes=(0, 1, 0), out_axes=1)(values, vectors, quick)
+    nq, scale = linear.system.nq, linear.system.coordinate_scale()
+    shapes = (linear.basis[:nq] / scale[:, None]).astype(vectors.dtype) @ vectors
+    largest = jnp.argmax(jnp.abs(lax.stop_gradient(shapes)), axis=0)
+    unity = jnp.take_along_axis(shapes, largest[None, :], axis=0)
+    return values, vectors / jnp.where(unity == 0, jnp.ones_like(unity), unity)
+
+
+@eqx.filter_jit
+def _response(linear, omega):
+    dtype = np.result_type(linear.A.dtype, np.complex64)
+    A, B, C, D = (x.astype(dtype) for x in (linear.A, linear.B, linear.C, linear.D))
+    shift = lambda w: lax.complex(jnp.zeros_like(w), w) * jnp.eye(len(linear.states), dtype=dtype)
+    return jax.vmap(lambda w: C @ jnp.linalg.solve(shift(w) - A, B) + D)(omega)
+
+
+def _size(values):
+    """`|λ|`, with derivative zero at zero."""
+    square = values.real**2 + values.imag**2
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)

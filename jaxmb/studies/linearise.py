@@ -1,0 +1,181 @@
+"""The linear equations of small motions about an equilibrium or a steady motion, with named states."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import Scalar, State
+from ..linalg.arrays import is_traced
+from ..linalg.failure import not_a_number_where
+from ..states.arguments import check_system, checked_guess, checked_time
+from ..states.consistency import consistent
+from ..system import AbstractSystem, parameters
+from .linear_equations import LinearEquations, linear_equations
+from .linearisation import Linearisation
+from .perturbations import (
+    Perturbations,
+    StateNames,
+    check_state_names,
+    displacement_names,
+    rate_candidates,
+)
+from .quantities import component_names, components
+
+
+def linearise(
+    system: AbstractSystem,
+    state: State,
+    *,
+    t: Scalar = 0.0,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    coordinates: Sequence[str] | None = None,
+    rates: Sequence[str] | None = None,
+) -> Linearisation:
+    """Linearise the equations of motion about an equilibrium or a steady motion, in independent coordinates.
+
+    `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. There
+    are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, so no
+    eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as the place of a vehicle
+    on level ground.
+
+    In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then
+    seen from a frame that is carried along with each body, so that A is constant; that it is, is verified a little
+    later along the motion.
+
+    **Arguments:**
+
+    - `system`, `state`: a compiled scene, or another system, and a consistent state of it, from `equilibrium`,
+        `steady_motion` or `assemble`.
+    - `t`: the time, for drivers [s].
+    - `inputs`: names of parameters, `"motor.torque"`, or of their components, `"push.force[0]"`.
+    - `outputs`: names of quantities that `Trajectory.quantity` takes, `"rod.position"`, `"A.force"`, or components.
+    - `coordinates`: names of coordinates that should be states: entries of q, `"crank.angle"`; displacements and small
+        turns of spatial bodies about their own axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a
+        smooth function of q. They may be fewer than the independent ones; the others are chosen, by pivoting.
+    - `rates`: likewise names of velocities, `"crank.angle"`, `"frame.wx"`, or `"crank.angle.rate"` of any coordinate;
+        default the rates of the coordinates, as far as they are independent.
+
+    **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have no names but numbers, since numbers decide
+    on the choice; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to parameters
+    and the state are exact, those of A at fixed states.
+
+    **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
+    constraints, is singular, is no equilibrium or steady motion, with the accelerations that remain; for a motion whose
+    linear equations change with time; and for inputs that move joints. Under a trace the result is NaN instead.
+    """
+    check_system("linearise", system)
+    state = checked_guess("linearise", system, state)
+    t = jnp.asarray(checked_time("linearise", t, state.q.dtype))
+    names = check_state_names(system, t, state, coordinates, rates)
+    shapes = {name: value.shape for name, value in parameters(system).items()} if len(tuple(inputs)) else {}
+    seen = {name: value.shape for name, value in system.quantities().items()}
+    chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
+    state = consistent(system, t, State(system.normalize(state.q), state.u))
+    found = linear_equations(system, t, state, names, chosen, observed)
+    labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
+    matrices = found.A, found.B, found.C, found.D
+    if is_traced((matrices, found.ok)):
+        matrices = not_a_number_where(~found.ok, matrices, (system, state, t))
+    elif not found.ok:
+        raise ValueError(_refusal(system, t, state, names, found, labels))
+    return Linearisation(
+        *matrices,
+        states=state_labels(system, names, found.perturbations),
+        inputs=labels[0],
+        outputs=labels[1],
+        coordinates=found.perturbations.coordinates,
+        basis=found.perturbations.basis,
+        system=system,
+        state=state,
+        t=t,
+    )
+
+
+def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations) -> tuple[str, ...]:
+    """The names of the states; of chosen ones under a trace, where the choice is not known, numbers."""
+    coordinates, rates = found.picked
+    own = [_rate_label(system, name) for name in names.rates or ()]
+    if is_traced(found.picked):
+        chosen = [f"coordinate {k}" for k in range(coordinates.size)], [f"rate {k}" for k in range(rates.size)]
+    else:
+        lists = displacement_names(system), rate_candidates(system, names)
+        chosen = tuple([known[int(k)] for k in picked] for known, picked in zip(lists, found.picked, strict=True))
+    return (*names.coordinates, *chosen[0], *own, *chosen[1])
+
+
+def _rate_label(system, name):
+    """The name of a rate as a state, which differs from that of its coordinate."""
+    return f"{name}.rate" if name in system.coordinate_names() else name
+
+
+def _label(item, shapes):
+    name, place = item
+    return component_names(name, shapes[name])[place]
+
+
+def _refusal(system, t, state, names, found: LinearEquations, labels):
+    """Why there are no linear equations."""
+    full, coordinates, rates = map(bool, found.perturbations.regular)
+    if not full:
+        return "The state is singular: fewer constraint rows are independent than elsewhere. Linearise at another one."
+    for kind, good, given in (("coordinates", coordinates, names.coordinates), ("rates", rates, names.rates or ())):
+        if not good:
+            return (
+                f"The {kind} {', '.join(given)} are not independent of each other in this state. Name fewer of them, "
+                "or others."
+            )
+    if not found.steady:
+        return _not_steady(system, found)
+    constant = np.asarray(found.constant)
+    if not constant[0]:
+        return (
+            "The linear equations change along this motion, or with time: it is no steady motion, since bodies that "
+            f"move ({', '.join(_moving(system, t, state))}) do not carry their surroundings along. For a periodic "
+            "motion use jaxmb.floquet."
+        )
+    changing = [name for name, same in zip([*labels[0], *labels[1]], constant[1:], strict=True) if not same]
+    if changing:
+        return (
+            f"The effects of {', '.join(changing)} change along this motion, since their directions do not turn with "
+            "it. Choose quantities or forces whose directions are fixed in a body that is carried along."
+        )
+    moves = [name for name, own in zip(labels[0], np.asarray(found.bound), strict=True) if own]
+    return (
+        f"{', '.join(moves)} cannot be an input: it moves the constraints, and the state would have to follow. Use "
+        "a force, a torque, or a parameter of one."
+    )
+
+
+def remaining(system: AbstractSystem, residual) -> str:
+    """The accelerations that remain where there should be none, for messages."""
+    left = np.asarray(residual)
+    rates, accelerations = left[: system.nq], left[system.nq :]
+    labels = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
+    worst = [k for k in np.argsort(-np.abs(accelerations))[:4] if abs(accelerations[k]) > 1e-6 * np.abs(left).max()]
+    listed = ", ".join(f"{labels[k]} ({accelerations[k]:.3g})" for k in worst)
+    if listed:
+        return f"accelerations remain along {listed}, in m/s² and rad/s²"
+    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from those of a uniform motion"
+
+
+def _not_steady(system, found):
+    left = remaining(system, found.residual)
+    if found.moving:
+        return (
+            f"The state is no steady motion: {left}, which no uniform motion of all bodies has. jaxmb.steady_motion "
+            "finds one near it; about a periodic motion use jaxmb.floquet."
+        )
+    return f"The state is no equilibrium: {left}. jaxmb.equilibrium(system, state) finds one near it."
+
+
+def _moving(system, t, state):
+    """Names of the bodies or coordinates that move."""
+    speeds = np.abs(np.asarray(system.rates(t, state.q, state.u)))
+    names = system.coordinate_names()
+    index = {name: names.get(f"{name}.position", names.get(name, [])) for name in system.motion_names()}
+    if system.has_bodies:
+        turning = lambda name: names.get(f"{name}.orientation", names.get(f"{name}.angle", []))
+        index = {name: [*own, *turning(name)] for name, own in index.items()}
+    return [name for name, own in index.items() if np.any(speeds[own] > 0)] or ["none"]

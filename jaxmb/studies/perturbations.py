@@ -1,0 +1,268 @@
+"""Independent perturbations of a constrained state: coordinates and velocities by name.
+
+A state moves on the constraints along directions T, as many as there are independent coordinates and independent
+velocities; dependent velocities change with the coordinates too, since ψ(t, q, u) = 0 holds along them. Named states
+read small changes, `z = S δx`, and `δx = R z` with `R = T (S T)⁻¹`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._types import Scalar, State
+from ..linalg.arrays import is_traced
+from ..linalg.elimination import PivotSearch, eliminate, full_pivot
+from ..parts.names import unknown
+from ..system import AbstractSystem
+from .quantities import checked_names, components, measured
+
+# How much rather a state is chosen than another that serves as well: turns than displacements, the rates of coordinates
+# that were chosen than other rates, and those of coordinates that the user named than any.
+_TURN, _CHOSEN, _NAMED = 4.0, 4.0, 64.0
+
+
+class StateNames(NamedTuple):
+    """The states that the user names; static. `rates` None: those of the named coordinates, as far as they are
+    independent.
+    """
+
+    coordinates: tuple[str, ...]
+    rates: tuple[str, ...] | None
+
+
+class Perturbations(eqx.Module):
+    """Independent perturbations z of a state.
+
+    **Fields:** `basis` (n × k): `δx = basis z` of x = (q, u); `reading` (k × n): `z = reading δx`; `coordinates`, the
+    number of states that are coordinates, which come first; `picked`: of the states that the user did not name, the
+    coordinates as indices in `displacement_names`, the rates as indices in `rate_candidates`; `regular`: whether the
+    constraints have their ranks, and the named coordinates and rates are independent.
+    """
+
+    basis: Float[Array, "n k"]
+    reading: Float[Array, "k n"]
+    coordinates: int = eqx.field(static=True)
+    picked: tuple[Int[Array, "c"], Int[Array, "r"]]
+    regular: Bool[Array, "3"]
+
+
+def counts(system: AbstractSystem) -> tuple[int, int]:
+    """Numbers of independent coordinates and of independent velocities."""
+    return system.nq - system.coordinate_rank, system.nu - system.velocity_rank
+
+
+def displacement_names(system: AbstractSystem) -> list[str]:
+    """Names of the displacements that coordinates are chosen from: the coordinates; or, where these have invariants of
+    their own, translations and small turns about the body's axes, `"rod.x"` and `"rod.rotation_x"`.
+    """
+    if not _has_invariants(system):
+        return _singles(system.coordinate_names(), system.nq)
+    names = _singles(system.rate_names(), system.nu)
+    return [f"{name[:-2]}rotation_{name[-1]}" if name[-3:-1] == ".w" else name for name in names]
+
+
+def rate_candidates(system: AbstractSystem, names: StateNames) -> list[str]:
+    """Names of the rates that velocities are chosen from: of named coordinates, and the velocities, with `".rate"`
+    where a coordinate has the same name.
+    """
+    own = [f"{name}.rate" for name in names.coordinates] if names.rates is None else []
+    known = system.coordinate_names()
+    return own + [f"{name}.rate" if name in known else name for name in _singles(system.rate_names(), system.nu)]
+
+
+def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinates, rates) -> StateNames:
+    """The names that a user gives to states.
+
+    **Raises:** `ValueError` for unknown names, more than there are independent ones, and quantities that are no
+    coordinates.
+    """
+    names = StateNames(
+        () if coordinates is None else checked_names("coordinate", coordinates),
+        None if rates is None else checked_names("rate", rates),
+    )
+    given_names = names.coordinates, names.rates or ()
+    for kind, given, most in zip(("coordinate", "rate"), given_names, counts(system), strict=True):
+        if len(given) > most:
+            raise ValueError(
+                f"There are {most} independent {kind}s, and {len(given)} are named: {', '.join(given)}. Name fewer; "
+                "the others are chosen."
+            )
+    for name in names.coordinates:
+        function = coordinate_function(system, t, state, name)
+        if _depends_on_velocities(function, state):
+            raise ValueError(f"{name!r} depends on velocities and is no coordinate; name it in rates.")
+    for name in names.rates or ():
+        rate_function(system, t, state, name)
+    return names
+
+
+def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, name: str) -> Callable[[State], Array]:
+    """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if that is given, or a
+    quantity.
+    """
+    known = system.coordinate_names()
+    if name in known and len(known[name]) == 1:
+        return lambda state: state.q[known[name][0]]
+    displacements = [] if at is None else displacement_names(system)
+    if at is not None and name in displacements:
+        row = _displacements(system, t, at)[displacements.index(name)]
+        return lambda state: row @ (state.q - at.q)
+    return _quantity(system, t, name, "coordinate", [*(k for k, v in known.items() if len(v) == 1), *displacements])
+
+
+def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Callable[[State], Array]:
+    """A rate as a function of the state: an entry of u, the rate of a coordinate, or a quantity."""
+    known = {name: index for name, index in system.rate_names().items() if len(index) == 1}
+    base = name.removesuffix(".rate")
+    if base in known:
+        return lambda state: state.u[known[base][0]]
+    if base != name:
+        function = coordinate_function(system, t, at, base)
+        if not _depends_on_velocities(function, at):
+            return lambda state: _rate(system, t, function, state)
+    return _quantity(system, t, name, "rate", known)
+
+
+def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Array, Array, Array, Bool[Array, ""]]:
+    """The directions in which a state moves on its constraints: those of coordinates (nq × kq), the velocities that
+    follow them (nu × kq), those of velocities alone (nu × ku); and whether the constraints have their ranks.
+    """
+    q, u = state.q, state.u
+    if _has_invariants(system):
+        moves = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
+        rows, scale = system.jacobian(t, q, u)[: system.position_rows], system.velocity_scale()
+        rank = system.position_rank
+    else:
+        moves = jnp.eye(system.nq, dtype=q.dtype)
+        rows, scale, rank = system.coordinate_jacobian(t, q), system.coordinate_scale(), system.coordinate_rank
+    positions = full_pivot(rows, scale=scale)
+    along = moves @ eliminate(rows, positions.order, rank).null_space
+    jacobian = system.velocity_jacobian(t, q, u)
+    velocities = full_pivot(jacobian, scale=system.velocity_scale())
+    solved = eliminate(jacobian, velocities.order, system.velocity_rank)
+    change = lambda dq: jax.jvp(lambda q: system.velocity_residual(t, q, u), (q,), (dq,))[1]
+    following = -solved.right_inverse @ jax.vmap(change, in_axes=1, out_axes=1)(along)
+    full = (positions.rank >= rank) & (velocities.rank >= system.velocity_rank)
+    return along, following, solved.null_space, full
+
+
+def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateNames) -> Perturbations:
+    """The named states and, of the others, those that serve best, by pivoting."""
+    along, following, alone, regular = tangent_basis(system, t, state)
+    nq, kq, ku = system.nq, along.shape[1], alone.shape[1]
+    displacements = _displacements(system, t, state)
+    named = _gradients([coordinate_function(system, t, state, name) for name in names.coordinates], state)
+    free, coordinates_ok = _remaining(named[:, :nq] @ along)
+    turns = _turns(system)
+    size = jnp.where(turns, 1.0 / _TURN, _sizes(system))
+    picked = _picked(displacements @ along @ free, 1.0 / size)
+    rows_q = jnp.concatenate([named, jnp.pad(displacements[picked], ((0, 0), (0, system.nu)))])
+
+    if names.rates is None:
+        given = jnp.zeros((0, nq + system.nu), state.q.dtype)
+        own = [coordinate_function(system, t, state, name) for name in names.coordinates]
+        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in own], state)
+    else:
+        given = _gradients([rate_function(system, t, state, name) for name in names.rates], state)
+        preferred = given[:0]
+    free, rates_ok = _remaining(given[:, nq:] @ alone)
+    velocities = jnp.eye(system.nu, nq + system.nu, nq, dtype=state.q.dtype)
+    candidates = jnp.concatenate([preferred, velocities])
+    chosen = jnp.zeros(len(displacements), bool).at[picked].set(True)
+    chosen = chosen if len(displacements) == system.nu else jnp.zeros(system.nu, bool)
+    speeds = jnp.where(_turns(system, rates=True), 1.0 / _TURN, system.velocity_scale())
+    weight = jnp.where(chosen, _CHOSEN, 1.0) / speeds
+    along_velocities = preferred[:, nq:] @ alone
+    largest = jnp.max(jnp.abs(along_velocities), axis=1, initial=0.0)
+    weight = jnp.concatenate([_NAMED / jnp.where(largest > 0, largest, 1.0), weight])
+    picked_rates = _picked(candidates[:, nq:] @ alone @ free, weight)
+    rows_u = jnp.concatenate([given, candidates[picked_rates]])
+
+    tangent = jnp.block([[along, jnp.zeros((nq, ku), along.dtype)], [following, alone]])
+    reading = jnp.concatenate([rows_q, rows_u])
+    basis = tangent @ jnp.linalg.inv(reading @ tangent)
+    return Perturbations(basis, reading, kq, (picked, picked_rates), jnp.stack([regular, coordinates_ok, rates_ok]))
+
+
+def _remaining(rows: Float[Array, "m k"]) -> tuple[Float[Array, "k f"], Bool[Array, ""]]:
+    """A basis of what named states leave free, and whether they are independent."""
+    m, k = rows.shape
+    if m == 0:
+        return jnp.eye(k, dtype=rows.dtype), jnp.array(True)
+    pivots = full_pivot(rows)
+    return eliminate(rows, pivots.order, m).null_space, pivots.rank == m
+
+
+def _picked(rows: Float[Array, "c f"], weight: Float[Array, "c"]) -> Int[Array, "f"]:
+    """The rows that determine all free directions best, by full pivoting, in their own order."""
+    pivots: PivotSearch = full_pivot(rows.T, scale=weight)
+    return jnp.sort(pivots.order.columns[: rows.shape[1]])
+
+
+def _gradients(functions: Sequence[Callable[[State], Array]], state: State) -> Float[Array, "m n"]:
+    if not functions:
+        return jnp.zeros((0, state.q.size + state.u.size), state.q.dtype)
+    return jnp.stack([jnp.concatenate([(g := jax.grad(f)(state)).q, g.u]) for f in functions])
+
+
+def _rate(system, t, function, state):
+    """The time derivative of a function of the coordinates."""
+    rest = jnp.zeros_like(state.u)
+    dq = system.rates(t, state.q, state.u)
+    return jax.jvp(function, (state,), (State(dq, rest),))[1]
+
+
+def _quantity(system, t, name, kind, others):
+    quantities = {key: value for key, value in system.quantities().items() if not value.of_forces}
+    shapes = {key: value.shape for key, value in quantities.items()}
+    base = name.split("[")[0]
+    if base not in shapes:
+        raise unknown(kind, name, [*others, *shapes])
+    chosen = components(kind, (name,), shapes)
+    if len(chosen) != 1:
+        raise ValueError(f"{name!r} has {len(chosen)} components; name one of them, '{name}[0]'.")
+    return lambda state: measured(system, chosen, t, state, None)[0]
+
+
+def _depends_on_velocities(function, state):
+    """Whether a function of the state has a derivative by velocities; numbers that are traced are not looked at."""
+    gradient = jax.grad(function)(state).u
+    return not is_traced(gradient) and bool(np.any(np.asarray(gradient)))
+
+
+def _displacements(system, t, state):
+    """The matrix that reads displacements off small changes of q."""
+    if not _has_invariants(system):
+        return jnp.eye(system.nq, dtype=state.q.dtype)
+    moves = jax.jacfwd(lambda u: system.rates(t, state.q, u))(state.u)
+    return jnp.linalg.solve(moves.T @ moves, moves.T)
+
+
+def _has_invariants(system):
+    return system.coordinate_rows > system.position_rows
+
+
+def _sizes(system):
+    return system.velocity_scale() if _has_invariants(system) else system.coordinate_scale()
+
+
+def _turns(system, rates=False):
+    """Which displacements, or rates, are turns of bodies."""
+    own = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
+    count = system.nu if rates or _has_invariants(system) else system.nq
+    turns = np.zeros(count, bool)
+    for body in system.motion_names() if system.has_bodies else ():
+        for name in (f"{body}.angle", f"{body}.angular_velocity"):
+            turns[own.get(name, [])] = True
+    return turns
+
+
+def _singles(names, count):
+    """The name of every entry."""
+    out = {index[0]: name for name, index in names.items() if len(index) == 1}
+    return [out[k] for k in range(count)]

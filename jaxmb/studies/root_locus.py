@@ -1,0 +1,136 @@
+"""Eigenvalues along a parameter, with modes followed."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Complex, Float
+
+from .._types import Scalar, State
+from ..parts.names import unknown
+from ..system import AbstractSystem, parameters, with_parameters
+from ..system.arguments import real_array
+from .linearise import linearise
+
+
+class RootLocus(eqx.Module):
+    """Eigenvalues along a parameter. `viz.plot_root_locus` draws them.
+
+    **Fields:** `name` and `values` of the parameter, (values,); `eigenvalues` [1/s], (values, k): column j is one mode,
+    followed; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
+    of the system's size; `states`, names of the states.
+    """
+
+    name: str = eqx.field(static=True)
+    values: Float[np.ndarray, "v"]
+    eigenvalues: Complex[np.ndarray, "v k"]
+    shapes: Complex[np.ndarray, "v n k"]
+    states: tuple[str, ...] = eqx.field(static=True)
+
+    def stable(self, least: float = 1e-6) -> np.ndarray:
+        """Whether no eigenvalue at a value has a positive real part, above this fraction of the largest one."""
+        sizes = np.max(np.abs(self.eigenvalues), axis=1)
+        return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
+
+
+def root_locus(
+    system: AbstractSystem | Callable[[Scalar], tuple[AbstractSystem, State]],
+    name: str,
+    values: ArrayLike,
+    *,
+    state: Callable[[AbstractSystem], State] | None = None,
+    t: Scalar = 0.0,
+    coordinates: Sequence[str] | None = None,
+    rates: Sequence[str] | None = None,
+) -> RootLocus:
+    """Linearise along values of a parameter and follow the modes.
+
+    Modes at neighbouring values are matched by the overlap of their shapes and the nearness of their eigenvalues, all
+    at once, so that they keep their places where eigenvalues cross.
+
+    **Arguments:**
+
+    - `system`: a compiled scene, or another system, whose parameter `name` takes the values; or a function that returns
+        a system and a state for each value, such as a speed.
+    - `name`: of the parameter, or what the values mean.
+    - `values`: numbers in order, close enough to follow the modes.
+    - `state(system)`: the equilibrium or steady motion of each system, such as `mb.equilibrium`; not with a function.
+    - `t`, `coordinates`, `rates`: as in `linearise`.
+
+    All values are computed in one batch, so functions must be traceable by JAX.
+
+    **Returns:** a `RootLocus`, with NumPy arrays.
+
+    **Raises:** `ValueError` for an unknown parameter or one that is no number, fewer than two values, a `state` that is
+    missing or too much, for what `linearise` refuses at the first value, and for values without an equilibrium or
+    steady motion.
+    """
+    case = _case(system, name, state)
+    given = np.asarray(real_array("root_locus: values", values, np.result_type(float), None))
+    if given.ndim != 1 or given.size < 2 or not np.all(np.isfinite(given)):
+        raise ValueError(f"root_locus: values must be a vector of at least two finite numbers, got {values!r}.")
+    # The first one names the states, and says what is wrong.
+    first = linearise(*case(given[0]), t=t, coordinates=coordinates, rates=rates)
+    chosen = first.states[: first.coordinates], first.states[first.coordinates :]
+
+    @eqx.filter_jit
+    @jax.vmap
+    def of_all(value):
+        linear = linearise(*case(value), t=t, coordinates=chosen[0], rates=chosen[1])
+        return linear.eigenvalues, linear.basis.astype(linear.vectors.dtype) @ linear.vectors
+
+    found, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
+    bad = ~np.all(np.isfinite(found), axis=1)
+    if np.any(bad):
+        listed = ", ".join(f"{value:.6g}" for value in given[bad][:8])
+        raise ValueError(
+            f"root_locus: there is no equilibrium or steady motion, or none in these states, at {name} = {listed}. "
+            "linearise it there to see why."
+        )
+    sizes = np.concatenate([np.asarray(first.system.coordinate_scale()), np.asarray(first.system.velocity_scale())])
+    shapes = shapes / sizes[None, :, None]
+    shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+    return RootLocus(name, given, *_followed(found, shapes), first.states)
+
+
+def _case(system: Any, name: str, state: Any) -> Any:
+    """A function of a value that returns a system and its state."""
+    if not isinstance(name, str):
+        raise ValueError(f"root_locus: name must be text, got {name!r}.")
+    if not isinstance(system, AbstractSystem):
+        if not callable(system):
+            raise ValueError("root_locus takes a compiled system, or a function that returns a system and a state.")
+        if state is not None:
+            raise ValueError("root_locus: the function returns a system and its state, so `state` is not needed.")
+        return system
+    known = parameters(system)
+    if name not in known:
+        raise unknown("parameter", name, known)
+    if known[name].shape != ():
+        shape = known[name].shape
+        raise ValueError(f"root_locus: {name!r} has shape {shape}, and values are numbers; give a function.")
+    if state is None:
+        raise ValueError("root_locus needs the state of each system: state=jaxmb.equilibrium, or another function.")
+
+    def of_parameter(value):
+        changed = with_parameters(system, {name: value})
+        return changed, state(changed)
+
+    return of_parameter
+
+
+def _followed(values, shapes):
+    """Eigenvalues and shapes with modes in the same columns as at the first value."""
+    from scipy.optimize import linear_sum_assignment
+
+    values, shapes = values.copy(), shapes.copy()
+    for k in range(1, len(values)):
+        expected = values[k - 1] if k == 1 else 2 * values[k - 1] - values[k - 2]
+        size = np.max(np.abs(values[k])) + np.finfo(float).tiny
+        apart = np.abs(expected[:, None] - values[k][None, :]) / size
+        overlap = np.abs(shapes[k - 1].conj().T @ shapes[k])
+        _, order = linear_sum_assignment(apart + (1 - overlap))
+        values[k], shapes[k] = values[k][order], shapes[k][:, order]
+    return values, shapes

@@ -1,0 +1,166 @@
+"""The Whipple bicycle from spatial bodies, hinges and rolling wheels, against its published eigenvalues.
+
+Source: J. P. Meijaard, J. M. Papadopoulos, A. Ruina and A. L. Schwab, "Linearized dynamics equations for the balance
+and steer of a bicycle: a benchmark and review", Proc. R. Soc. A 463, 2007: the parameters of table 1, appendix A for
+the linear equations.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmb as mb
+from jaxmb import spatial
+
+W, TRAIL, TILT, G = 1.02, 0.08, np.pi / 10, 9.81
+REAR, FRONT = 0.3, 0.35
+RATES = ("frame.x", "frame.wx", "fork.wz")
+COORDINATES = ("frame.x", "frame.y", "frame.rotation_x", "frame.rotation_z", "fork.rotation_z")
+# Published, at 4 and 5 m/s: weave (a pair), capsize, castering.
+PUBLISHED = {
+    4.0: (0.413253315211239 + 3.07910818603205j, -1.42944427361326, -12.1586142657644),
+    5.0: (-0.775341882195845 + 4.46486771378823j, -0.322866429004087, -14.0783896927982),
+}
+
+
+@functools.cache
+def bicycle():
+    """z up, x forward, rear contact in the origin."""
+    mirror = lambda I: np.array(I) * np.array([[1, 1, -1], [1, 1, 1], [-1, 1, 1]])
+    frame = mirror([[9.2, 0.0, 2.4], [0.0, 11.0, 0.0], [2.4, 0.0, 2.8]])
+    fork = mirror([[0.05892, 0.0, -0.00756], [0.0, 0.06, 0.0], [-0.00756, 0.0, 0.00708]])
+    bodies = [
+        spatial.Body("rear", mass=2.0, inertia=(0.0603, 0.12, 0.0603), position=(0.0, 0.0, REAR)),
+        spatial.Body("frame", mass=85.0, inertia=frame, position=(0.3, 0.0, 0.9)),
+        spatial.Body("fork", mass=4.0, inertia=fork, position=(0.9, 0.0, 0.7)),
+        spatial.Body("front", mass=3.0, inertia=(0.1405, 0.28, 0.1405), position=(W, 0.0, FRONT)),
+    ]
+    # The steering axis meets the ground ahead of the contact by the trail.
+    steer = (-np.sin(TILT), 0.0, np.cos(TILT))
+    joints = [
+        spatial.Revolute("rear_hub", "frame", "rear", point=(0.0, 0.0, REAR), axis=(0.0, 1.0, 0.0)),
+        spatial.Revolute("head", "frame", "fork", point=(W + TRAIL, 0.0, 0.0), axis=steer),
+        spatial.Revolute("front_hub", "fork", "front", point=(W, 0.0, FRONT), axis=(0.0, 1.0, 0.0)),
+        spatial.RollingDisk("rear_tyre", "rear", radius=REAR, axis=(0.0, 1.0, 0.0)),
+        spatial.RollingDisk("front_tyre", "front", radius=FRONT, axis=(0.0, 1.0, 0.0)),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+
+
+def running(system, speed, trail=TRAIL):
+    """The bicycle with another trail that runs straight."""
+    ahead = jnp.array([1.0, 0.0, 0.0]) * (W + trail)
+    points = {
+        "head.point_a": ahead - jnp.array([0.3, 0.0, 0.9]),
+        "head.point_b": ahead - jnp.array([0.9, 0.0, 0.7]),
+    }
+    system = mb.with_parameters(system, points)
+    q = system.guess.q
+    forward = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    wheel = lambda radius: np.array([1.0, 0.0, 0.0, 0.0, 1 / radius, 0.0])
+    u = speed * jnp.asarray(np.concatenate([wheel(REAR), forward, forward, wheel(FRONT)]))
+    return system, mb.State(q, u)
+
+
+def published(speed, trail=TRAIL):
+    """The four eigenvalues from appendix A, in JAX; z down as there."""
+    m = jnp.array([2.0, 85.0, 4.0, 3.0])
+    x, z = jnp.array([0.0, 0.3, 0.9, W]), jnp.array([-REAR, -0.9, -0.7, -FRONT])
+    Ixx, Ixz = jnp.array([0.0603, 9.2, 0.05892, 0.1405]), jnp.array([0.0, 2.4, -0.00756, 0.0])
+    Izz = jnp.array([0.0603, 2.8, 0.00708, 0.1405])
+    total = jnp.sum(m)
+    xT, zT = jnp.sum(m * x) / total, jnp.sum(m * z) / total
+    Txx, Txz, Tzz = jnp.sum(Ixx + m * z**2), jnp.sum(Ixz - m * x * z), jnp.sum(Izz + m * x**2)
+    mA = m[2] + m[3]
+    xA, zA = (m[2] * x[2] + m[3] * x[3]) / mA, (m[2] * z[2] + m[3] * z[3]) / mA
+    Axx = Ixx[2] + Ixx[3] + m[2] * (z[2] - zA) ** 2 + m[3] * (z[3] - zA) ** 2
+    Axz = Ixz[2] - m[2] * (x[2] - xA) * (z[2] - zA) + Ixz[3] - m[3] * (x[3] - xA) * (z[3] - zA)
+    Azz = Izz[2] + Izz[3] + m[2] * (x[2] - xA) ** 2 + m[3] * (x[3] - xA) ** 2
+    c, s = jnp.cos(TILT), jnp.sin(TILT)
+    uA = (xA - W - trail) * c - zA * s
+    All = mA * uA**2 + Axx * s**2 + 2 * Axz * s * c + Azz * c**2
+    Alx = -mA * uA * zA + Axx * s + Axz * c
+    Alz = mA * uA * xA + Axz * s + Azz * c
+    mu = trail / W * c
+    SR, SF = 0.12 / REAR, 0.28 / FRONT
+    ST, SA = SR + SF, mA * uA + mu * total * xT
+    mass = jnp.array([[Txx, Alx + mu * Txz], [Alx + mu * Txz, All + 2 * mu * Alz + mu**2 * Tzz]])
+    K0 = jnp.array([[total * zT, -SA], [-SA, -SA * s]])
+    K2 = jnp.array([[0.0, (ST - total * zT) / W * c], [0.0, (SA + SF * s) / W * c]])
+    C1 = jnp.array(
+        [
+            [0.0, mu * ST + SF * c + Txz / W * c - mu * total * zT],
+            [-(mu * ST + SF * c), Alz / W * c + mu * (SA + Tzz / W * c)],
+        ]
+    )
+    stiffness = jnp.linalg.solve(mass, G * K0 + speed**2 * K2)
+    damping = jnp.linalg.solve(mass, speed * C1)
+    A = jnp.block([[jnp.zeros((2, 2)), jnp.eye(2)], [-stiffness, -damping]])
+    return jnp.linalg.eigvals(A)
+
+
+def essential(linear):
+    """The eigenvalues of lean and steer; those of the places and of the speed are zero."""
+    values = np.asarray(linear.eigenvalues)
+    assert np.sum(np.abs(values) < 1e-9) == 6
+    return np.sort_complex(values[np.abs(values) >= 1e-9])
+
+
+def test_the_equations_of_the_source_give_its_eigenvalues():
+    for speed, (weave, *others) in PUBLISHED.items():
+        expected = np.sort_complex([weave, np.conj(weave), *others])
+        np.testing.assert_allclose(np.sort_complex(published(speed)), expected, rtol=1e-12)
+
+
+def test_the_bicycle_has_its_published_eigenvalues():
+    system = bicycle()
+    for speed, (weave, *others) in PUBLISHED.items():
+        linear = mb.linearise(*running(system, speed), coordinates=COORDINATES)
+        expected = np.sort_complex([weave, np.conj(weave), *others])
+        np.testing.assert_allclose(essential(linear), expected, atol=1e-10)
+    assert linear.states[:5] == COORDINATES
+
+
+@functools.cache
+def locus():
+    speeds = np.linspace(0.5, 10.0, 39)
+    return mb.root_locus(lambda speed: running(bicycle(), speed), "speed [m/s]", speeds, coordinates=COORDINATES)
+
+
+def test_the_locus_follows_weave_capsize_and_castering():
+    found = locus()
+    for speed, values in zip(found.values, found.eigenvalues, strict=True):
+        own = np.sort_complex(values[np.abs(values) > 1e-7])
+        np.testing.assert_allclose(own, np.sort_complex(published(speed)), atol=1e-10)
+    # Between the weave speed of 4.292 m/s and the capsize speed of 6.024 m/s the bicycle is stable.
+    stable = found.values[found.stable()]
+    assert np.all((stable > 4.2923) & (stable < 6.0243)) and stable.size == np.sum(
+        (found.values > 4.2923) & (found.values < 6.0243)
+    )
+    step = np.abs(np.diff(found.eigenvalues[12:], axis=0))
+    assert np.max(step) < 2.0
+    from jaxmb import viz
+
+    assert len(viz.plot_root_locus(found).axes) == 3
+
+
+def test_the_weave_speed_changes_with_the_trail():
+    system = bicycle()
+
+    def growth(x):
+        linear = mb.linearise(*running(system, x[0], x[1]), coordinates=COORDINATES, rates=RATES)
+        values = linear.eigenvalues
+        return values.real[jnp.argmax(values.imag)]
+
+    def closed(x):
+        values = published(x[0], x[1])
+        return values.real[jnp.argmax(values.imag)]
+
+    at = jnp.array([4.292382536341119, TRAIL])
+    slopes, own = jax.jit(jax.jacfwd(growth))(at), []
+    for e in np.eye(2):
+        own.append((closed(at + 1e-5 * e) - closed(at - 1e-5 * e)) / 2e-5)
+    assert abs(growth(at)) < 1e-9
+    np.testing.assert_allclose(slopes[1] / slopes[0], own[1] / own[0], rtol=1e-7)

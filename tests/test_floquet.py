@@ -1,0 +1,122 @@
+"""Floquet's multipliers of periodic motions, against Mathieu's equation and direct integration."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from scipy.special import ellipk, mathieu_a, mathieu_b
+
+import jaxmb as mb
+from jaxmb import lagrangian, planar
+
+G = 9.81
+
+
+@functools.cache
+def parametric():
+    """`θ̈ + (δ + ε cos t) sin θ = 0`."""
+    return lagrangian.LagrangianSystem(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 + (p["delta"] + p["epsilon"] * jnp.cos(t)) * jnp.cos(q[0]),
+        q=(0.0,),
+        parameters={"delta": 0.3, "epsilon": 0.1},
+        coordinates=("theta",),
+    )
+
+
+def monodromy(delta, epsilon):
+    """Of Mathieu's equation, by direct integration."""
+    run = lambda y: scipy.integrate.solve_ivp(
+        lambda t, y: [y[1], -(delta + epsilon * np.cos(t)) * y[0]],
+        (0, 2 * np.pi),
+        y,
+        rtol=1e-12,
+        atol=1e-13,
+        method="DOP853",
+    ).y[:, -1]
+    return np.stack([run([1.0, 0.0]), run([0.0, 1.0])], axis=1)
+
+
+def test_a_parametric_pendulum_has_mathieus_multipliers():
+    system = parametric()
+    found = mb.floquet(system, mb.assemble(system), 2 * np.pi)
+    assert found.states == ("theta", "theta.rate")
+    np.testing.assert_allclose(found.monodromy, monodromy(0.3, 0.1), atol=1e-8)
+    own = np.linalg.eigvals(monodromy(0.3, 0.1))
+    np.testing.assert_allclose(np.sort_complex(found.multipliers), np.sort_complex(own), atol=1e-8)
+    assert "multiplier" in str(found)
+
+
+def test_the_tongues_of_mathieu():
+    """With `a = 4 δ`, `q = −2 ε`, a multiplier is −1 on the borders of the first tongue: the trace is −2."""
+    system, epsilon = parametric(), 0.2
+
+    def trace(delta):
+        changed = mb.with_parameters(system, {"delta": delta, "epsilon": epsilon})
+        return jnp.trace(mb.floquet(changed, mb.State(jnp.zeros(1), jnp.zeros(1)), 2 * np.pi).monodromy)
+
+    borders = np.sort([mathieu_a(1, 2 * epsilon), mathieu_b(1, 2 * epsilon)]) / 4
+    traces = jax.jit(jax.vmap(trace))(np.array([*borders, np.mean(borders)]))
+    np.testing.assert_allclose(traces[:2], -2.0, atol=1e-8)
+    assert traces[2] < -2.0
+    h = 1e-5
+    slope = (np.trace(monodromy(borders[0] + h, epsilon)) - np.trace(monodromy(borders[0] - h, epsilon))) / (2 * h)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(trace))(borders[0]), slope, rtol=1e-5)
+
+
+@functools.cache
+def shaken():
+    """A rod that hangs from a block, which a driver shakes up and down."""
+    block = planar.Body("block", mass=1.0, inertia=1.0)
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.0, -0.5), angle=-np.pi / 2)
+    joints = [
+        planar.Prismatic("guide", "ground", "block", point=(0.0, 0.0), axis=(0.0, 1.0)),
+        planar.Revolute("pin", "block", "rod", point=(0.0, 0.0)),
+        planar.Driver(
+            "shaker",
+            "ground",
+            "block",
+            quantity="y",
+            motion=lambda t, p: p["stroke"] * (jnp.cos(7.0 * t) - 1.0),
+            parameters={"stroke": 0.02},
+        ),
+    ]
+    return mb.Scene([block, rod], joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
+
+
+def test_a_shaken_rod_on_hinges():
+    system = shaken()
+    found = mb.floquet(system, mb.assemble(system), 2 * np.pi / 7.0, coordinates=["rod.angle"])
+    # 1/3 θ̈ + ½ (g + ÿ) θ = 0 with y = stroke (cos 7 t − 1); in 7 t the equation of Mathieu.
+    delta, epsilon = 1.5 * G / 49.0, -1.5 * 0.02
+    scale = np.diag([1.0, 7.0])
+    expected = scale @ monodromy(delta, epsilon) @ np.linalg.inv(scale)
+    assert found.states == ("rod.angle", "rod.angle.rate")
+    np.testing.assert_allclose(found.monodromy, expected, atol=1e-7)
+
+
+def test_a_swinging_rod_has_two_multipliers_of_one():
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.0, -0.5), angle=-np.pi / 2)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -G))]).compile()
+    state = mb.assemble(system, fix={"rod.angle": -np.pi / 2 + 1.0})
+    period = 4 * np.sqrt(2 / (3 * G)) * ellipk(np.sin(0.5) ** 2)
+    found = mb.floquet(system, state, period, coordinates=["rod.angle"])
+    assert np.trace(found.monodromy) == pytest.approx(2.0, abs=1e-7)
+    assert np.linalg.det(found.monodromy) == pytest.approx(1.0, abs=1e-7)
+    with pytest.raises(ValueError, match=r"does not return after 1 s: it differs in rod.*ignorable"):
+        mb.floquet(system, state, 1.0)
+
+
+def test_periods_and_names_that_cannot_be():
+    system = parametric()
+    state = mb.State(jnp.zeros(1), jnp.zeros(1))
+    for period in (0.0, -1.0, np.inf):
+        with pytest.raises(ValueError, match="period must be positive"):
+            mb.floquet(system, state, period)
+    with pytest.raises(ValueError, match="Unknown coordinate 'thet'; did you mean 'theta'"):
+        mb.floquet(system, state, 1.0, ignorable=["thet"])
+    with pytest.raises(ValueError, match="There are 1 independent coordinates"):
+        mb.floquet(system, state, 1.0, coordinates=["theta", "thet"])

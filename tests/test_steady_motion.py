@@ -1,0 +1,156 @@
+"""Steady motions and their stability: cones, governors, wheels."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import jaxmb as mb
+from jaxmb import lagrangian, mechanisms, planar, spatial
+
+G = 9.81
+
+
+@functools.cache
+def conical():
+    """A ball of 1 kg on a string of 2 m."""
+    ball = spatial.PointMass("ball", mass=1.0, position=(1.0, 0.0, -np.sqrt(3.0)), velocity=(0.0, 2.0, 0.0))
+    string = spatial.Distance("string", "ground", "ball", point_a=(0.0, 0.0, 0.0), length=2.0)
+    return mb.Scene([ball], joints=[string], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+
+
+def test_a_conical_pendulum_runs_in_its_circle_and_nutates():
+    system, angle = conical(), 0.6
+    state = mb.steady_motion(system, fix={"ball.z": -2.0 * np.cos(angle)})
+    rate = np.sqrt(G / (2.0 * np.cos(angle)))
+    assert np.hypot(*state.u[:2]) == pytest.approx(rate * 2.0 * np.sin(angle), rel=1e-10)
+    assert abs(state.u[2]) < 1e-10
+    linear = mb.linearise(system, state)
+    # ω² = Ω² (1 + 3 cos²α); the azimuth and a change of the cone make a double zero.
+    found = np.asarray(linear.eigenvalues)
+    nutation = rate * np.sqrt(1 + 3 * np.cos(angle) ** 2)
+    np.testing.assert_allclose(found[2:].imag, [nutation, -nutation], rtol=1e-9)
+    assert np.max(np.abs(found[:2])) < 1e-6 and np.max(np.abs(found[2:].real)) < 1e-9
+
+
+def test_the_speed_of_a_cone_is_differentiable():
+    system = conical()
+
+    def speed(angle):
+        state = mb.steady_motion(system, fix={"ball.z": -2.0 * jnp.cos(angle)})
+        return jnp.sqrt(state.u[0] ** 2 + state.u[1] ** 2) / (2.0 * jnp.sin(angle))
+
+    exact = lambda a: np.sqrt(G / (2.0 * np.cos(a)))
+    slope = 0.5 * exact(0.6) * np.tan(0.6)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(speed))(0.6), slope, rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.grad(speed))(0.6), slope, rtol=1e-8)
+    angles = np.array([0.5, 0.6])
+    np.testing.assert_allclose(jax.jit(jax.vmap(speed))(angles), exact(angles), rtol=1e-9)
+
+
+def test_a_flyball_governor_balances_its_springs():
+    """Stationary values of V − ½ Ω² J over the arms' angle and the slider's height."""
+    speed, stiffness, ball = 8.0, 2e3, 5.0
+    mechanism = mechanisms.get("flyball", stiffness=stiffness, damping=20.0)
+    state = mb.steady_motion(mechanism.system, mechanism.state, rates={"shaft.wz": speed})
+    rod, cube = 0.3, 3.0
+
+    def effective(x):
+        a, s = x
+        along = np.array([np.cos(a), -np.sin(a)])
+        point = lambda r: np.array([0.05, 1.0]) + r * along
+        V = 2 * G * (rod * point(0.5)[1] + ball * point(1.0)[1]) + cube * G * s
+        stretch = np.linalg.norm(point(0.5) - [0.05, s]) - 0.5
+        V += stiffness * stretch**2
+        # The section of an arm turns with it, which is small.
+        across, length = rod * 0.01**2 / 12, rod * (1 + 0.01**2) / 12
+        own = length * np.cos(a) ** 2 + (across + across) * np.sin(a) ** 2
+        J = 2 * (rod * point(0.5)[0] ** 2 + ball * point(1.0)[0] ** 2 + own)
+        return V - 0.5 * speed**2 * J
+
+    slope = lambda x, h=1e-4: np.array([(effective(x + h * e) - effective(x - h * e)) / (2 * h) for e in np.eye(2)])
+    _, s = scipy.optimize.fsolve(slope, [0.3, 0.6], xtol=1e-12)
+    names = mechanism.system.coordinate_names()
+    assert float(state.q[names["slider.z"][0]]) == pytest.approx(s, abs=1e-4)
+    linear = mb.linearise(mechanism.system, state, coordinates=["slider.z"])
+    assert np.max(linear.eigenvalues.real) < 1e-6 and len(linear.states) == 6
+
+
+def disk(speed):
+    """A disk of 1 kg and 0.3 m that rolls upright along x."""
+    body = spatial.Body("disk", mass=1.0, inertia=spatial.disc(1.0, 0.3, "y"), position=(0.0, 0.0, 0.3))
+    plane = spatial.RollingDisk("plane", "disk", radius=0.3, axis=(0.0, 1.0, 0.0))
+    system = mb.Scene([body], joints=[plane], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+    return system, mb.assemble(system, rates={"disk.wy": speed / 0.3, "disk.wx": 0.0, "disk.wz": 0.0})
+
+
+@pytest.mark.parametrize("speed", [0.8, 1.2])
+def test_a_rolling_disk_falls_below_its_critical_speed(speed):
+    """λ² (A + m r²) = m g r − C (C + m r²) ω² / A, which changes its sign at v² = g r / 3 (Routh)."""
+    r, A, C, mr2 = 0.3, 0.0225, 0.045, 0.09
+    linear = mb.linearise(*disk(speed))
+    square = (G * r - C * (C + mr2) * (speed / r) ** 2 / A) / (A + mr2)
+    found = np.asarray(linear.eigenvalues)[-2:]
+    np.testing.assert_allclose(found**2, square, rtol=1e-9)
+    assert (speed**2 < G * r / 3) == (np.max(found.real) > 1e-6)
+
+
+def test_a_disk_in_a_steady_circle():
+    given = mechanisms.get("rolling_disk", lean=0.4, turn=-2.0)
+    names = given.system.rate_names()
+    rates = {f"disk.{w}": float(given.state.u[names[f"disk.{w}"][0]]) for w in ("wx", "wy", "wz")}
+    moved = given.state.u + 0.05 * np.sin(np.arange(6.0))
+    guess = mb.assemble(given.system, mb.State(given.state.q, moved))
+    state = mb.steady_motion(
+        given.system,
+        guess,
+        fix={"disk.z": float(given.state.q[2])},
+        rates={"disk.wx": rates["disk.wx"], "disk.wz": rates["disk.wz"]},
+    )
+    np.testing.assert_allclose(state.u[4], rates["disk.wy"], rtol=1e-8)
+    np.testing.assert_allclose(state.q[2], given.state.q[2], rtol=1e-10)
+    linear = mb.linearise(given.system, state)
+    assert len(linear.states) == 8
+    # Perturbed, it nutates at the same frequency: lean angles a quarter of a period apart have opposite changes.
+    nutation = float(np.max(linear.frequencies))
+    mode = linear.mode(7)
+    start = mode.at(0.0, 1e-6)
+    half = mb.simulate(given.system, start, t1=np.pi / nutation, rtol=1e-11)
+    np.testing.assert_allclose(half.ys.q[-1, 2] - state.q[2], -(start.q[2] - state.q[2]), atol=2e-10)
+
+
+def test_ignorable_coordinates_of_a_lagrangian():
+    """A bead on a turning hoop in the coordinates θ and the hoop's angle φ: cos θ = g / (r Ω²)."""
+    hoop = lagrangian.LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * (v[0] ** 2 + (2.0 + jnp.sin(q[0]) ** 2) * v[1] ** 2),
+        potential=lambda t, q, p: -G * jnp.cos(q[0]),
+        q=(1.0, 0.0),
+        u=(0.0, 4.0),
+        coordinates=("theta", "phi"),
+    )
+    state = mb.steady_motion(hoop, rates={"phi": 4.0}, ignorable=["phi"])
+    assert float(state.q[0]) == pytest.approx(np.arccos(G / 16.0), rel=1e-10)
+    linear = mb.linearise(hoop, state)
+    s, c = np.sin(float(state.q[0])), G / 16.0
+    J = 2.0 + s**2
+    # At constant angular momentum: ω² = Ω² s² (1 + 4 c² / J).
+    assert float(np.max(linear.frequencies)) == pytest.approx(4.0 * s * np.sqrt(1 + 4 * c**2 / J), rel=1e-9)
+    with pytest.raises(ValueError, match="No steady motion"):
+        mb.steady_motion(hoop, rates={"phi": 4.0})
+
+
+def test_what_is_no_steady_motion():
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -G))]).compile()
+    with pytest.raises(ValueError, match=r"No steady motion was found with rod.angle prescribed"):
+        mb.steady_motion(system, rates={"rod.angle": 3.0})
+    with pytest.raises(ValueError, match=r"Unknown coordinate 'rod.angel'"):
+        mb.steady_motion(system, fix={"rod.angel": 3.0})
+    with pytest.raises(ValueError, match="Unknown coordinate 'x'"):
+        mb.steady_motion(system, ignorable=["x"])
+    with pytest.raises(ValueError, match="no steady motion"):
+        mb.linearise(system, mb.assemble(system, fix={"rod.angle": -np.pi / 2}, rates={"rod.angle": 3.0}))
