@@ -245,7 +245,10 @@ def dense(**options):
 
     seen = ("between steps", "rates between steps", "violation", "violation of velocities")
     machine = Machine("batch", list(mb.parameters(system)), seen, ["initial rate"])
-    return Case(system, [machine], observe, {"initial rate": 0.4}, parameters=6, outputs=10)
+    case = Case(system, [machine], observe, {"initial rate": 0.4}, parameters=6, outputs=10)
+    # The violation changes by little of what the velocities do, of which the tolerance is a share.
+    case.rtol, case.tighter = 1e-11, 1e-12
+    return case
 
 
 def jumps(**options):
@@ -459,20 +462,20 @@ LEAST = {
     "equilibria": 75,
     "rough ring": 35,
     "rows of every level": 27,
-    "Hamel's equations": 10,
+    "Hamel's equations": 30,
     "Voronets' equations": 10,
     "quasi-velocities": 10,
     "planar joints": 50,
-    "planar gears and drivers": 10,
+    "planar gears and drivers": 20,
     "planar velocities, laws and functions": 55,
-    "planar forces": 10,
-    "spatial joints": 10,
+    "planar forces": 50,
+    "spatial joints": 28,
     "spatial slides": 18,
     "spatial points": 24,
-    "spatial rolling": 10,
+    "spatial rolling": 28,
     "spatial friction": 4,
-    "spatial forces": 10,
-    "ground": 10,
+    "spatial forces": 34,
+    "ground": 54,
 }
 
 
