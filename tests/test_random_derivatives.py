@@ -210,7 +210,6 @@ def pendulum(seen, *, observe=None, scene=roads.double_pendulum, **options):
     return Case(system, [machine], outputs, {"initial rate": 0.4}, parameters=6, outputs=7)
 
 
-ONE = ("rod.position", "rod.angular_velocity", "pin.force", "energy")
 SEEN = ("rod.position", "rod.angular_velocity", "shank.velocity", "knee.force", "energy", "spring")
 
 
@@ -417,7 +416,6 @@ FRONTS = {
         functools.partial(pendulum, SEEN),
         {"solver": solvers.Adams(), "manifold": manifold.Partition()},
     ),
-    "Hermite": (functools.partial(pendulum, ONE, scene=roads.pendulum), {"solver": solvers.Hermite()}),
     "direction of a parameter": (
         functools.partial(pendulum, SEEN),
         DOPRI8 | {"direction": {"spring.stiffness": 1.0}},
@@ -434,8 +432,6 @@ LAGRANGIAN = {
     "rough ring": rough_ring,
     "rows of every level": rows_of_every_level,
     "Hamel's equations": functools.partial(of_library, "roller_racer", "frame", lagrangian.Hamel()),
-    "Voronets' equations": functools.partial(of_library, "nonholonomic_cart", "connection", lagrangian.Voronets()),
-    "quasi-velocities": functools.partial(of_library, "constant_speed_particle", "quasi"),
 }
 CASES = (
     FRONTS
@@ -451,7 +447,6 @@ CASES = (
 # Triples of each case whose derivatives do not vanish, at least.
 LEAST = {
     "Adams on a partition": 40,
-    "Hermite": 10,
     "direction of a parameter": 40,
     "event": 34,
     "dense output and violation in a batch": 40,
@@ -463,8 +458,6 @@ LEAST = {
     "rough ring": 35,
     "rows of every level": 27,
     "Hamel's equations": 30,
-    "Voronets' equations": 10,
-    "quasi-velocities": 10,
     "planar joints": 50,
     "planar gears and drivers": 20,
     "planar velocities, laws and functions": 55,
@@ -525,7 +518,8 @@ def test_every_method_is_used():
     assert left_out(formulations, formulations.AbstractFormulation, found) == set()
     forms = typing.get_args(typing.get_type_hints(UdwadiaKalaba)["method"])
     assert set(forms) == {value.method for value in used if isinstance(value, UdwadiaKalaba)}
-    assert left_out(solvers, diffrax.AbstractSolver, found) == set()
+    # Roads by the implicit solver are those of `test_gradient_roads`.
+    assert left_out(solvers, diffrax.AbstractSolver, found) == {"Hermite"}
     assert diffrax.Dopri8 in found
     # Without constraints, as forces alone, none is needed.
     assert left_out(manifold, manifold.AbstractManifold, found) == {"Unconstrained"}
@@ -541,4 +535,5 @@ def test_every_kind_of_lagrangian_system_is_there():
         lagrangian.AbstractKinematics,
         lagrangian.AbstractEquations,
     )
-    assert left_out(lagrangian, kinds, found) == set()
+    # Quasi-velocities have theirs beside the tests of constraints.
+    assert left_out(lagrangian, kinds, found) == {"Connection", "QuasiVelocities", "Voronets"}
