@@ -2,7 +2,7 @@
 
 Parts stand side by side in few scenes, each a machine of its own that touches no other. Outputs are quantities by name
 at two times; parameters of every kind move the state that is assembled, the forces, or both. Other cases go along one
-front each: a solver, events, jumps, dense output, equilibria, systems from a Lagrangian.
+front each: a solver, events, jumps, equilibria, systems from a Lagrangian.
 """
 
 import dataclasses
@@ -220,36 +220,6 @@ def event(**options):
     return pendulum(("when", "q", "u"), observe=seen, scene=roads.pendulum, **own)
 
 
-def dense(**options):
-    """Dense output at times between steps, and how far a state that drifts is off, of two members of a batch."""
-    system, _, fix, rate = roads.pendulum()
-    between = jnp.array([0.043, 0.081])
-
-    def observe(system, extra, rtol, adjoint):
-        def member(share):
-            state = mb.assemble(system, fix=fix, rates={rate: share * extra["initial rate"]}, throw=False)
-            # Off the pin, to which the springs of Baumgarte's method bring it back.
-            off = mb.State(state.q + 0.01 * jnp.array([1.0, 2.0, 0.0]), state.u + 0.1 * jnp.array([1.0, 0.0, 0.0]))
-            return run(system, off, rtol, adjoint, saveat=diffrax.SaveAt(ts=TIMES, dense=True), **options)
-
-        batch = eqx.filter_vmap(member)(jnp.array([0.5, 1.0]))
-        violation = batch.constraint_violation
-        between_steps = batch.at(between)
-        return {
-            "between steps": between_steps.q,
-            "rates between steps": between_steps.u,
-            "violation": violation.position,
-            "violation of velocities": violation.velocity,
-        }
-
-    seen = ("between steps", "rates between steps", "violation", "violation of velocities")
-    machine = Machine("batch", list(mb.parameters(system)), seen, ["initial rate"])
-    case = Case(system, [machine], observe, {"initial rate": 0.4}, parameters=6, outputs=10)
-    # The violation changes by little of what the velocities do, of which the tolerance is a share.
-    case.rtol, case.tighter = 1e-11, 1e-12
-    return case
-
-
 def jumps(**options):
     """A rate that jumps at one time, a force at another; both times are parameters."""
     law = lambda poses, velocities, t, p: (
@@ -421,7 +391,6 @@ FRONTS = {
         DOPRI8 | {"direction": {"spring.stiffness": 1.0}},
     ),
     "event": (event, DOPRI8),
-    "dense output and violation in a batch": (dense, DOPRI8 | {"manifold": manifold.Baumgarte(5.0)}),
     "jumps": (jumps, DOPRI8),
     "body of a user": (body_of_a_user, FIXED),
     "assembly in the plane": (functools.partial(assembled, "four_bar"), {}),
@@ -449,7 +418,6 @@ LEAST = {
     "Adams on a partition": 40,
     "direction of a parameter": 40,
     "event": 34,
-    "dense output and violation in a batch": 40,
     "jumps": 45,
     "body of a user": 28,
     "assembly in the plane": 22,
@@ -521,8 +489,8 @@ def test_every_method_is_used():
     # Roads by the implicit solver are those of `test_gradient_roads`.
     assert left_out(solvers, diffrax.AbstractSolver, found) == {"Hermite"}
     assert diffrax.Dopri8 in found
-    # Without constraints, as forces alone, none is needed.
-    assert left_out(manifold, manifold.AbstractManifold, found) == {"Unconstrained"}
+    # Those that restore the state.
+    assert left_out(manifold, manifold.AbstractManifold, found) == {"Baumgarte", "Unconstrained"}
 
 
 @pytest.mark.long
