@@ -64,3 +64,13 @@ def _jit(function, options):
     """With other options than those by which the tests compile, if they do."""
     quickly = os.environ.get("XLA_FLAGS") == QUICKLY
     return jax.jit(function, compiler_options=options if quickly else None)
+
+
+def jit_quickly(function: Callable) -> Callable:
+    """`jax.jit` for what compiles longer than it runs, also in a test that runs alone."""
+    options = (option.removeprefix("--").split("=", 1) for option in QUICKLY.split())
+    return jax.jit(function, compiler_options={name: _value(text) for name, text in options})
+
+
+def _value(text):
+    return {"false": False, "true": True}.get(text, int(text) if text.isdigit() else text)

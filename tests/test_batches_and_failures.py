@@ -150,3 +150,23 @@ def test_forward_mode_under_the_default_adjoint_says_what_to_do():
     for transform in (lambda q: jax.jvp(run, (q,), (q,)), jax.jacfwd(run)):
         with pytest.raises(TypeError, match=r"adjoint=diffrax.ForwardMode\(\)"):
             transform(mechanism.state.q)
+
+
+def test_the_gradient_of_a_sum_over_a_batch():
+    """Of what the members share: the sum of theirs."""
+    mechanism = mb.mechanisms.get("pendulum")
+    system, state = mechanism.system, mechanism.state
+    name = next(name for name in mb.parameters(system) if name.endswith(".mass"))
+
+    def end(mass, spin):
+        changed = mb.with_parameters(system, {name: mass})
+        start = mb.assemble(changed, mb.State(state.q, state.u + spin), throw=False)
+        own = {"solver": diffrax.Dopri8(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.05}
+        return mb.simulate(changed, start, t1=0.1, max_steps=4, throw=False, **own).energy[-1]
+
+    mass, spins = mb.parameters(system)[name], jnp.array([0.1, 0.2])
+    along = jax.vmap(end, in_axes=(None, 0))
+    together = jax.jit(jax.grad(lambda mass: jnp.sum(along(mass, spins))))(mass)
+    each = jax.jit(jax.vmap(jax.grad(end), in_axes=(None, 0)))(mass, spins)
+    assert abs(together) > 1e-3
+    np.testing.assert_allclose(together, jnp.sum(each), rtol=1e-12)

@@ -21,8 +21,7 @@ def turned(t, p):
     return jnp.where(t < when, p["before"] * t, p["before"] * when + p["after"] * (t - when))
 
 
-@pytest.fixture(scope="module")
-def arm():
+def driven_arm(*forces):
     bodies = [
         planar.Body("arm", mass=1.0, inertia=0.1, position=(A / 2, 0.0)),
         planar.Body("rod", mass=MASS, inertia=INERTIA, position=(A + B, 0.0)),
@@ -33,7 +32,12 @@ def arm():
         planar.Revolute("elbow", "arm", "rod", point=(A, 0.0)),
         planar.Driver("drive", "ground", "arm", quantity="angle", motion=turned, parameters=numbers),
     ]
-    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -G)), *forces]).compile()
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return driven_arm()
 
 
 def angle_of_rod(before=BEFORE, after=AFTER):

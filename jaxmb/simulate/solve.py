@@ -62,23 +62,51 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
     return trajectory, has_failed(result), end, coupling
 
 
-@eqx.filter_custom_jvp
 def _solve(term, solver, options, control):
     """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
+    # A class of diffrax: its loop has a rule for reverse mode only, whose tangents cannot be batched. So that gradients
+    # of batches exist, the rule around it is one for reverse mode, too.
+    if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
+        return _solve_in_reverse((term, solver, options), control)
+    return _solve_either_way((term, solver, options), control)
+
+
+def _solve_plain(arguments, control):
     del control
+    term, solver, options = arguments
     return diffrax.diffeqsolve(term, solver, throw=False, **options)
 
 
-@_solve.def_jvp
+def _solve_with_tangents(arguments, control):
+    term, solver, options = arguments
+    solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
+    solution = diffrax.diffeqsolve(term, solver, throw=False, **options | {"stepsize_controller": controller})
+    return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
+
+
+_solve_either_way = eqx.filter_custom_jvp(_solve_plain)
+_solve_in_reverse = eqx.filter_custom_vjp(_solve_plain)
+
+
+@_solve_either_way.def_jvp
 def _solve_jvp(primals, tangents):
-    arguments, control = primals[:-1], primals[-1]
+    arguments, control = primals
+    return eqx.filter_jvp(lambda arguments: _solve_with_tangents(arguments, control), (arguments,), (tangents[0],))
 
-    def solve(term, solver, options):
-        solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
-        solution = diffrax.diffeqsolve(term, solver, throw=False, **options | {"stepsize_controller": controller})
-        return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
-    return eqx.filter_jvp(solve, arguments, tangents[:-1])
+@_solve_in_reverse.def_fwd
+def _solve_forward(perturbed, arguments, control):
+    moved, still = eqx.partition(arguments, perturbed)
+    solution, pull = eqx.filter_vjp(lambda moved: _solve_with_tangents(eqx.combine(moved, still), control), moved)
+    return solution, (pull, eqx.filter(solution, eqx.is_inexact_array))
+
+
+@_solve_in_reverse.def_bwd
+def _solve_backward(residuals, cotangents, perturbed, arguments, control):
+    del perturbed, arguments, control
+    pull, values = residuals
+    zeros = jax.tree.map(jnp.zeros_like, values)
+    return pull(eqx.combine(cotangents, zeros))[0]
 
 
 def _tangent_control(system, options, direction) -> TangentControl:
