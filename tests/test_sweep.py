@@ -383,6 +383,6 @@ def test_a_lambda_and_a_closure_go_to_processes(tmp_path):
     factor = jnp.asarray(3.0)
     found = mb.sweep(lambda a: {"x": factor * a}, mb.cases.grid(a=[1.0, 2.0]), processes=2, chunk=1, progress=False)
     np.testing.assert_array_equal(found["x"], [3.0, 6.0])
-    handle = open(__file__)  # noqa: SIM115
-    with handle, pytest.raises(ValueError, match="cannot be sent to other processes"):
-        mb.sweep(lambda a: {"x": a + 0 * handle.fileno()}, mb.cases.grid(a=[1.0, 2.0]), processes=2, progress=False)
+    lock = threading.Lock()
+    with pytest.raises(ValueError, match="cannot be sent to other processes"):
+        mb.sweep(lambda a: {"x": a + float(lock.locked())}, mb.cases.grid(a=[1.0, 2.0]), processes=2, progress=False)

@@ -78,10 +78,10 @@ def overhead(chunks=8):
 
 def long():
     """256 members, 3 of which fail and 3 of which take ten times the steps, against the good ones alone."""
-    length, t1 = np.linspace(0.8, 1.1, CHUNK), np.full(CHUNK, 0.5)
+    length, t1 = np.linspace(0.8, 1.1, CHUNK), np.full(CHUNK, 2.0)
     good = {"length": length, "t1": t1}
     length, t1 = length.copy(), t1.copy()
-    t1[LONG], length[FAILED] = 5.0, 9.0
+    t1[LONG], length[FAILED] = 20.0, 9.0
     mixed = mb.cases.table(length=length, t1=t1)
     full = batch_of(mixed, chunk=CHUNK, max_steps=65536)
     chosen = full.with_budget(mixed)
