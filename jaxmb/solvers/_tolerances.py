@@ -11,6 +11,12 @@ from jaxtyping import Array, PyTree
 from ._evaluation import unravel_like
 from ._scales import RunningScales
 
+# The part of the tolerance that the error of one step may take. A method of variable order settles at the order where
+# the estimates of neighbouring orders are equal: the step taken with local extrapolation is hardly better than its
+# estimate, and the errors of a hundred steps add up. The steps of a Runge–Kutta method of high order are fewer and much
+# better than its estimate. With one twentieth both mean the same error of the result by a tolerance.
+_SHARE = 1 / 20
+
 
 def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> Any:
     """The norm of a raveled quantity, evaluated in the structure of `like` but in one precision."""
@@ -62,8 +68,8 @@ class Tolerances(eqx.Module):
         return getattr(self.norm, "scales", None)
 
     def scale(self, y0: Array, y1: Array, sizes: Array | None) -> Array:
-        """The error tolerated in each component over a step from `y0` to `y1`; `sizes` are those of the running scales
-        so far.
+        """The tolerance of each component over a step from `y0` to `y1`; `sizes` are those of the running scales so
+        far.
         """
         # A step that ends where the vector field is undefined is measured at its start.
         y1 = jnp.where(jnp.isnan(y1), y0, y1)
@@ -71,3 +77,12 @@ class Tolerances(eqx.Module):
             absolute = absolute_tolerance(self.atol, self.scales, sizes)
             scale = absolute + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
         return jax.lax.stop_gradient(scale.astype(y0.dtype))
+
+    def of_step(self, y0: Array, y1: Array, sizes: Array | None, finest: float = 0.0) -> Array:
+        """The error tolerated in each component in one step of a multistep method.
+
+        `finest`: the smallest relative one, in units of the machine precision, where rounding dominates the estimates.
+        """
+        with jax.numpy_dtype_promotion("standard"):
+            share = jnp.clip(finest * float(jnp.finfo(y0.dtype).eps) / self.rtol, _SHARE, 1.0)
+        return jax.lax.stop_gradient(share.astype(y0.dtype)) * self.scale(y0, y1, sizes)

@@ -30,6 +30,8 @@ from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances, norm_of
 from .manifold_term import Chart
 
+# The finest relative tolerance of a step, in units of the machine precision.
+_FINEST = 200
 # The target error of a step, in units of the tolerance.
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
@@ -237,10 +239,11 @@ class Adams(AbstractMultistep):
         after = step.after
 
         failed = step.first.failed | step.second.failed
-        sizes = self._sizes(terms, y0, self.tolerances.scale(before, after, state.sizes), step.errors, state.chart)
+        scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
+        sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
         tangents, scales = self._tangents_after(state.tangents, along)
-        for end, scale in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(terms, y0, scale, end.errors, state.chart))
+        for end, own in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(terms, y0, own, end.errors, state.chart))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         change, estimate = choose_order(
             sizes,
@@ -277,7 +280,7 @@ class Adams(AbstractMultistep):
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
             return None
-        scale = self.tolerances.scale(before, after, state.sizes)
+        scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
         size = lambda change: self._size(lax.stop_gradient(change), scale, like)
         correction = size(after - predicted), size(second - first)
         change = size(after - before), size(second - state.history.differences[0])

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ._evaluation import check_real, ravel, unravel_like
 from ._order import StepEstimate
 from ._scales import RunningScales
-from ._tolerances import MultistepNorm, absolute_tolerance, norm_of
+from ._tolerances import MultistepNorm, Tolerances, norm_of
 from .manifold_term import Args, Y
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
@@ -51,7 +51,8 @@ class ControllerState(eqx.Module):
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
     """The longest steps that the error estimates of a multistep method allow, at the order that allows the longest.
 
-    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one in the given norm. For
+    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm, so that
+    the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
     [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
 
@@ -222,7 +223,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         frozen = lambda tree: jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
         terms, t0, t1, y0, args = frozen((terms, t0, t1, y0, args))
         flat = ravel(y0)
-        scales = self.norm.scales
+        scales, tolerances = self.norm.scales, Tolerances(self.rtol, self.atol, self.norm)
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
 
         def trial(carry, _):
@@ -231,18 +232,14 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             t, y, scale = carry
             f = ravel(func(terms, t, unravel_like(y0, y), args), flat.dtype)
             if scales is not None:
-                sizes = scales.start(flat, f)
-                with jax.numpy_dtype_promotion("standard"):
-                    own = absolute_tolerance(self.atol, scales, sizes) + self.rtol * jnp.abs(flat)
-                scale = jnp.where(scale > 0, scale, own.astype(flat.dtype))
+                scale = jnp.where(scale > 0, scale, tolerances.of_step(flat, flat, scales.start(flat, f)))
             size = lambda x: norm_of(self.norm, x / scale, y0)
             # Within this time the state changes by its own size, or at least by the tolerance.
             reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
             return (t0 + (reach / 100).astype(t0.dtype), flat + reach / 100 * f, scale), (f, reach)
 
-        with jax.numpy_dtype_promotion("standard"):
-            first = jnp.zeros_like(flat) if scales is not None else (self.atol + self.rtol * jnp.abs(flat))
-        carry = t0, flat, jnp.broadcast_to(first, flat.shape).astype(flat.dtype)
+        first = jnp.zeros_like(flat) if scales is not None else tolerances.of_step(flat, flat, None)
+        carry = t0, flat, jnp.broadcast_to(first, flat.shape)
         (_, _, scale), (f, (reach, _)) = lax.scan(trial, carry, None, length=2)
         # The local error of order one is h^2/2 times the change of the derivative.
         change = norm_of(self.norm, (f[1] - f[0]) / scale, y0) / (reach / 100)

@@ -22,6 +22,17 @@ def test_evaluations_at_equal_error(name):
     assert np.exp(np.mean(np.log(ratios))) < 0.6
 
 
+@pytest.mark.parametrize(
+    "name", ["kepler 0.6", *(pytest.param(name, marks=pytest.mark.long) for name in PROBLEMS if name != "kepler 0.6")]
+)
+def test_errors_at_equal_tolerance_are_those_of_a_runge_kutta_method(name):
+    # Every half decade: a single run is lucky or unlucky.
+    tolerances = 10.0 ** -np.arange(4.0, 11.1, 0.5)
+    adams, dopri8 = (work_precision(PROBLEMS[name], tolerances, solver=solver)[0] for solver in ("adams", "dopri8"))
+    ratios = adams / dopri8
+    assert np.median(ratios) <= 3 and np.max(ratios) <= 15
+
+
 def _clock(t, y, rate):
     return rate * jnp.stack([-y[1], y[0]])
 
