@@ -28,6 +28,10 @@ from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
-from .studies.identify import Identification as Identification, identify as identify
+from .studies.experiment import Experiment as Experiment
+from .studies.identification import Identification as Identification
+from .studies.identify import identify as identify
+from .studies.measurements import Measurements as Measurements, read_measurements as read_measurements
+from .studies.sensors import Sensor as Sensor
 from .system import RigidBodySystem as RigidBodySystem, parameters as parameters, with_parameters as with_parameters
 from .trajectory import Trajectory as Trajectory, load as load
