@@ -100,9 +100,13 @@ class Trial(eqx.Module):
         parts = jnp.split(flat, ends[:-1])
         return {name: part.reshape(shape) for (name, shape), part in zip(self.unknowns, parts, strict=True)}
 
+    def changed_system(self, system: AbstractSystem, theta: Mapping[str, Array]) -> AbstractSystem:
+        """The system with these unknowns."""
+        return with_parameters(system, self.known | {name: theta[name] for name in self.changed})
+
     def start(self, system: AbstractSystem, theta: Mapping[str, Array]) -> tuple[AbstractSystem, State]:
         """The system with these unknowns, and its initial state; not a number if there is none."""
-        system = with_parameters(system, self.known | {name: theta[name] for name in self.changed})
+        system = self.changed_system(system, theta)
         fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
         rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
         return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=False)

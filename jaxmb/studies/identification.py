@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -14,6 +15,7 @@ from ..system import AbstractSystem
 from .covariance import combinations, covariance
 from .density import LogDensity, logdensity
 from .fit import Fit
+from .identification_report import write_report
 from .prediction import HeldOut, Prediction, held_out, predict
 from .problem import Problem
 from .profile import Profile, profile
@@ -109,6 +111,26 @@ class Identification:
         **Raises:** `ValueError` if the noise level of a sensor is neither known nor free, and after multiple shooting.
         """
         return logdensity(self.fit, mode)
+
+    def report(self, path: str | Path, *, profiles: Sequence[str] = ()) -> Path:
+        """Write one HTML page: the table, each sensor's fit and residuals, correlations and profiles.
+
+        **Arguments:** `path`: a file that ends in `.html`, or a folder; `profiles`: components whose profile likelihood
+        is computed and shown.
+
+        **Returns:** the path of the page.
+
+        **Raises:** `ValueError` as `profile`; `ImportError` without Matplotlib.
+        """
+        return write_report(
+            self.fit,
+            path,
+            message=self.message,
+            start=_flat(self.start),
+            deviations=_flat(self.deviations),
+            combinations=self.combinations,
+            profiles=profiles,
+        )
 
     def __str__(self) -> str:
         columns = (_flat(self.start), _flat(self.parameters), _flat(self.deviations))

@@ -18,6 +18,7 @@ from .minimise import Minimum, descend, minimise_together
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
 from .ranges import Bounds, Interval
 from .sensors import Sensor
+from .shooting import shoot
 from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
 
 # A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
@@ -44,6 +45,7 @@ def identify(
     residual: Callable[[Trajectory], Array] | None = None,
     starts: int | Sequence[Mapping[str, VectorLike]] = 1,
     seed: int = 0,
+    segments: int = 1,
     method: str | optax.GradientTransformation = "lm",
     max_iterations: int | None = None,
     tol: float = 1e-8,
@@ -86,6 +88,9 @@ def identify(
     - `starts`: how many points to start from, the first one that of `free`, the others drawn with `seed` between the
         bounds or, where there are none, from a normal distribution of the size of the start; or further starting
         values, one mapping for each start. They are simulated in one batch, and the best minimum is returned.
+    - `segments`: more than one is multiple shooting, for motions that are chaotic or unstable, which a simulation over
+        the whole time does not follow: each experiment is cut into so many segments of nearly as many samples,
+        simulated in one batch from states of their own, which are joined as the iteration goes on.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
         optax optimiser with reverse-mode derivatives of the objective divided by the number of residuals, such as
         `optax.adam(0.02)`.
@@ -107,6 +112,27 @@ def identify(
     limit = _ITERATIONS["lm" if method == "lm" else "optax"] if max_iterations is None else max_iterations
 
     points = _starts(problem, starts, seed)
+    if segments != 1:
+        if method != "lm" or len(points) > 1:
+            raise ValueError("Multiple shooting, segments > 1, has one start and method='lm'.")
+        shot = shoot(problem, points[0], segments, tol, limit)
+        return identification(
+            problem,
+            shot.z,
+            data=shot.data,
+            jacobian=shot.jacobian,
+            along=shot.along,
+            objective=shot.objective,
+            readings=shot.readings,
+            known_noise=known_noise,
+            iterations=shot.iterations,
+            success=shot.success,
+            objectives=(shot.objective,),
+            tol=tol,
+            max_iterations=limit,
+            segments=segments,
+            continuity=shot.continuity,
+        )
     model = linearise(problem, points[0])
     _check_start(problem, model)
     if isinstance(method, str):
@@ -226,7 +252,7 @@ def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int
     coarse = 1e-3 if levels.sum() < levels.size else np.inf
     found = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
     starts = points if found is None else [minimum.z for minimum in found]
-    starts = [with_likely_levels(problem, z) for z in starts]
+    starts = [with_likely_levels(problem, z, linearise(problem, z).readings) for z in starts]
     refined = minimise_together(linearised, starts, tol, limit)
     before = [0] * len(points) if found is None else [minimum.iterations for minimum in found]
     return [own._replace(iterations=own.iterations + more) for own, more in zip(refined, before, strict=True)]

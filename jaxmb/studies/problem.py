@@ -88,14 +88,19 @@ def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
 
 def linearise_batch(problem: Problem, zs: Sequence[Float[Array, "n"]]) -> list[Model]:
     """The same at several points, simulated as one batch."""
-    charts = [tuple(map(np.asarray, _chart(problem.free, problem.priors, z))) for z in zs]
+    charts = [values_and_derivatives(problem, z) for z in zs]
     found = {}
     for number, trial in enumerate(problem.trials):
         if problem.fitted[number]:
             columns = problem.columns(number)
             flats = [jnp.asarray(values[columns]) for values, *_ in charts]
-            found[number] = _numbers(linearised_trials(problem.system, trial, problem.options, flats))
+            found[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
     return [_joined(problem, chart, {n: seen[k] for n, seen in found.items()}) for k, chart in enumerate(charts)]
+
+
+def values_and_derivatives(problem: Problem, z: Float[Array, "n"]) -> tuple[np.ndarray, ...]:
+    """All values one after the other, their derivatives, and the rows of the priors with theirs."""
+    return tuple(map(np.asarray, _chart(problem.free, problem.priors, z)))
 
 
 def linearised_trials(system, trial, options, flats: Sequence[Array]) -> list[tuple[Seen, Any]]:
@@ -132,13 +137,13 @@ def _with_jacobian(system, trial, options, flat):
 
 @eqx.filter_jit
 def _chart(free, priors, z):
-    """All values, their derivatives, and the rows of the priors with theirs."""
     rows = lambda z: priors(free(z)).astype(z.dtype)
     return free.flat(z), jax.jacfwd(free.flat)(z), rows(z), jax.jacfwd(rows)(z)
 
 
-def _numbers(seen):
-    return [jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, one) for one in seen]
+def numbers(tree: Any) -> Any:
+    """A tree whose arrays are those of NumPy."""
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
 
 
 def _joined(problem, chart, found) -> Model:
@@ -161,10 +166,11 @@ def _joined(problem, chart, found) -> Model:
     return Model(model, data, results, {problem.names[n]: seen.readings for n, (seen, _) in found.items()})
 
 
-def with_likely_levels(problem: Problem, z: Float[Array, "n"]) -> Float[Array, "n"]:
-    """The vector with the noise levels that are most likely for the motion of the others."""
+def with_likely_levels(
+    problem: Problem, z: Float[Array, "n"], readings: Mapping[str, Mapping[str, np.ndarray]]
+) -> Float[Array, "n"]:
+    """The vector with the noise levels that are most likely for predicted readings, by experiment and sensor."""
     values = {name: np.asarray(value) for name, value in problem.free(z).items()}
-    readings = linearise(problem, z).readings
     squares: dict[str, list] = {}
     for number, trial in enumerate(problem.trials):
         for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
