@@ -16,7 +16,7 @@ from .experiment import Experiment
 from .identification import Identification, identification
 from .minimise import Minimum, descend, minimise_together
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
-from .ranges import Bounds, Interval
+from .ranges import Bounds
 from .sensors import Sensor
 from .shooting import shoot
 from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
@@ -161,8 +161,6 @@ def identify(
 
 def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, options) -> tuple[Problem, bool]:
     """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
-    # A concrete class: one experiment alone is what a list of one is.
-    measured = [measured] if isinstance(measured, Experiment) else measured
     if isinstance(measured, Mapping) or measured is None:
         if own["ts"] is None:
             raise ValueError("ts is missing: the times of what was measured.")
@@ -171,7 +169,7 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, opt
         for name, value in (own | {"t0": t0}).items():
             if value is not None and np.size(value) and not (name == "t0" and np.ndim(value) == 0 and value == 0):
                 raise ValueError(f"{name} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {name}=…).")
-        experiments = experiments_by_name(measured)
+        experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
     named = sensors_by_name(system, sensors)
     free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma)
     problem = Problem(
@@ -229,18 +227,8 @@ def _starts(problem: Problem, starts: int | Sequence[Mapping[str, VectorLike]], 
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}.")
     random = np.random.default_rng(seed)
-    points = [first]
-    for _ in range(starts - 1):
-        parts = []
-        for r in free.ranges:
-            # A concrete class: between two bounds every value is as likely as any other.
-            if isinstance(r, Interval):
-                drawn = r.low + (r.high - r.low) * random.uniform(size=r.start.shape)
-                parts.append(r.locate(drawn))
-            else:
-                parts.append(jnp.asarray(random.standard_normal(r.size), first.dtype))
-        points.append(jnp.concatenate(parts))
-    return points
+    draw = lambda: jnp.concatenate([r.draw(random) for r in free.ranges])
+    return [first, *(draw() for _ in range(starts - 1))]
 
 
 def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int) -> list[Minimum]:

@@ -49,6 +49,10 @@ class AbstractRange(eqx.Module):
         """As many components of a value as determine it."""
         return value.reshape(-1)
 
+    def draw(self, random: np.random.Generator) -> Float[Array, "n"]:
+        """A vector somewhere in the range, not far from the start."""
+        return jnp.asarray(random.standard_normal(self.size), self.start.dtype)
+
 
 class Line(AbstractRange):
     """Any value: `start + scale z`."""
@@ -88,6 +92,10 @@ class Interval(AbstractRange):
 
     def locate(self, value):
         return (self._logit(value) - self._logit(self.start)).reshape(-1)
+
+    def draw(self, random):
+        # Between two bounds every value is as likely as any other.
+        return self.locate(self.low + (self.high - self.low) * random.uniform(size=self.start.shape))
 
     def _logit(self, value):
         share = (value - self.low) / (self.high - self.low)

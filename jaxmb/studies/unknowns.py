@@ -13,6 +13,7 @@ from .._types import VectorLike
 from ..parts.names import unknown
 from ..states.assembly import assemble
 from ..system import AbstractSystem, parameters, with_parameters
+from ..system.arguments import check_kind
 from .experiment import Experiment, Trial, arrays, channels_of, checked_times, initial_unknown, known_parameters
 from .ranges import Bounds, FreeParameters, range_of
 from .sensors import SENSOR_FIELDS, Channel, Sensor
@@ -57,9 +58,7 @@ def experiments_by_name(experiments: Sequence[Experiment]) -> dict[str, Experime
     """Experiments by their names, which are made where they are missing."""
     out = {}
     for number, experiment in enumerate(experiments, 1):
-        # A concrete class: anything else in the list is a mistake of the caller.
-        if not isinstance(experiment, Experiment):
-            raise ValueError(f"Experiments must be jaxmb.Experiment(measured, ts=…), got {experiment!r}.")
+        check_kind("An experiment", experiment, Experiment, "a jaxmb.Experiment", "jaxmb.Experiment(measured, ts=…)")
         name = f"exp{number}" if experiment.name is None else experiment.name
         if name in out or not name or "/" in name:
             raise ValueError(f"The name {name!r} of an experiment must be its own, not empty and without '/'.")
@@ -73,9 +72,7 @@ def sensors_by_name(system: AbstractSystem, sensors: Iterable[Sensor]) -> dict[s
     """Sensors by their names, checked."""
     quantities, out = system.quantities(), {}
     for sensor in sensors:
-        # A concrete class: anything else in the list is a mistake of the caller.
-        if not isinstance(sensor, Sensor):
-            raise ValueError(f"Sensors must be jaxmb.Sensor(quantity, …), got {sensor!r}.")
+        check_kind("A sensor", sensor, Sensor, "a jaxmb.Sensor", "jaxmb.Sensor(quantity, …)")
         if sensor.quantity not in quantities:
             raise unknown("quantity of a sensor", sensor.quantity, quantities)
         if sensor.label in out or (sensor.label in quantities and sensor.label != sensor.quantity):
