@@ -4,7 +4,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 from jax.scipy.special import ndtri
 
@@ -377,7 +376,7 @@ def test_combinations_that_make_no_difference():
     ((own),) = combinations(("a", "b", "c"), np.array([1.0, 2.0, 1.0]), found)
     assert set(own) == {"a", "b"}
     np.testing.assert_allclose([own["a"], own["b"]], [1.0, -0.5])
-    np.testing.assert_allclose(found.matrix[2, 2], 0.5 + 1 / 6, rtol=0.5)
+    np.testing.assert_allclose(found.matrix[2, 2], 2 / 3)
 
 
 def test_iterations_together_are_those_alone():
@@ -426,7 +425,7 @@ def test_measurements_from_files_and_tables(tmp_path):
     np.testing.assert_array_equal(own.ts, [0.1, 0.2, 0.4])
     np.testing.assert_array_equal(own.values["rod.angle"], [1.0, np.nan, 1.5])
     np.testing.assert_array_equal(own.values["rod.position"], [[2.0, 3.0], [np.nan, 4.0], [2.0, 5.0]])
-    frame = pd.DataFrame({"time": [0.0, 1.0], "rod.angle": [1.0, None]})
+    frame = pytest.importorskip("pandas").DataFrame({"time": [0.0, 1.0], "rod.angle": [1.0, None]})
     table = mb.read_measurements(frame, time="time")
     np.testing.assert_array_equal(table.values["rod.angle"], [1.0, np.nan])
 

@@ -166,9 +166,10 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, opt
             raise ValueError("ts is missing: the times of what was measured.")
         experiments = {"": Experiment(measured, **own, t0=t0)}
     else:
-        for name, value in (own | {"t0": t0}).items():
-            if value is not None and np.size(value) and not (name == "t0" and np.ndim(value) == 0 and value == 0):
-                raise ValueError(f"{name} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {name}=…).")
+        given = [name for name, value in own.items() if value is not None and name != "free_initial"]
+        given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
+        if given:
+            raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {given[0]}=…).")
         experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
     named = sensors_by_name(system, sensors)
     free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma)
