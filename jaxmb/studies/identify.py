@@ -1,97 +1,51 @@
 """Parameters by name from measured motion."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import diffrax
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
-from ..parts.names import unknown
-from ..simulate import simulate
-from ..states.assembly import assemble
-from ..system import AbstractSystem, with_parameters
+from ..system import AbstractSystem
 from ..trajectory import Trajectory
-from .minimise import Minimum, descend, levenberg_marquardt
-from .ranges import Bounds, FreeParameters, free_parameters
+from .experiment import Experiment
+from .identification import Identification, identification
+from .minimise import Minimum, descend, minimise_together
+from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
+from .ranges import Bounds
+from .sensors import Sensor
+from .shooting import shoot
+from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
 
 # A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
 _NO_EFFECT = 1e-10
 
-# Directions of parameters to which the residuals are less sensitive than this, relative to the strongest direction, are
-# not determined.
-_UNDETERMINED = 1e-6
-# Parameters with at least this share in such a direction are named.
-_SHARE = 0.1
-
 _ITERATIONS = {"lm": 100, "optax": 1000}
-
-
-@dataclasses.dataclass(frozen=True)
-class Identification:
-    """The result of `identify`; `print` shows a table.
-
-    **Fields:**
-
-    - `parameters`: estimates by name; `start`: where they started from.
-    - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
-        Without `sigma` the noise is estimated from the residuals. Infinite for parameters that the data do not
-        determine, NaN where there are no more residuals than parameters and no `sigma`.
-    - `covariance`: of all components, in the order of `components`, the names of all scalar components.
-    - `undetermined`: names of components that can change, alone or together, without changing the residuals.
-    - `residuals`: weighted, at the solution; `rms`: their root mean square.
-    - `iterations`; `success`: whether the iteration converged; `message` says how it ended.
-    - `system`, `state`: with the estimated parameters, ready for `simulate`.
-    """
-
-    parameters: dict[str, np.ndarray]
-    start: dict[str, np.ndarray]
-    deviations: dict[str, np.ndarray]
-    covariance: np.ndarray
-    components: tuple[str, ...]
-    undetermined: tuple[str, ...]
-    residuals: np.ndarray
-    iterations: int
-    success: bool
-    message: str
-    system: AbstractSystem
-    state: State
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the weighted residuals."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
-
-    def __str__(self) -> str:
-        columns = (_flat(self.start), _flat(self.parameters), _flat(self.deviations))
-        width = max(len("parameter"), *(len(name) for name in self.components))
-        lines = [f"{'parameter':{width}}  {'start':>12}  {'estimate':>12}  {'deviation':>10}"]
-        for name, start, value, deviation in zip(self.components, *columns, strict=True):
-            lines.append(f"{name:{width}}  {start:12.6g}  {value:12.6g}  {deviation:10.2g}")
-        count = f"{self.residuals.size} residuals, rms {self.rms:.3g}, {self.iterations} iterations"
-        return "\n".join([*lines, f"{count}: {self.message}"])
 
 
 def identify(
     system: AbstractSystem,
-    measured: Mapping[str, VectorLike] | None = None,
+    measured: Mapping[str, VectorLike] | Experiment | Sequence[Experiment] | None = None,
     *,
-    ts: ArrayLike,
-    free: Mapping[str, VectorLike] | Sequence[str],
+    ts: ArrayLike | None = None,
+    free: Mapping[str, VectorLike | None] | Sequence[str] = (),
     state: State | None = None,
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
+    free_initial: Sequence[str] | Mapping[str, VectorLike] = (),
     t0: Scalar = 0.0,
+    sensors: Sequence[Sensor] = (),
     sigma: Mapping[str, VectorLike] | None = None,
     bounds: Mapping[str, Bounds] | None = None,
+    prior: Mapping[str, Prior] | None = None,
     residual: Callable[[Trajectory], Array] | None = None,
+    starts: int | Sequence[Mapping[str, VectorLike]] = 1,
+    seed: int = 0,
+    segments: int = 1,
     method: str | optax.GradientTransformation = "lm",
     max_iterations: int | None = None,
     tol: float = 1e-8,
@@ -103,28 +57,43 @@ def identify(
 
     - `system`: a compiled scene, or another system.
     - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
-        (times, 2)}`. Names are those of `Trajectory[body]` (`position`, `velocity`, `angle`, `orientation`,
-        `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has coordinates and
-        their rates q̇, `"theta"` and `"theta.rate"`, shape (times,), and generalized forces of its constraints,
-        `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without wrapping.
+        (times, 2)}`. Names are those of `sensors`, of `Trajectory[body]` (`position`, `velocity`, `angle`,
+        `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
+        coordinates and their rates q̇, `"theta"` and `"theta.rate"`, shape (times,), and generalized forces of its
+        constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
+        wrapping. Instead, an `Experiment` or a list of them, each with its own data, times and initial state.
     - `ts`: times [s], shape (times,), increasing, from `t0` on.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
-        system's values.
+        system's values. Every experiment has the same value, unless the name is among its `own`: that unknown is
+        called `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
+        `"encoder.bias"`; noise levels are estimated by maximum likelihood.
 
     **The initial state**, at `t0`, is found anew for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints whatever the free parameters is therefore kept as it is.
+    `free_initial` names coordinates and rates of it that are unknown, `("crank.angle", "crank.angle.rate")`, or gives
+    their starting values by name; these unknowns are called `"initial.crank.angle"`.
 
     **Other arguments:**
 
+    - `sensors`: instruments between quantities and data.
     - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
         it every quantity is weighted by its own range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
         to be positive, such as masses and moments of inertia, stay so without bounds, and inertia matrices stay
-        positive definite; the parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are
-        scaled by their start.
+        those of a body, positive definite and with principal moments that satisfy the triangle inequalities; the
+        parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
+    - `prior`: `(mean, deviation)` by name, of a normal distribution that is known before the measurement. Needs the
+        noise levels, known or free.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
+    - `starts`: how many points to start from, the first one that of `free`, the others drawn with `seed` between the
+        bounds or, where there are none, from a normal distribution of the size of the start; or further starting
+        values, one mapping for each start. They are simulated in one batch, and the best minimum is returned.
+    - `segments`: more than one is multiple shooting, for motions that are chaotic or unstable, which a simulation over
+        the whole time does not follow: each experiment is cut into so many segments of nearly as many samples,
+        simulated in one batch from states of their own, which are joined as the iteration goes on.
     - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
-        optax optimiser with reverse-mode derivatives of half the mean square residual, such as `optax.adam(0.02)`.
+        optax optimiser with reverse-mode derivatives of the objective divided by the number of residuals, such as
+        `optax.adam(0.02)`.
     - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: change of unknowns and residuals, absolute and
         relative, or size of an optax step, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
@@ -133,254 +102,168 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, and if the simulation with
-    the starting values fails or a free parameter has no effect on the residuals there.
+    **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, fewer data than unknowns,
+    and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.
     """
-    names = free_parameters(system, free, bounds)
-    ts = _times(ts, t0)
-    problem = _Problem(
-        system=system,
-        free=names,
-        state=system.guess if state is None else state,
-        fix=_arrays(fix),
-        rates=_arrays(rates),
-        t0=jnp.asarray(t0, ts.dtype),
-        ts=ts,
-        fit=_fit(system, measured, sigma, residual, ts),
-        options=_checked(options),
-    )
+    own = {"ts": ts, "state": state, "fix": fix, "rates": rates, "residual": residual, "free_initial": free_initial}
+    problem, known_noise = _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, options)
     if method != "lm" and not isinstance(method, optax.GradientTransformation):
         raise ValueError(f"method must be 'lm' or an optax optimiser, got {method!r}.")
+    limit = _ITERATIONS["lm" if method == "lm" else "optax"] if max_iterations is None else max_iterations
 
-    start = jnp.zeros(names.size, ts.dtype)
-    _check_start(problem, start)
-    kind = "lm" if method == "lm" else "optax"
-    limit = _ITERATIONS[kind] if max_iterations is None else max_iterations
-    if isinstance(method, str):
-        solution = levenberg_marquardt(lambda z: _linearised(problem, z)[:2], start, tol, limit)
-    else:
-        solution = descend(method, problem.residuals, start, tol, limit)
-    return _summary(problem, solution, known_noise=sigma is not None or residual is not None)
-
-
-class _Measured(eqx.Module):
-    """Weighted residuals of measured quantities; missing samples are left out."""
-
-    values: dict[str, Array]
-    weights: dict[str, Array]
-    present: dict[str, Array]
-
-    def __call__(self, trajectory: Trajectory) -> Float[Array, "residuals"]:
-        out = []
-        for name, value in self.values.items():
-            difference = (trajectory.quantity(name) - value) * self.weights[name]
-            out.append(difference.reshape(-1)[self.present[name]])
-        return jnp.concatenate(out)
-
-    @property
-    def size(self) -> Array:
-        """The size of what is measured, weighted."""
-        largest = [jnp.max(jnp.abs(self.values[name] * self.weights[name])) for name in self.values]
-        return 1 + jnp.max(jnp.stack(largest))
-
-
-class _Residual(eqx.Module):
-    """Residuals of the user."""
-
-    fn: Callable[[Trajectory], Array]
-    size: Array
-
-    def __call__(self, trajectory: Trajectory) -> Float[Array, "residuals"]:
-        return jnp.asarray(self.fn(trajectory)).reshape(-1)
-
-
-class _Problem(eqx.Module):
-    """Everything that the residuals depend on besides the free parameters."""
-
-    system: AbstractSystem
-    free: FreeParameters
-    state: State
-    fix: dict[str, Array]
-    rates: dict[str, Array]
-    t0: Array
-    ts: Float[Array, "times"]
-    fit: _Measured | _Residual
-    options: dict[str, Any]
-
-    def initial(self, z: Float[Array, "n"]) -> tuple[AbstractSystem, State]:
-        system = with_parameters(self.system, self.free(z))
-        state = assemble(system, self.state, fix=self.fix, rates=self.rates, t=self.t0, throw=False)
-        return system, state
-
-    def simulate(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
-        system, state = self.initial(z)
-        return simulate(
-            system, state, t0=self.t0, t1=self.ts[-1], saveat=self.ts, adjoint=adjoint, throw=False, **self.options
+    points = _starts(problem, starts, seed)
+    if segments != 1:
+        if method != "lm" or len(points) > 1:
+            raise ValueError("Multiple shooting, segments > 1, has one start and method='lm'.")
+        shot = shoot(problem, points[0], segments, tol, limit)
+        return identification(
+            problem,
+            shot.z,
+            data=shot.data,
+            jacobian=shot.jacobian,
+            along=shot.along,
+            objective=shot.objective,
+            readings=shot.readings,
+            known_noise=known_noise,
+            iterations=shot.iterations,
+            success=shot.success,
+            objectives=(shot.objective,),
+            tol=tol,
+            max_iterations=limit,
+            segments=segments,
+            continuity=shot.continuity,
         )
+    model = linearise(problem, points[0])
+    _check_start(problem, model)
+    if isinstance(method, str):
+        solutions = _least_squares(problem, points, tol, limit)
+    else:
+        objective = lambda z, adjoint: problem.objective(z, adjoint) / model.data
+        solutions = [descend(method, objective, z, tol, limit) for z in points]
+    solutions = sorted(solutions, key=lambda solution: np.inf if np.isnan(solution.value) else solution.value)
+    best = solutions[0]
+    model = linearise(problem, best.z)
+    return identification(
+        problem,
+        best.z,
+        data=model.linearised.residuals[: model.data],
+        jacobian=model.linearised.jacobian,
+        objective=model.linearised.value,
+        readings=model.readings,
+        known_noise=known_noise,
+        iterations=best.iterations,
+        success=best.success,
+        objectives=tuple(solution.value for solution in solutions),
+        tol=tol,
+        max_iterations=limit,
+    )
 
-    def residuals(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Float[Array, "residuals"]:
-        return self.residuals_and_result(z, adjoint)[0]
 
-    def residuals_and_result(
-        self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None
-    ) -> tuple[Float[Array, "residuals"], RESULTS]:
-        """Residuals, infinite if anything failed, and how the simulation ended."""
-        trajectory = self.simulate(z, adjoint)
-        residuals = self.fit(trajectory)
-        ok = (trajectory.result == RESULTS.successful) & jnp.all(jnp.isfinite(residuals))
-        return jnp.where(ok, residuals, jnp.inf), trajectory.result
+def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, options) -> tuple[Problem, bool]:
+    """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
+    if isinstance(measured, Mapping) or measured is None:
+        if own["ts"] is None:
+            raise ValueError("ts is missing: the times of what was measured.")
+        experiments = {"": Experiment(measured, **own, t0=t0)}
+    else:
+        given = [name for name, value in own.items() if value is not None and name != "free_initial"]
+        given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
+        if given:
+            raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {given[0]}=…).")
+        experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
+    named = sensors_by_name(system, sensors)
+    free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma)
+    problem = Problem(
+        system=system,
+        free=free,
+        priors=priors,
+        names=tuple(experiments),
+        sources=sources,
+        fitted=tuple(not experiment.held_out for experiment in experiments.values()),
+        trials=trials,
+        options=_checked(options),
+    )
+    known_noise = _known_noise(experiments, named, sigma, trials)
+    if priors.names and not known_noise:
+        raise ValueError(
+            f"The prior of {priors.names[0]!r} is weighed against noise of a known size: give sigma, or free the noise "
+            "levels of the sensors, such as 'encoder.sigma'."
+        )
+    return problem, known_noise
 
 
-def _times(ts: ArrayLike, t0: Scalar) -> Float[Array, "times"]:
-    times = np.asarray(ts, dtype=float)
-    if times.ndim != 1 or times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
-        raise ValueError("ts must be a vector of increasing times.")
-    if times[0] < t0 or times[-1] <= t0:
-        raise ValueError(f"ts must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
-    return jnp.asarray(times, dtype=jnp.result_type(float))
-
-
-def _arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Array]:
-    return {name: jnp.asarray(value, jnp.result_type(float)) for name, value in (values or {}).items()}
+def _known_noise(experiments, sensors, sigma, trials) -> bool:
+    for experiment, trial in zip(experiments.values(), trials, strict=True):
+        given = {*(sigma or {}), *(experiment.sigma or {}), *(n for n, s in sensors.items() if s.sigma is not None)}
+        free = {name for name, _ in trial.unknowns}
+        if not all(name in given or f"{name}.sigma" in free for name in (experiment.measured or {})):
+            return False
+    return True
 
 
 def _checked(options: dict[str, Any]) -> dict[str, Any]:
-    for name in ("saveat", "t1", "adjoint", "throw", "event"):
+    for name in ("saveat", "t1", "adjoint", "throw", "event", "inputs"):
         if name in options:
-            raise ValueError(f"identify sets {name!r} of simulate itself; leave it out.")
+            where = "give it to an Experiment" if name == "inputs" else "leave it out"
+            raise ValueError(f"identify sets {name!r} of simulate itself; {where}.")
     return options
 
 
-def _fit(system, measured, sigma, residual, ts) -> "_Measured | _Residual":
-    if (measured is None) == (residual is None):
-        raise ValueError("Give either measured quantities by name or a residual function.")
-    if measured is None:
-        if sigma is not None:
-            raise ValueError("sigma belongs to measured quantities; a residual function does its own weighting.")
-        return _Residual(residual, jnp.ones((), ts.dtype))
-    if not measured:
-        raise ValueError("measured is empty: give at least one quantity by name.")
-    known = {name: (ts.shape[0], *own.shape) for name, own in system.quantities().items()}
-    for name in (*measured, *(sigma or {})):
-        if name not in known:
-            raise unknown("quantity", name, known)
-    values, weights, present = {}, {}, {}
-    for name, data in measured.items():
-        data = np.asarray(data, dtype=ts.dtype)
-        if data.shape != known[name]:
-            raise ValueError(
-                f"Measured {name!r} must have shape {known[name]} for {ts.shape[0]} times, got {data.shape}."
-            )
-        there = np.isfinite(data)
-        if not there.any():
-            raise ValueError(f"Measured {name!r} holds no number.")
-        values[name] = jnp.asarray(np.where(there, data, 0.0))
-        weights[name] = jnp.asarray(_weights(name, data, sigma))
-        present[name] = jnp.asarray(np.flatnonzero(there))
-    for name in sigma or {}:
-        if name not in measured:
-            raise ValueError(f"sigma is given for {name!r}, which is not measured.")
-    return _Measured(values, weights, present)
-
-
-def _weights(name: str, data: np.ndarray, sigma: Mapping[str, VectorLike] | None) -> np.ndarray:
-    if sigma is None:
-        size = np.nanmax(data) - np.nanmin(data)
-        return np.full(data.shape, 1.0 / size if size > 0 else 1.0, data.dtype)
-    if name not in sigma:
-        raise ValueError(f"sigma is given for other quantities but not for {name!r}; give all or none.")
-    deviation = np.asarray(sigma[name], data.dtype)
-    if not np.all(deviation > 0):
-        raise ValueError(f"sigma of {name!r} must be positive.")
-    try:
-        return np.broadcast_to(1.0 / deviation, data.shape)
-    except ValueError:
-        raise ValueError(f"sigma of {name!r} has shape {deviation.shape}, which does not fit {data.shape}.") from None
-
-
-@eqx.filter_jit
-def _linearised(problem: _Problem, z: Float[Array, "n"]):
-    """Residuals, their Jacobian, and how the simulation ended."""
-
-    def fn(z):
-        residuals, result = problem.residuals_and_result(z, diffrax.ForwardMode())
-        return residuals, (residuals, result)
-
-    jacobian, (residuals, result) = jax.jacfwd(fn, has_aux=True)(z)
-    return residuals, jacobian, result
-
-
-def _check_start(problem: _Problem, z: Float[Array, "n"]) -> None:
-    residuals, jacobian, result = _linearised(problem, z)
-    if not bool(result == RESULTS.successful):
-        text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
-        raise ValueError(f"The simulation fails with the starting values: {text}")
-    if not bool(jnp.all(jnp.isfinite(residuals))):
-        raise ValueError("The residuals are not finite with the starting values.")
-    ahead = np.asarray(jnp.max(jnp.abs(jacobian), axis=0) / problem.fit.size)
-    position = 0
-    for name, r in zip(problem.free.names, problem.free.ranges, strict=True):
-        if not np.any(ahead[position : position + r.size] > _NO_EFFECT):
-            raise ValueError(f"{name!r} has no effect on what was measured; leave it out of free, or measure more.")
-        position += r.size
-
-
-def _summary(problem: _Problem, solution: Minimum, *, known_noise: bool) -> Identification:
-    z = solution.z
-    residuals, jacobian, _ = (np.asarray(x) if eqx.is_array(x) else x for x in _linearised(problem, z))
+def _starts(problem: Problem, starts: int | Sequence[Mapping[str, VectorLike]], seed: int) -> list[Array]:
+    """The vectors to start from."""
     free = problem.free
-    values = {name: np.asarray(value) for name, value in free(z).items()}
-    components = tuple(component for name, value in values.items() for component in _components(name, value.shape))
-    ahead = np.asarray(jax.jacfwd(free.flat)(z))
-
-    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
-    sizes = np.pad(sizes, (0, z.size - sizes.size))
-    weak = sizes <= _UNDETERMINED * sizes[0]
-    strong = directions[~weak] / sizes[~weak][:, None]
-    covariance = ahead @ (strong.T @ strong) @ ahead.T
-    surplus = residuals.size - int(np.sum(~weak))
-    if not known_noise:
-        covariance = covariance * (np.sum(residuals**2) / surplus if surplus > 0 else np.nan)
-    moved = np.max(np.abs(ahead @ directions[weak].T), axis=1, initial=0.0)
-    scale = np.max(np.abs(ahead), axis=1)
-    lost = moved > _SHARE * scale
-    covariance[lost, :] = covariance[:, lost] = 0.0
-    covariance[lost, lost] = np.inf
-    undetermined = tuple(np.array(components)[lost].tolist())
-
-    message = (
-        "converged" if solution.success else "the iteration did not converge; try another start, or more iterations"
-    )
-    if undetermined:
-        message += f"; the data do not determine {', '.join(undetermined)} separately"
-    system, state = problem.initial(z)
-    return Identification(
-        parameters=values,
-        start={name: np.asarray(r.start) for name, r in zip(free.names, free.ranges, strict=True)},
-        deviations=_unflatten(np.sqrt(np.diag(covariance)), values),
-        covariance=covariance,
-        components=components,
-        undetermined=undetermined,
-        residuals=residuals,
-        iterations=solution.iterations,
-        success=solution.success,
-        message=message,
-        system=system,
-        state=state,
-    )
+    first = jnp.zeros(free.size, problem.trials[0].ts.dtype)
+    if not isinstance(starts, int):
+        points = [first]
+        for given in starts:
+            for name in given:
+                if name not in free.names:
+                    raise ValueError(f"starts has {name!r}, which is not free.")
+            values = free(first) | {name: jnp.asarray(value, first.dtype) for name, value in given.items()}
+            point = free.locate(values)
+            if point.shape != first.shape or not np.all(np.isfinite(point)):
+                raise ValueError(f"The start {dict(given)} has wrong shapes or lies out of the bounds.")
+            points.append(point)
+        return points
+    if starts < 1:
+        raise ValueError(f"starts must be at least 1, got {starts}.")
+    random = np.random.default_rng(seed)
+    draw = lambda: jnp.concatenate([r.draw(random) for r in free.ranges])
+    return [first, *(draw() for _ in range(starts - 1))]
 
 
-def _components(name: str, shape: tuple[int, ...]) -> list[str]:
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
+def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int) -> list[Minimum]:
+    linearised = lambda zs: [model.linearised for model in linearise_batch(problem, zs)]
+    levels = level_mask(problem)
+    if not levels.any():
+        return minimise_together(linearised, points, tol, limit)
+    # First the motion, with the noise levels as they are, and then both, from the levels that the first fit shows.
+    coarse = 1e-3 if levels.sum() < levels.size else np.inf
+    found = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
+    starts = points if found is None else [minimum.z for minimum in found]
+    starts = [with_likely_levels(problem, z, linearise(problem, z).readings) for z in starts]
+    refined = minimise_together(linearised, starts, tol, limit)
+    before = [0] * len(points) if found is None else [minimum.iterations for minimum in found]
+    return [own._replace(iterations=own.iterations + more) for own, more in zip(refined, before, strict=True)]
 
 
-def _flat(values: dict[str, np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.ravel(value) for value in values.values()])
-
-
-def _unflatten(flat: np.ndarray, like: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    out, position = {}, 0
-    for name, value in like.items():
-        out[name] = flat[position : position + value.size].reshape(value.shape)
-        position += value.size
-    return out
+def _check_start(problem: Problem, model: Model) -> None:
+    fitted = [name for name, own in zip(problem.names, problem.fitted, strict=True) if own]
+    for name, result in zip(fitted, model.results, strict=True):
+        if not bool(result == RESULTS.successful):
+            text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
+            where = f" of experiment {name!r}" if name else ""
+            raise ValueError(f"The simulation{where} fails with the starting values: {text}")
+    residuals, jacobian, _ = model.linearised
+    if not np.all(np.isfinite(residuals)):
+        raise ValueError("The residuals are not finite with the starting values.")
+    size = max(trial.size for trial in problem.trials)
+    ahead = np.max(np.abs(jacobian), axis=0) / size
+    for name in problem.free.names:
+        if not np.any(ahead[problem.free.place(name)] > _NO_EFFECT):
+            raise ValueError(f"{name!r} has no effect on what was measured; leave it out of free, or measure more.")
+    data = model.data + sum(int(np.size(mean)) for mean in problem.priors.means)
+    if data < problem.free.size:
+        raise ValueError(
+            f"There are {data} measured numbers for {problem.free.size} unknown ones; measure more, or free fewer."
+        )

@@ -1,6 +1,6 @@
 """Two ways to make residuals small: Levenberg–Marquardt, and any optimiser of optax."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -11,71 +11,130 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-# Residuals of the unknowns z, given how to differentiate the simulation in them; infinite where it fails.
-Residuals = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[Array, "residuals"]]
-
-# Residuals and their Jacobian; infinite where the simulation fails.
-Linearised = Callable[[Float[Array, "n"]], tuple[Float[Array, "residuals"], Float[Array, "residuals n"]]]
+# The objective as a function of the unknowns z, given how to differentiate the simulation in them; infinite where it
+# fails.
+Objective = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[Array, ""]]
 
 # Damping of the first step of Levenberg–Marquardt, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
 
 
+class Linearised(NamedTuple):
+    """A model of an objective at one point: its gradient is `Jᵀ r`, and `Jᵀ J` approximates its second derivatives.
+
+    **Fields:** `residuals` r and their `jacobian` J, infinite where the simulation fails; `objective`, default
+    `½ |r|²`.
+    """
+
+    residuals: Any
+    jacobian: Any
+    objective: Any = None
+
+    @property
+    def value(self) -> float:
+        """The objective."""
+        return float(0.5 * self.residuals @ self.residuals if self.objective is None else self.objective)
+
+
 class Minimum(NamedTuple):
-    """The end of an iteration: `z`, the number of trials, and whether it converged."""
+    """The end of an iteration: `z`, the number of trials, whether it converged, and the objective."""
 
     z: Float[Array, "n"]
     iterations: int
     success: bool
+    value: float
 
 
-def levenberg_marquardt(linearised: Linearised, z: Float[Array, "n"], tol: float, limit: int) -> Minimum:
-    """Minimise `½ |r(z)|²`; trials that fail are rejected.
+def levenberg_marquardt(
+    linearised: Callable[[Float[Array, "n"]], Any],
+    z: Float[Array, "n"],
+    tol: float,
+    limit: int,
+    held: np.ndarray | None = None,
+) -> Minimum:
+    """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt). The damping μ follows
     the gain, the ratio of the decrease of the objective to that of the linear model.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
-    **Arguments:** `linearised`: residuals and their Jacobian; `tol`: change of the unknowns and of the objective at
-    which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`.
+    **Arguments:** `linearised`: residuals and their Jacobian, or a `Linearised`; `tol`: change of the unknowns and of
+    the objective at which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`;
+    `held`: a mask of the unknowns that stay as they are.
     """
-    residuals, jacobian = map(np.asarray, linearised(z))
-    objective = 0.5 * residuals @ residuals
+    return minimise_together(lambda zs: [linearised(zs[0])], [z], tol, limit, held)[0]
+
+
+def minimise_together(
+    linearised: Callable[[list[Array]], list[Any]],
+    starts: Sequence[Float[Array, "n"]],
+    tol: float,
+    limit: int,
+    held: np.ndarray | None = None,
+) -> list[Minimum]:
+    """`levenberg_marquardt` from several starts, whose trials are evaluated together."""
+    runs = [_trials(z, tol, limit, held) for z in starts]
+    points = [next(run) for run in runs]
+    found: dict[int, Minimum] = {}
+    while len(found) < len(runs):
+        models = linearised(points)
+        for k, run in enumerate(runs):
+            if k not in found:
+                try:
+                    points[k] = run.send(Linearised(*models[k]))
+                except StopIteration as end:
+                    found[k] = end.value
+    return [found[k] for k in range(len(runs))]
+
+
+def _trials(
+    z: Float[Array, "n"], tol: float, limit: int, held: np.ndarray | None
+) -> Generator[Float[Array, "n"], Linearised, Minimum]:
+    """The iteration: it yields trials, and is sent the model of the objective there."""
+    free = np.ones(z.size, bool) if held is None else ~held
+
+    def at(point, model):
+        numbers = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
+        return point, *numbers, model.value
+
+    z, residuals, jacobian, objective = at(z, (yield z))
     damping, growth = _FIRST_DAMPING, 2.0
     for iteration in range(1, limit):
         norms = np.linalg.norm(jacobian, axis=0)
         weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
         rows, target = np.vstack([jacobian, np.diag(weights)]), np.append(-residuals, np.zeros_like(weights))
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        trial = z + jnp.asarray(step, z.dtype)
-        trial_residuals, trial_jacobian = map(np.asarray, linearised(trial))
-        trial_objective = 0.5 * trial_residuals @ trial_residuals
-        decrease = objective - trial_objective
+        whole = np.zeros(z.size)
+        whole[free] = step
+        point = z + jnp.asarray(whole, z.dtype)
+        trial = at(point, (yield point))
+        decrease = objective - trial[-1]
         predicted = 0.5 * step @ (weights**2 * step - jacobian.T @ residuals)
         gain = decrease / predicted if predicted > 0 else 0.0
-        converged = np.all(np.abs(step) <= tol * (1 + np.abs(z))) and abs(decrease) <= tol * (1 + objective)
+        small = np.all(np.abs(whole) <= tol * (1 + np.abs(z)))
+        converged = small and abs(decrease) <= tol * (1 + abs(objective))
         if gain > 0:
             damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
-            z, residuals, jacobian, objective = trial, trial_residuals, trial_jacobian, trial_objective
+            z, residuals, jacobian, objective = trial
         else:
             damping, growth = damping * growth, 2 * growth
         if converged:
-            return Minimum(z, iteration + 1, True)
-    return Minimum(z, limit, False)
+            return Minimum(z, iteration + 1, True, objective)
+    return Minimum(z, limit, False, objective)
 
 
 def descend(
-    optimiser: optax.GradientTransformation, residuals: Residuals, z: Float[Array, "n"], tol: float, limit: int
+    optimiser: optax.GradientTransformation, objective: Objective, z: Float[Array, "n"], tol: float, limit: int
 ) -> Minimum:
-    """Minimise half the mean square, with reverse-mode derivatives; where a trial fails, half its step is taken.
+    """Minimise an objective, with reverse-mode derivatives; where a trial fails, half its step is taken.
 
     **Arguments:** `tol`: size of a step at which to stop; `limit`: largest number of trials.
     """
     memory = optimiser.init(z)
     best, best_value, good = z, np.inf, z
     for iteration in range(limit):
-        value, finite, step, ahead = _step(residuals, optimiser, z, memory)
+        value, finite, step, ahead = _step(objective, optimiser, z, memory)
         if not bool(finite):
             z = 0.5 * (good + z)
             continue
@@ -83,14 +142,14 @@ def descend(
             best, best_value = z, float(value)
         good, memory, z = z, ahead, z + step
         if float(jnp.max(jnp.abs(step))) <= tol:
-            return Minimum(best, iteration + 1, True)
-    return Minimum(best, limit, False)
+            return Minimum(best, iteration + 1, True, best_value)
+    return Minimum(best, limit, False, best_value)
 
 
 @eqx.filter_jit
-def _step(residuals: Residuals, optimiser: optax.GradientTransformation, z: Float[Array, "n"], memory: Any):
+def _step(objective: Objective, optimiser: optax.GradientTransformation, z: Float[Array, "n"], memory: Any):
     def loss(z):
-        return 0.5 * jnp.mean(residuals(z, None) ** 2)
+        return objective(z, None)
 
     value, gradient = jax.value_and_grad(loss)(z)
     finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))

@@ -37,6 +37,23 @@ class AbstractRange(eqx.Module):
     def __call__(self, z: Float[Array, "n"]) -> Array:
         """The parameter's value; `start` at zero."""
 
+    @abc.abstractmethod
+    def locate(self, value: Array) -> Float[Array, "n"]:
+        """The vector `z` of a value."""
+
+    @property
+    def componentwise(self) -> bool:
+        """Whether every component of the value belongs to one component of `z`."""
+        return self.size == self.start.size
+
+    def free_components(self, value: Array) -> Float[Array, "n"]:
+        """As many components of a value as determine it."""
+        return value.reshape(-1)
+
+    def draw(self, random: np.random.Generator) -> Float[Array, "n"]:
+        """A vector somewhere in the range, not far from the start."""
+        return jnp.asarray(random.standard_normal(self.size), self.start.dtype)
+
 
 class Line(AbstractRange):
     """Any value: `start + scale z`."""
@@ -46,6 +63,9 @@ class Line(AbstractRange):
 
     def __call__(self, z):
         return self.start + self.scale * z.reshape(self.start.shape)
+
+    def locate(self, value):
+        return ((value - self.start) / self.scale).reshape(-1)
 
 
 class HalfLine(AbstractRange):
@@ -57,6 +77,9 @@ class HalfLine(AbstractRange):
     def __call__(self, z):
         return self.bound + (self.start - self.bound) * jnp.exp(z.reshape(self.start.shape))
 
+    def locate(self, value):
+        return jnp.log((value - self.bound) / (self.start - self.bound)).reshape(-1)
+
 
 class Interval(AbstractRange):
     """Values between two bounds: a logistic curve of `z`."""
@@ -66,9 +89,18 @@ class Interval(AbstractRange):
     high: Array
 
     def __call__(self, z):
-        share = (self.start - self.low) / (self.high - self.low)
-        at_start = jnp.log(share) - jnp.log1p(-share)
-        return self.low + (self.high - self.low) * jax.nn.sigmoid(at_start + z.reshape(self.start.shape))
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(self._logit(self.start) + z.reshape(self.start.shape))
+
+    def locate(self, value):
+        return (self._logit(value) - self._logit(self.start)).reshape(-1)
+
+    def draw(self, random):
+        # Between two bounds every value is as likely as any other.
+        return self.locate(self.low + (self.high - self.low) * random.uniform(size=self.start.shape))
+
+    def _logit(self, value):
+        share = (value - self.low) / (self.high - self.low)
+        return jnp.log(share) - jnp.log1p(-share)
 
 
 class PositiveDefinite(AbstractRange):
@@ -82,11 +114,62 @@ class PositiveDefinite(AbstractRange):
         return n * (n + 1) // 2
 
     def __call__(self, z):
-        n = self.start.shape[0]
-        lower = jnp.zeros_like(self.start).at[np.tril_indices(n)].set(z)
+        lower = jnp.zeros_like(self.start).at[self._below].set(z)
         diagonal = jnp.diag(lower)
         factor = jnp.linalg.cholesky(self.start) @ (lower + jnp.diag(jnp.exp(diagonal) - diagonal))
         return factor @ factor.T
+
+    def locate(self, value):
+        lower = jnp.linalg.solve(jnp.linalg.cholesky(self.start), jnp.linalg.cholesky(value))
+        diagonal = jnp.diag(lower)
+        return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
+
+    def free_components(self, value):
+        return value[self._below]
+
+    @property
+    def _below(self):
+        return np.tril_indices(self.start.shape[0])
+
+
+class Inertia(AbstractRange):
+    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
+
+    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite. About the mass centre, which is
+    where bodies have their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive
+    definite if both are.
+
+    Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
+    Letters 7(2), 2022.
+    """
+
+    start: Array
+
+    @property
+    def size(self):
+        return 6
+
+    def __call__(self, z):
+        return _second_moments_to_inertia(self._moments(z))
+
+    def locate(self, value):
+        return self._moments.locate(second_moments(value))
+
+    def free_components(self, value):
+        return self._moments.free_components(value)
+
+    @property
+    def _moments(self):
+        return PositiveDefinite(second_moments(self.start))
+
+
+def second_moments(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """`Σ = ½ tr(I) 1 − I` of an inertia matrix [kg m²]."""
+    return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
+
+
+def _second_moments_to_inertia(moments):
+    return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
 
 class FreeParameters(eqx.Module):
@@ -109,6 +192,23 @@ class FreeParameters(eqx.Module):
         """All values, raveled one after the other."""
         return jnp.concatenate([value.reshape(-1) for value in self(z).values()])
 
+    def locate(self, values: Mapping[str, Array]) -> Float[Array, "n"]:
+        """The vector of values by name."""
+        return jnp.concatenate([r.locate(values[name]) for name, r in zip(self.names, self.ranges, strict=True)])
+
+    def log_volume(self, z: Float[Array, "n"]) -> Float[Array, ""]:
+        """`log |∂ values / ∂ z|`, of as many components of the values as determine them."""
+        parts = jnp.split(z, np.cumsum([r.size for r in self.ranges])[:-1])
+        each = zip(self.ranges, parts, strict=True)
+        ahead = [jax.jacfwd(lambda z, r=r: r.free_components(r(z)))(part) for r, part in each]
+        return jnp.sum(jnp.stack([jnp.linalg.slogdet(matrix)[1] for matrix in ahead]))
+
+    def place(self, name: str) -> slice:
+        """Where the components of a parameter stand in the vector."""
+        number = self.names.index(name)
+        first = sum(r.size for r in self.ranges[:number])
+        return slice(first, first + self.ranges[number].size)
+
 
 def free_parameters(
     system: AbstractSystem,
@@ -126,6 +226,23 @@ def free_parameters(
     bounds.
     """
     known = parameters(system)
+    starts = starting_values(free, known)
+    for name in bounds or {}:
+        if name not in starts:
+            raise unknown("free parameter with bounds", name, starts)
+    bounds = design_bounds(system, bounds)
+    positive = system.positive_parameters()
+    ranges = [
+        range_of(name, value, known[name], bounds.get(name), positive=name in positive)
+        for name, value in starts.items()
+    ]
+    return FreeParameters(tuple(starts), tuple(ranges))
+
+
+def starting_values(
+    free: Mapping[str, VectorLike | None] | Sequence[str], known: Mapping[str, Array]
+) -> dict[str, VectorLike]:
+    """Starting values by name; those that are not given are the known ones."""
     if isinstance(free, str):
         free = (free,)
     if not free:
@@ -133,30 +250,25 @@ def free_parameters(
     for name in free:
         if name not in known:
             raise unknown("parameter", name, known)
-    starts = free if isinstance(free, Mapping) else {name: known[name] for name in free}
-    for name in bounds or {}:
-        if name not in starts:
-            raise unknown("free parameter with bounds", name, starts)
-    bounds = design_bounds(system, bounds)
-    positive = system.positive_parameters()
-    ranges = [
-        _range(name, value, known[name], bounds.get(name), positive=name in positive) for name, value in starts.items()
-    ]
-    return FreeParameters(tuple(starts), tuple(ranges))
+    given = free if isinstance(free, Mapping) else dict.fromkeys(free)
+    return {name: known[name] if value is None else value for name, value in given.items()}
 
 
-def _range(name: str, start: Any, own: Array, bounds: Bounds | None, *, positive: bool) -> AbstractRange:
+def range_of(
+    name: str, start: Any, own: Array, bounds: Bounds | None, *, positive: bool, scale: Array | None = None
+) -> AbstractRange:
+    """The range of one parameter.
+
+    **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether it stays positive, or a matrix
+    of inertia; `scale`: a typical change, default the size of the start.
+    """
     value = jnp.asarray(start, own.dtype)
     if value.shape != own.shape:
         raise ValueError(f"Parameter {name!r} has shape {own.shape}, got a start of shape {value.shape}.")
     if not np.all(np.isfinite(value)):
         raise ValueError(f"The start of {name!r} must be finite, got {start}.")
     if positive and value.ndim == 2:
-        if bounds is not None:
-            raise ValueError(f"{name!r} is a matrix and stays positive definite; it takes no bounds.")
-        if not np.allclose(value, value.T) or np.any(np.linalg.eigvalsh(value) <= 0):
-            raise ValueError(f"The start of {name!r} must be a symmetric positive definite matrix.")
-        return PositiveDefinite(value)
+        return _inertia(name, value, bounds)
     if bounds is None:
         bounds = (0.0, None) if positive else (None, None)
     low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
@@ -166,9 +278,25 @@ def _range(name: str, start: Any, own: Array, bounds: Bounds | None, *, positive
         return Interval(value, low, high)
     if np.all(np.isfinite(low)) or np.all(np.isfinite(high)):
         return HalfLine(value, low if np.all(np.isfinite(low)) else high)
+    if scale is not None:
+        return Line(value, jnp.broadcast_to(scale, value.shape))
     largest = jnp.max(jnp.abs(value))
     typical = jnp.where(largest > 0, largest, jnp.ones_like(largest))
     return Line(value, jnp.where(value == 0, typical, jnp.abs(value)))
+
+
+def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:
+    if bounds is not None:
+        raise ValueError(f"{name!r} is a matrix and stays that of a body; it takes no bounds.")
+    if not np.allclose(value, value.T) or np.any(np.linalg.eigvalsh(value) <= 0):
+        raise ValueError(f"The start of {name!r} must be a symmetric positive definite matrix.")
+    least = np.min(np.linalg.eigvalsh(second_moments(value)))
+    if least <= 1e-9 * np.trace(value):
+        raise ValueError(
+            f"The start of {name!r} is not the inertia of a body with an extent in every direction: the largest "
+            "principal moment must be smaller than the sum of the other two. Start from a slightly thicker body."
+        )
+    return Inertia(value)
 
 
 def _bound(name: str, value: Array, bound: ArrayLike | None, empty: float) -> Array:

@@ -1,0 +1,78 @@
+"""How well data determine unknowns: covariances, and the combinations that make no difference."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+# Directions of unknowns to which the residuals are less sensitive than this, relative to the strongest direction, are
+# not determined.
+_UNDETERMINED = 1e-6
+# Components with at least this share in such a direction are named.
+_SHARE = 0.1
+
+
+class Covariance(NamedTuple):
+    """What a linearised fit says of its unknowns.
+
+    **Fields:** `matrix`: covariance of the components, infinite on the diagonal where they are not determined; `root`:
+    its factor along the directions that are determined, components × directions; `lost`: the others, components ×
+    directions; `undetermined`: mask of the components that have a share in one of these; `noise`: the factor of the
+    standard deviations that the residuals show, 1 where it is known.
+    """
+
+    matrix: Float[np.ndarray, "components components"]
+    root: Float[np.ndarray, "components strong"]
+    lost: Float[np.ndarray, "components weak"]
+    undetermined: np.ndarray
+    noise: float
+
+
+def covariance(
+    jacobian: Float[np.ndarray, "rows n"],
+    ahead: Float[np.ndarray, "components n"],
+    squares: float | None,
+    count: int,
+) -> Covariance:
+    """The covariance of a fit.
+
+    **Arguments:** `jacobian` of the weighted residuals along n directions; `ahead`: changes of the components along
+    them; `squares`: sum of the `count` squared residuals of data, which estimates the noise if it is not known.
+    """
+    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
+    sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
+    weak = sizes <= _UNDETERMINED * sizes[0]
+    root = ahead @ (directions[~weak] / sizes[~weak][:, None]).T
+    lost = ahead @ directions[weak].T
+    surplus = count - int(np.sum(~weak))
+    noise = 1.0
+    if squares is not None:
+        noise = np.sqrt(squares / surplus) if surplus > 0 else np.nan
+    root = root * noise
+    matrix = root @ root.T
+    undetermined = np.max(np.abs(lost), axis=1, initial=0.0) > _SHARE * np.max(np.abs(ahead), axis=1)
+    matrix[undetermined, :] = matrix[:, undetermined] = 0.0
+    matrix[undetermined, undetermined] = np.inf
+    return Covariance(matrix, root, lost, undetermined, float(noise))
+
+
+def combinations(components: tuple[str, ...], values: np.ndarray, found: Covariance) -> tuple[dict[str, float], ...]:
+    """The changes, relative to the values, that together make no difference: one dictionary for each direction.
+
+    The largest change of a direction is one; components that hardly change are left out. Directions are chosen such
+    that they share as few components as possible.
+    """
+    size = np.where(values == 0, 1.0, np.abs(values))
+    relative = found.lost / size[:, None]
+    relative = relative[:, np.max(np.abs(relative), axis=0, initial=0.0) > 0]
+    basis, left = [], relative.copy()
+    for _ in range(relative.shape[1]):
+        row, column = np.unravel_index(np.argmax(np.abs(left)), left.shape)
+        direction = left[:, column] / left[row, column]
+        left = np.delete(left - np.outer(direction, left[row]), column, axis=1)
+        basis = [own - own[row] * direction for own in basis] + [direction]
+    out = []
+    for direction in basis:
+        direction = direction / direction[np.argmax(np.abs(direction))]
+        out.append({name: float(x) for name, x in zip(components, direction, strict=True) if abs(x) > 1e-3})
+    return tuple(out)

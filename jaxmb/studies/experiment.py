@@ -1,0 +1,266 @@
+"""One measured motion: what was measured, from which initial state, and what was different from other ones."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from .._results import RESULTS
+from .._types import Scalar, State, VectorLike
+from ..parts.names import unknown
+from ..simulate import simulate
+from ..states.assembly import assemble
+from ..system import AbstractSystem, parameters, with_parameters
+from ..trajectory import Trajectory
+from .sensors import Channel, Rows, Sensor, readings_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One measured motion, for `identify`.
+
+    **Arguments:**
+
+    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
+    - `inputs`: as of `simulate`.
+    - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
+    - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
+    - `name`: in front of these unknowns; default `"exp1"`, `"exp2"`, ….
+    - `held_out`: whether the data are only predicted, for `Identification.held_out`, and not fitted.
+    """
+
+    measured: Mapping[str, VectorLike] | None = None
+    _: dataclasses.KW_ONLY
+    ts: ArrayLike
+    state: State | None = None
+    fix: Mapping[str, VectorLike] | None = None
+    rates: Mapping[str, VectorLike] | None = None
+    t0: Scalar = 0.0
+    inputs: Any = None
+    parameters: Mapping[str, VectorLike] | None = None
+    own: Sequence[str] = ()
+    free_initial: Sequence[str] | Mapping[str, VectorLike] = ()
+    sigma: Mapping[str, VectorLike] | None = None
+    residual: Callable[[Trajectory], Array] | None = None
+    name: str | None = None
+    held_out: bool = False
+
+
+class Initial(NamedTuple):
+    """An unknown of the initial state: the coordinate or the rate of this name."""
+
+    name: str
+    is_rate: bool
+
+
+class Seen(NamedTuple):
+    """What a simulation with some parameters shows: the misfit, the predicted readings by sensor, the state at the last
+    time, and how the simulation ended. Where it failed the misfit is infinite.
+    """
+
+    rows: Rows
+    readings: dict[str, Array]
+    end: State
+    result: RESULTS
+
+
+class Trial(eqx.Module):
+    """An experiment as a function of its unknowns, which are called without the experiment's name.
+
+    **Fields:** `unknowns`: their names and shapes; `changed`: which of them are parameters of the system; `initial`:
+    which are of the initial state.
+    """
+
+    unknowns: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+    changed: tuple[str, ...] = eqx.field(static=True)
+    initial: tuple[tuple[str, Initial], ...] = eqx.field(static=True)
+    channels: tuple[Channel, ...]
+    residual: Callable[[Trajectory], Array] | None
+    known: dict[str, Array]
+    state: State
+    fix: dict[str, Array]
+    rates: dict[str, Array]
+    t0: Array
+    ts: Float[Array, "times"]
+    inputs: Any
+
+    @property
+    def size(self) -> float:
+        """The size of what is measured, in units of the noise."""
+        return 1 + max((channel.size for channel in self.channels), default=0.0)
+
+    def named(self, flat: Float[Array, "values"]) -> dict[str, Array]:
+        """Unknowns by name, from all of them one after the other."""
+        ends = np.cumsum([int(np.prod(shape)) for _, shape in self.unknowns])
+        parts = jnp.split(flat, ends[:-1])
+        return {name: part.reshape(shape) for (name, shape), part in zip(self.unknowns, parts, strict=True)}
+
+    def changed_system(self, system: AbstractSystem, theta: Mapping[str, Array]) -> AbstractSystem:
+        """The system with these unknowns."""
+        return with_parameters(system, self.known | {name: theta[name] for name in self.changed})
+
+    def start(self, system: AbstractSystem, theta: Mapping[str, Array]) -> tuple[AbstractSystem, State]:
+        """The system with these unknowns, and its initial state; not a number if there is none."""
+        system = self.changed_system(system, theta)
+        fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
+        rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
+        return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=False)
+
+    def simulated(
+        self,
+        system: AbstractSystem,
+        state: State,
+        ts: Float[Array, "saved"],
+        options: Mapping[str, Any],
+        adjoint: diffrax.AbstractAdjoint | None,
+    ) -> Trajectory:
+        """The motion from an initial state."""
+        own = {} if self.inputs is None else {"inputs": self.inputs}
+        return simulate(
+            system, state, t0=self.t0, t1=ts[-1], saveat=ts, adjoint=adjoint, throw=False, **(dict(options) | own)
+        )
+
+    def seen(
+        self,
+        system: AbstractSystem,
+        state: State,
+        theta: Mapping[str, Array],
+        options: Mapping[str, Any],
+        adjoint: diffrax.AbstractAdjoint | None,
+    ) -> Seen:
+        """What the sensors show of the motion from an initial state."""
+        late = [channel for channel in self.channels if channel.delayed]
+        series = [self.ts, *(channel.times(self.ts, self.t0, theta) for channel in late)]
+        saved = jnp.concatenate(series) if late else self.ts
+        # Sensors with a delay see the motion at other times: all of them are saved in order.
+        order = jnp.argsort(saved) if late else np.arange(saved.size)
+        trajectory = self.simulated(system, state, saved[order] if late else saved, options, adjoint)
+        places = jnp.argsort(order).reshape(len(series), -1) if late else np.arange(saved.size)[None]
+        readings, rows = {}, []
+        for channel in self.channels:
+            own = places[1 + late.index(channel) if channel.delayed else 0]
+            quantity = trajectory.quantity(channel.quantity)
+            readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
+            rows.append(channel.rows(readings[channel.name], theta))
+        if self.residual is not None:
+            rows.append(_of_user(self.residual(trajectory)))
+        joined = Rows(
+            jnp.concatenate([own.residuals for own in rows]),
+            jnp.concatenate([own.present for own in rows]),
+            jnp.concatenate([own.scores for own in rows]),
+            jnp.sum(jnp.stack([own.objective for own in rows])),
+        )
+        ok = (trajectory.result == RESULTS.successful) & jnp.isfinite(joined.objective)
+        fails = lambda x: jnp.where(ok, x, jnp.inf)
+        joined = Rows(fails(joined.residuals), joined.present, fails(joined.scores), fails(joined.objective))
+        end = State(trajectory.ys.q[-1], trajectory.ys.u[-1])
+        return Seen(joined, readings, end, trajectory.result)
+
+
+def _of_user(residuals) -> Rows:
+    residuals = jnp.asarray(residuals).reshape(-1)
+    present = jnp.ones(residuals.shape, bool)
+    return Rows(residuals, present, jnp.zeros((0,), residuals.dtype), 0.5 * jnp.sum(residuals**2))
+
+
+def checked_times(ts: ArrayLike, t0: Scalar) -> Float[Array, "times"]:
+    """Measured times, or a `ValueError` that says what is wrong with them."""
+    times = np.asarray(ts, dtype=float)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(f"ts must be a vector of increasing times, got shape {times.shape}.")
+    if not np.all(np.isfinite(times)):
+        place = int(np.flatnonzero(~np.isfinite(times))[0])
+        raise ValueError(f"ts must be a vector of increasing times, but ts[{place}] is {times[place]}; leave it out.")
+    if np.any(np.diff(times) <= 0):
+        place = int(np.flatnonzero(np.diff(times) <= 0)[0])
+        raise ValueError(
+            f"ts must be a vector of increasing times, but ts[{place + 1}] = {times[place + 1]:g} follows "
+            f"{times[place]:g}; sort the samples, one at each time."
+        )
+    if times[0] < t0 or times[-1] <= t0:
+        raise ValueError(f"ts must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
+    return jnp.asarray(times, dtype=jnp.result_type(float))
+
+
+def channels_of(
+    system: AbstractSystem,
+    experiment: Experiment,
+    sensors: Mapping[str, Sensor],
+    sigma: Mapping[str, VectorLike] | None,
+    free: frozenset[str],
+    ts: Float[Array, "times"],
+) -> tuple[Channel, ...]:
+    """The readings of an experiment, checked.
+
+    **Arguments:** `free`: names of unknowns, without the experiment's.
+    """
+    measured, residual = experiment.measured, experiment.residual
+    if (measured is None) == (residual is None):
+        raise ValueError("Give either measured quantities by name or a residual function.")
+    if measured is None:
+        if experiment.sigma is not None:
+            raise ValueError("sigma belongs to measured quantities; a residual function does its own weighting.")
+        return ()
+    if not measured:
+        raise ValueError("measured is empty: give at least one quantity by name.")
+    shapes = {name: own.shape for name, own in system.quantities().items()}
+    known = dict.fromkeys((*sensors, *shapes))
+    for name in (*measured, *(experiment.sigma or {})):
+        if name not in known:
+            raise unknown("quantity", name, known)
+    for name in experiment.sigma or {}:
+        if name not in measured:
+            raise ValueError(f"sigma is given for {name!r}, which is not measured.")
+    own = dict(sigma or {}) | dict(experiment.sigma or {})
+    out, levels = [], {}
+    for name, data in measured.items():
+        sensor = sensors.get(name, Sensor(name))
+        deviation = own.get(name, sensor.sigma)
+        levels[name] = deviation is not None or f"{name}.sigma" in free
+        shape = shapes[sensor.quantity]
+        late = f"{name}.delay" in free
+        out.append(readings_of(sensor, data, deviation, shape, ts.shape[0], ts.dtype, late))
+    if any(levels.values()) and not all(levels.values()):
+        missing = next(name for name, there in levels.items() if not there)
+        raise ValueError(f"sigma is given for other quantities but not for {missing!r}; give all or none.")
+    return tuple(out)
+
+
+def initial_unknown(system: AbstractSystem, name: str) -> Initial:
+    """The coordinate or the rate, `"crank.angle"` or `"crank.angle.rate"`, of an initial state."""
+    coordinates, rates = system.coordinate_names(), system.rate_names()
+    if name in coordinates:
+        fixed = np.zeros(system.nq, bool)
+        fixed[coordinates[name]] = True
+        if system.normalize_fixed(system.guess.q, fixed)[1]:
+            raise ValueError(
+                f"{name!r} cannot be free: its components are not independent of each other. Free a joint's coordinate."
+            )
+        return Initial(name, False)
+    rate = name.removesuffix(".rate")
+    if rate in rates:
+        return Initial(rate, True)
+    raise unknown("initial coordinate or rate", name, [*coordinates, *(f"{rate}.rate" for rate in rates)])
+
+
+def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:
+    """The parameters that are known for an experiment alone."""
+    known = parameters(system)
+    out = {}
+    for name, value in (experiment.parameters or {}).items():
+        if name not in known:
+            raise unknown("parameter", name, known)
+        out[name] = jnp.asarray(value, known[name].dtype)
+        if out[name].shape != known[name].shape:
+            raise ValueError(f"Parameter {name!r} has shape {known[name].shape}, got {out[name].shape}.")
+    return out
+
+
+def arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Bool[Array, "..."]]:
+    """Numbers by name as arrays."""
+    return {name: jnp.asarray(value, jnp.result_type(float)) for name, value in (values or {}).items()}

@@ -1,0 +1,43 @@
+"""Where an identification ended, for the studies that go on from it."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array
+
+from .covariance import Covariance
+from .problem import Problem
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The problem, the point where the iteration ended, and what is known of it there.
+
+    **Fields:** `z`: the vector of the unknowns, and `values` by name; `components`: the names of all scalar components
+    of these; `objective`: minus the logarithm of likelihood and prior; `residuals` of the data, weighted; `jacobian` of
+    all rows, and `readings`: the predicted ones by experiment and sensor; `known_noise`: whether the noise level of
+    every reading is known, or an unknown of its own; `segments`: of multiple shooting.
+    """
+
+    problem: Problem
+    z: Array
+    values: dict[str, np.ndarray]
+    components: tuple[str, ...]
+    objective: float
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    covariance: Covariance
+    readings: dict[str, dict[str, Any]]
+    known_noise: bool
+    success: bool
+    segments: int
+    tol: float
+    max_iterations: int
+
+    def whole_motions(self, what: str) -> None:
+        """Raise a `ValueError` for what needs simulations from start to end, after multiple shooting."""
+        if self.segments > 1:
+            raise ValueError(
+                f"{what} simulates whole motions; identify again with segments=1, from the estimates as starts."
+            )

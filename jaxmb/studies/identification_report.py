@@ -1,0 +1,121 @@
+"""An identification on one page: the table, the fit, the residuals, correlations and profiles."""
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .fit import Fit
+from .prediction import held_out
+from .profile import Profile, profile
+
+_STYLE = (
+    "body{font-family:sans-serif;max-width:60em;margin:2em auto}table{border-collapse:collapse}"
+    "td,th{padding:.2em .8em;text-align:right;border-bottom:1px solid #ccc}img{max-width:100%}"
+)
+
+
+def write_report(
+    fit: Fit,
+    path: str | Path,
+    *,
+    message: str,
+    start: np.ndarray,
+    deviations: np.ndarray,
+    combinations: Sequence[dict[str, float]],
+    profiles: Sequence[str],
+) -> Path:
+    """As `Identification.report`."""
+    path = Path(path)
+    path = path if path.suffix == ".html" else path / "identification.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = np.concatenate([np.ravel(value) for value in fit.values.values()])
+    rows = zip(fit.components, start, values, deviations, strict=True)
+    parts = [
+        "<h1>Identification</h1>",
+        _table(
+            ("parameter", "start", "estimate", "standard deviation"),
+            [(name, f"{a:.6g}", f"{b:.6g}", f"{c:.2g}") for name, a, b, c in rows],
+        ),
+        f"<p>{html.escape(message)}</p><p>{fit.residuals.size} residuals, rms "
+        f"{np.sqrt(np.mean(fit.residuals**2)):.3g}</p>",
+    ]
+    for direction in combinations:
+        text = ", ".join(f"{name} {100 * share:+.3g} %" for name, share in direction.items())
+        parts.append(f"<p>The data do not change with {html.escape(text)} together.</p>")
+    for name, trial, fitted in zip(fit.problem.names, fit.problem.trials, fit.problem.fitted, strict=True):
+        readings = fit.readings[name] if fitted else held_out(fit)[name].readings
+        for channel in trial.channels:
+            label = " ".join(filter(None, (name, channel.name, "" if fitted else "(held out)")))
+            parts += [f"<h2>{html.escape(label)}</h2>", _fit_figure(trial, channel, np.asarray(readings[channel.name]))]
+    if len(fit.components) > 1:
+        parts += ["<h2>Correlations</h2>", _correlations(fit)]
+    for component in profiles:
+        parts += [f"<h2>Profile of {html.escape(component)}</h2>", _profile_figure(profile(fit, component))]
+    page = f"<!doctype html><meta charset='utf-8'><title>Identification</title><style>{_STYLE}</style>"
+    path.write_text(page + "\n".join(parts), encoding="utf-8")
+    return path
+
+
+def _table(header, rows) -> str:
+    line = lambda tag, cells: "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+    return "<table>" + line("th", header) + "".join(line("td", row) for row in rows) + "</table>"
+
+
+def _axes(rows: int, height: float) -> tuple[Any, Any]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError("A report needs Matplotlib: pip install jaxmb[plot]") from None
+    figure = Figure(figsize=(8, height), layout="constrained")
+    return figure, figure.subplots(rows, squeeze=False)[:, 0]
+
+
+def _image(figure: Any) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=120)
+    return f"<img src='data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}'>"
+
+
+def _fit_figure(trial, channel, predicted) -> str:
+    """Measured samples and the fit above, what is between them below."""
+    figure, (above, below) = _axes(2, 5.0)
+    ts = np.asarray(trial.ts)
+    measured = np.where(channel.present, channel.values, np.nan).reshape(ts.size, -1)
+    predicted = predicted.reshape(ts.size, -1)
+    for k in range(measured.shape[1]):
+        above.plot(ts, measured[:, k], ".", color=f"C{k}", markersize=3)
+        above.plot(ts, predicted[:, k], "-", color=f"C{k}", linewidth=1)
+        below.plot(ts, measured[:, k] - predicted[:, k], ".", color=f"C{k}", markersize=3)
+    above.set_ylabel("measured and fitted")
+    below.set_ylabel("measured − fitted")
+    below.set_xlabel("time [s]")
+    below.axhline(0, color="0.7", linewidth=0.8)
+    return _image(figure)
+
+
+def _correlations(fit: Fit) -> str:
+    deviations = np.sqrt(np.diag(fit.covariance.matrix))
+    correlations = fit.covariance.matrix / np.outer(deviations, deviations)
+    correlations[~np.isfinite(correlations)] = np.nan
+    figure, (axes,) = _axes(1, 1.5 + 0.4 * len(fit.components))
+    image = axes.imshow(correlations, vmin=-1, vmax=1, cmap="RdBu")
+    axes.set_xticks(range(len(fit.components)), fit.components, rotation=90)
+    axes.set_yticks(range(len(fit.components)), fit.components)
+    figure.colorbar(image, ax=axes)
+    return _image(figure)
+
+
+def _profile_figure(found: Profile) -> str:
+    figure, (axes,) = _axes(1, 3.0)
+    axes.plot(found.values, found.ratios, "o-")
+    for end in found.interval:
+        if np.isfinite(end):
+            axes.axvline(end, color="0.6", linestyle="--")
+    axes.set_xlabel(found.component)
+    axes.set_ylabel("2 log of the likelihood ratio")
+    return _image(figure)

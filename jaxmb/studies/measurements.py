@@ -1,0 +1,116 @@
+"""Measured data from files and tables."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..parts.names import unknown
+
+_MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
+
+
+class Measurements(NamedTuple):
+    """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, as `identify` takes them:
+    `identify(system, data.values, ts=data.ts, …)`.
+    """
+
+    ts: np.ndarray
+    values: dict[str, np.ndarray]
+
+
+def read_measurements(
+    source: str | Path | Any, columns: Mapping[str, str | Sequence[str]] | None = None, *, time: str = "t"
+) -> Measurements:
+    """Read measured data from a CSV file with a header line, or from a DataFrame.
+
+    **Arguments:**
+
+    - `source`: the path of a file, or a table with `columns` and columns by name, such as those of pandas and polars.
+    - `columns`: for each quantity or sensor the name of its column, or of one column for each component:
+        `{"rod.angle": "phi", "rod.position": ["x", "y"]}`; default every column but that of time, by its own name.
+    - `time`: the column of times [s], which must increase.
+
+    **Returns:** `Measurements`; empty cells, and those that say `nan`, `NA` or `null`, are NaN, which marks a missing
+    sample.
+
+    **Raises:** `ValueError` naming missing and repeated columns, the line and column of a cell that is no number, times
+    that are missing or out of order, and tables with fewer than two rows. `FileNotFoundError` if there is no such file.
+    """
+    named = _of_file(Path(source)) if isinstance(source, str | Path) else _of_frame(source)
+    label = str(source) if isinstance(source, str | Path) else "The table"
+    if time not in named:
+        raise unknown("column of time", time, named)
+    columns = {name: name for name in named if name != time} if columns is None else columns
+    if not columns:
+        raise ValueError(f"{label} has no column but that of time.")
+    values = {}
+    for name, own in columns.items():
+        for column in (own,) if isinstance(own, str) else own:
+            if column not in named:
+                raise unknown("column", column, named)
+        values[name] = named[own] if isinstance(own, str) else np.stack([named[column] for column in own], axis=1)
+    ts = named[time]
+    if ts.size < 2:
+        raise ValueError(f"{label} has {ts.size} rows; there are too few data.")
+    if not np.all(np.isfinite(ts)):
+        raise ValueError(f"Column {time!r} has no number in row {int(np.flatnonzero(~np.isfinite(ts))[0]) + 1}.")
+    if np.any(np.diff(ts) <= 0):
+        row = int(np.flatnonzero(np.diff(ts) <= 0)[0]) + 1
+        raise ValueError(
+            f"Column {time!r} must increase, but {ts[row]:g} in row {row + 1} follows {ts[row - 1]:g}; "
+            "sort the rows, one at each time."
+        )
+    return Measurements(ts, values)
+
+
+def _of_file(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        text = file.read()
+    lines = [line for line in csv.reader(text.splitlines(), _dialect(text)) if any(cell.strip() for cell in line)]
+    if not lines:
+        raise ValueError(f"{path} is empty.")
+    header = [cell.strip() for cell in lines[0]]
+    repeated = sorted({name for name in header if header.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{path} has more than one column {repeated[0]!r}.")
+    for number, line in enumerate(lines[1:], 1):
+        if len(line) != len(header):
+            raise ValueError(f"{path} has {len(line)} cells in row {number}, and {len(header)} columns.")
+    return {
+        name: np.array([_number(path, name, row, line[k]) for row, line in enumerate(lines[1:], 1)], float)
+        for k, name in enumerate(header)
+    }
+
+
+def _dialect(text: str) -> Any:
+    first = text.splitlines()[0] if text.strip() else ""
+    delimiter = max(",;\t", key=first.count)
+    return type("_Dialect", (csv.excel,), {"delimiter": delimiter})
+
+
+def _number(path, column, row, cell) -> float:
+    cell = cell.strip()
+    if cell.lower() in _MISSING:
+        return np.nan
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"{path} has no number in row {row} of column {column!r}, but {cell!r}.") from None
+
+
+def _of_frame(frame: Any) -> dict[str, np.ndarray]:
+    names = [str(name) for name in getattr(frame, "columns", ())]
+    if not names:
+        raise ValueError(f"Measurements must be the path of a CSV file or a table with columns, got {frame!r}.")
+    if len(set(names)) < len(names):
+        raise ValueError("The table has columns of the same name.")
+    out = {}
+    for name, column in zip(names, frame.columns, strict=True):
+        try:
+            out[name] = np.asarray(frame[column].to_numpy(), float)
+        except (TypeError, ValueError):
+            raise ValueError(f"Column {name!r} of the table holds something that is no number.") from None
+    return out

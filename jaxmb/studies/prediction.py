@@ -1,0 +1,121 @@
+"""What the estimates predict, how certain that is, and how it compares with data that were held out."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtri
+from jaxtyping import ArrayLike
+
+from ..parts.names import unknown
+from .experiment import checked_times
+from .fit import Fit
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """Quantities of a motion with their uncertainty.
+
+    **Fields:** `ts` [s]; by name of the quantity `values`, their standard `deviations`, and the ends of the band that
+    holds the true value with probability `level`, `low` and `high`; times are axis 0. A deviation is infinite where the
+    quantity depends on what the data do not determine.
+    """
+
+    ts: np.ndarray
+    values: dict[str, np.ndarray]
+    deviations: dict[str, np.ndarray]
+    low: dict[str, np.ndarray]
+    high: dict[str, np.ndarray]
+    level: float
+
+
+def predict(
+    fit: Fit,
+    quantities: str | Sequence[str],
+    *,
+    ts: ArrayLike | None = None,
+    experiment: str | None = None,
+    level: float = 0.95,
+) -> Prediction:
+    """As `Identification.predict`."""
+    fit.whole_motions("A prediction")
+    problem = fit.problem
+    if experiment is not None and experiment not in problem.names:
+        raise unknown("experiment", experiment, problem.names)
+    number = 0 if experiment is None else problem.names.index(experiment)
+    trial = problem.trials[number]
+    names = (quantities,) if isinstance(quantities, str) else tuple(quantities)
+    for name in names:
+        if name not in problem.system.quantities():
+            raise unknown("quantity", name, problem.system.quantities())
+    ts = trial.ts if ts is None else checked_times(ts, float(trial.t0))
+    columns = problem.columns(number)
+    flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
+    values, jacobians = _predicted(problem.system, trial, problem.options, names, ts, flat)
+    found = fit.covariance
+    width = float(ndtri((1 + level) / 2))
+    out, deviations = {}, {}
+    for name in names:
+        jacobian = np.asarray(jacobians[name])
+        out[name] = np.asarray(values[name])
+        deviation = np.linalg.norm(jacobian @ found.root[columns], axis=-1)
+        if found.lost.shape[1]:
+            along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
+            size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
+            deviation = np.where(along > 1e-6 * size, np.inf, deviation)
+        deviations[name] = deviation
+    low = {name: out[name] - width * deviations[name] for name in names}
+    high = {name: out[name] + width * deviations[name] for name in names}
+    return Prediction(np.asarray(ts), out, deviations, low, high, level)
+
+
+@eqx.filter_jit
+def _predicted(system, trial, options, names, ts, flat) -> Any:
+    def fn(flat):
+        changed, state = trial.start(system, trial.named(flat))
+        trajectory = trial.simulated(changed, state, ts, options, diffrax.ForwardMode())
+        values = {name: trajectory.quantity(name) for name in names}
+        return values, values
+
+    if flat.size == 0:
+        values, _ = fn(flat)
+        return values, {name: jnp.zeros((*value.shape, 0)) for name, value in values.items()}
+    jacobians, values = jax.jacfwd(fn, has_aux=True)(flat)
+    return values, jacobians
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """How well data that were not fitted are predicted.
+
+    **Fields:** `residuals` of the samples, predicted minus measured, weighted by the noise level (by the range of the
+    readings where it is not known); `rms`: their root mean square; `readings`: predicted, by sensor.
+    """
+
+    residuals: np.ndarray
+    rms: float
+    readings: dict[str, np.ndarray]
+
+
+def held_out(fit: Fit) -> dict[str, HeldOut]:
+    """The prediction of every experiment that was held out, by its name."""
+    problem = fit.problem
+    values, out = problem.free(fit.z), {}
+    for number, (name, fitted) in enumerate(zip(problem.names, problem.fitted, strict=True)):
+        if fitted:
+            continue
+        seen = _seen(problem.system, problem.trials[number], problem.options, problem.own(number, values))
+        residuals = np.asarray(seen.rows.residuals)[np.asarray(seen.rows.present)]
+        readings = {sensor: np.asarray(reading) for sensor, reading in seen.readings.items()}
+        out[name] = HeldOut(residuals, float(np.sqrt(np.mean(residuals**2))), readings)
+    return out
+
+
+@eqx.filter_jit
+def _seen(system, trial, options, theta):
+    return trial.seen(*trial.start(system, theta), theta, options, diffrax.ForwardMode())

@@ -1,0 +1,198 @@
+"""The misfit of all experiments as a function of one vector of unknowns, with its linearisation."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._results import RESULTS
+from .._types import State
+from ..system import AbstractSystem
+from .experiment import Seen, Trial
+from .minimise import Linearised
+from .ranges import FreeParameters
+from .unknowns import Priors
+
+
+class Problem(eqx.Module):
+    """Experiments that share unknowns.
+
+    **Fields:** `names` of the experiments; `sources`: for each of them the names of its unknowns among all; `fitted`:
+    which of them are fitted, the others are held out.
+    """
+
+    system: AbstractSystem
+    free: FreeParameters
+    priors: Priors
+    names: tuple[str, ...] = eqx.field(static=True)
+    sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    fitted: tuple[bool, ...] = eqx.field(static=True)
+    trials: tuple[Trial, ...]
+    options: dict[str, Any]
+
+    def own(self, number: int, values: Mapping[str, Array]) -> dict[str, Array]:
+        """The unknowns of one experiment, by their names in it."""
+        names = self.trials[number].unknowns
+        return {name: values[source] for (name, _), source in zip(names, self.sources[number], strict=True)}
+
+    def start(self, number: int, z: Float[Array, "n"]) -> tuple[AbstractSystem, State]:
+        """The system of one experiment and its initial state."""
+        return self.trials[number].start(self.system, self.own(number, self.free(z)))
+
+    def objective(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Float[Array, ""]:
+        """Minus the logarithm of likelihood and priors, up to a constant; infinite where a simulation fails."""
+        values = self.free(z)
+        total = 0.5 * jnp.sum(self.priors(values) ** 2).astype(z.dtype)
+        for number, trial in enumerate(self.trials):
+            if self.fitted[number]:
+                theta = self.own(number, values)
+                total = (
+                    total + trial.seen(*trial.start(self.system, theta), theta, self.options, adjoint).rows.objective
+                )
+        return total
+
+    def columns(self, number: int) -> np.ndarray:
+        """Where the unknowns of one experiment stand among the components of all."""
+        ends = np.cumsum([0, *(r.start.size for r in self.free.ranges)])
+        places = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(self.free.names)}
+        own = [places[name] for name in self.sources[number]]
+        return np.concatenate(own) if own else np.zeros(0, int)
+
+
+class Model(NamedTuple):
+    """A `Linearised` with its parts.
+
+    **Fields:** `data`: the number of residuals that are of data, the first ones; those of priors and noise levels
+    follow; `results`: how each simulation ended; `readings`: predictions by experiment and sensor.
+    """
+
+    linearised: Linearised
+    data: int
+    results: tuple[RESULTS, ...]
+    readings: dict[str, dict[str, np.ndarray]]
+
+
+def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
+    """Residuals of everything that is fitted and their derivatives with respect to the vector.
+
+    Experiments of the same structure share one compiled program, whose derivatives are those in their own unknowns.
+    """
+    return linearise_batch(problem, [z])[0]
+
+
+def linearise_batch(problem: Problem, zs: Sequence[Float[Array, "n"]]) -> list[Model]:
+    """The same at several points, simulated as one batch."""
+    charts = [values_and_derivatives(problem, z) for z in zs]
+    found = {}
+    for number, trial in enumerate(problem.trials):
+        if problem.fitted[number]:
+            columns = problem.columns(number)
+            flats = [jnp.asarray(values[columns]) for values, *_ in charts]
+            found[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
+    return [_joined(problem, chart, {n: seen[k] for n, seen in found.items()}) for k, chart in enumerate(charts)]
+
+
+def values_and_derivatives(problem: Problem, z: Float[Array, "n"]) -> tuple[np.ndarray, ...]:
+    """All values one after the other, their derivatives, and the rows of the priors with theirs."""
+    return tuple(map(np.asarray, _chart(problem.free, problem.priors, z)))
+
+
+def linearised_trials(system, trial, options, flats: Sequence[Array]) -> list[tuple[Seen, Any]]:
+    """What one experiment shows for several values of its unknowns, with the derivatives of the misfit's rows."""
+    if len(flats) == 1:
+        return [_linearised(system, trial, options, flats[0])]
+    batch = _linearised_batch(system, trial, options, jnp.stack(flats))
+    arrays, static = eqx.partition(batch, eqx.is_array)
+    return [eqx.combine(jax.tree.map(lambda x, k=k: x[k], arrays), static) for k in range(len(flats))]
+
+
+@eqx.filter_jit
+def _linearised(system, trial, options, flat):
+    return _with_jacobian(system, trial, options, flat)
+
+
+@eqx.filter_jit
+def _linearised_batch(system, trial, options, flats):
+    return eqx.filter_vmap(functools.partial(_with_jacobian, system, trial, options))(flats)
+
+
+def _with_jacobian(system, trial, options, flat):
+    def fn(flat):
+        theta = trial.named(flat)
+        seen = trial.seen(*trial.start(system, theta), theta, options, diffrax.ForwardMode())
+        return (seen.rows.residuals, seen.rows.scores), seen
+
+    if flat.size == 0:
+        (residuals, scores), seen = fn(flat)
+        return seen, (jnp.zeros((residuals.size, 0)), jnp.zeros((scores.size, 0)))
+    jacobians, seen = jax.jacfwd(fn, has_aux=True)(flat)
+    return seen, jacobians
+
+
+@eqx.filter_jit
+def _chart(free, priors, z):
+    rows = lambda z: priors(free(z)).astype(z.dtype)
+    return free.flat(z), jax.jacfwd(free.flat)(z), rows(z), jax.jacfwd(rows)(z)
+
+
+def numbers(tree: Any) -> Any:
+    """A tree whose arrays are those of NumPy."""
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
+
+
+def _joined(problem, chart, found) -> Model:
+    _, ahead, prior_rows, prior_jacobian = chart
+    residuals, jacobians, scores, score_jacobians, objective = [], [], [], [], 0.5 * prior_rows @ prior_rows
+    for number, (seen, (of_residuals, of_scores)) in found.items():
+        inward, rows = ahead[problem.columns(number)], seen.rows
+        residuals.append(rows.residuals[rows.present])
+        jacobians.append(of_residuals[rows.present] @ inward)
+        scores.append(rows.scores)
+        score_jacobians.append(of_scores @ inward)
+        objective = objective + rows.objective
+    data = sum(own.size for own in residuals)
+    model = Linearised(
+        np.concatenate([*residuals, prior_rows, *scores]),
+        np.vstack([*jacobians, prior_jacobian, *score_jacobians]),
+        objective,
+    )
+    results = tuple(seen.result for seen, _ in found.values())
+    return Model(model, data, results, {problem.names[n]: seen.readings for n, (seen, _) in found.items()})
+
+
+def with_likely_levels(
+    problem: Problem, z: Float[Array, "n"], readings: Mapping[str, Mapping[str, np.ndarray]]
+) -> Float[Array, "n"]:
+    """The vector with the noise levels that are most likely for predicted readings, by experiment and sensor."""
+    values = {name: np.asarray(value) for name, value in problem.free(z).items()}
+    squares: dict[str, list] = {}
+    for number, trial in enumerate(problem.trials):
+        for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
+            channel = next((own for own in trial.channels if name == f"{own.name}.sigma"), None)
+            if channel is not None and problem.fitted[number]:
+                level = channel.level(readings[problem.names[number]][channel.name], values[source])
+                squares.setdefault(source, []).append((level**2, int(np.sum(channel.present))))
+    for source, own in squares.items():
+        total = sum(count for _, count in own)
+        level = np.sqrt(sum(square * count for square, count in own) / total)
+        inside = np.all(level > 0) and np.all(np.isfinite(level))
+        if inside:
+            place, number = problem.free.place(source), problem.free.names.index(source)
+            z = z.at[place].set(problem.free.ranges[number].locate(jnp.asarray(level, z.dtype)))
+    return z
+
+
+def level_mask(problem: Problem) -> np.ndarray:
+    """Which components of the vector are noise levels."""
+    mask = np.zeros(problem.free.size, bool)
+    for number, trial in enumerate(problem.trials):
+        for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
+            if any(name == f"{channel.name}.sigma" for channel in trial.channels):
+                mask[problem.free.place(source)] = True
+    return mask

@@ -1,0 +1,503 @@
+"""Several experiments, sensors, priors, profiles, densities, shooting, predictions and reports of identification."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.special import ndtri
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.lagrangian import LagrangianSystem
+from jaxmb.studies.covariance import combinations, covariance
+from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
+from jaxmb.studies.ranges import free_parameters, second_moments
+
+TS = jnp.linspace(0.0, 1.0, 31)[1:]
+# Compiles faster than Adams, where the solver does not matter.
+TSIT5 = diffrax.Tsit5()
+
+
+def pendulum():
+    """A rod on a pin with a torsional spring and damper."""
+    rod = planar.Body("rod", mass=2.0, inertia=planar.rod(2.0, 1.0), position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=6.0, damping=0.3)
+    return mb.Scene([rod], joints=[pin], forces=[spring, mb.Gravity((0.0, -9.81))]).compile()
+
+
+@pytest.fixture(scope="module")
+def system():
+    return pendulum()
+
+
+def swing():
+    """The rod's angle alone, as a Lagrangian system with damping."""
+    return LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * p["length"] ** 2 * (v @ v),
+        potential=lambda t, q, p: -9.81 * p["length"] * jnp.cos(q[0]),
+        force=lambda t, q, v, p: -p["damping"] * v,
+        q=[1.0],
+        coordinates=("theta",),
+        parameters={"length": 0.8, "damping": 0.3},
+    )
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """Of the Lagrangian system, from an angle of 0.5 rad."""
+    own = swing()
+    start = mb.assemble(own, fix={"theta": 0.5})
+    return np.asarray(mb.simulate(own, start, t1=TS[-1], saveat=TS, solver=TSIT5)["theta"])
+
+
+DELAY, BIAS, GAIN, SIGMA = 0.02, 0.1, 1.1, {"encoder": 1e-3, "gyro": 0.01}
+
+
+@pytest.fixture(scope="module")
+def three(system):
+    """A fit of two experiments with shared and own unknowns of every kind, and a third one held out."""
+    random = np.random.default_rng(0)
+
+    def measured(angle, damping):
+        own = mb.with_parameters(system, {"spring.damping": damping})
+        start = mb.assemble(own, fix={"rod.angle": angle})
+        late = mb.simulate(own, start, t1=TS[-1], saveat=TS - DELAY, solver=TSIT5)
+        exact = {"encoder": late["rod"].angle + BIAS, "gyro": GAIN * late["rod"].angular_velocity}
+        return {name: np.asarray(x) + SIGMA[name] * random.standard_normal(x.shape) for name, x in exact.items()}
+
+    experiments = [
+        mb.Experiment(measured(0.1, 0.3), ts=TS, fix={"rod.angle": 0.0}, free_initial=("rod.angle",)),
+        mb.Experiment(measured(-0.4, 0.5), ts=TS, fix={"rod.angle": -0.4}, own=("spring.damping",), name="worn"),
+        mb.Experiment(
+            measured(0.4, 0.2), ts=TS, fix={"rod.angle": 0.4}, parameters={"spring.damping": 0.2}, held_out=True
+        ),
+    ]
+    sensors = [
+        mb.Sensor("rod.angle", name="encoder"),
+        mb.Sensor("rod.angular_velocity", name="gyro", delay=DELAY, sigma=SIGMA["gyro"]),
+    ]
+    free = {"spring.stiffness": 8.0, "spring.damping": 0.2, "encoder.bias": 0.0, "encoder.delay": 0.0}
+    return mb.identify(
+        system,
+        experiments,
+        free=free | {"gyro.gain": None, "encoder.sigma": None},
+        sensors=sensors,
+        prior={"spring.stiffness": (6.1, 0.5)},
+        solver=TSIT5,
+    )
+
+
+TRUE = {
+    "spring.stiffness": 6.0,
+    "spring.damping": 0.3,
+    "encoder.bias": BIAS,
+    "encoder.delay": DELAY,
+    "gyro.gain": GAIN,
+    "encoder.sigma": SIGMA["encoder"],
+    "exp1/initial.rod.angle": 0.1,
+    "worn/spring.damping": 0.5,
+}
+
+
+def test_unknowns_of_every_kind_from_two_experiments(three):
+    assert three.success and not three.undetermined and tuple(three.parameters) == tuple(TRUE)
+    for name, true in TRUE.items():
+        assert abs(three.parameters[name] - true) < 4 * three.deviations[name] < 0.5 * true, name
+    assert 0.8 < three.rms < 1.2
+    # The expected information on a noise level from 60 samples.
+    np.testing.assert_allclose(three.deviations["encoder.sigma"], three.parameters["encoder.sigma"] / np.sqrt(120))
+    np.testing.assert_allclose(
+        mb.parameters(three.systems["worn"])["spring.damping"], three.parameters["worn/spring.damping"]
+    )
+
+
+def test_what_is_held_out_is_predicted(three):
+    (own,) = three.held_out.values()
+    assert own.residuals.size == 60 and 0.7 < own.rms < 1.3
+
+
+def test_a_density_has_the_same_gradient_by_both_modes(three):
+    """Also as central differences; and under a batch, with a member whose simulation fails."""
+    forward, reverse = three.logdensity(), three.logdensity("reverse")
+    z = forward.start + 0.01
+    gradient = jax.grad(forward)(z)
+    np.testing.assert_allclose(jax.grad(reverse)(z), gradient, rtol=1e-8)
+    h = 1e-5
+    for k, e in enumerate(np.eye(z.size)):
+        central = (forward(z + h * e) - forward(z - h * e)) / (2 * h)
+        np.testing.assert_allclose(central, gradient[k], rtol=1e-5, atol=1e-3)
+    broken = z.at[1].set(jnp.nan)
+    values, gradients = jax.vmap(jax.value_and_grad(forward))(jnp.stack([z, broken]))
+    np.testing.assert_allclose(gradients[0], gradient, rtol=1e-6)
+    assert values[1] == -jnp.inf and not np.any(gradients[1])
+    np.testing.assert_allclose(forward.parameters(forward.start[None])["gyro.gain"][0], three.parameters["gyro.gain"])
+
+
+def test_the_density_includes_prior_likelihood_and_volume(three):
+    """The difference between two points, written out."""
+    density = three.logdensity()
+    problem, z = three.fit.problem, three.fit.z
+
+    def by_hand(z):
+        values = {name: float(value) for name, value in problem.free(z).items()}
+        out = -0.5 * ((values["spring.stiffness"] - 6.1) / 0.5) ** 2
+        # Positive ones are exponentials, one with an upper bound as well; the others are linear.
+        out += np.log(values["encoder.sigma"]) + np.log(TS[0] - values["encoder.delay"])
+        for number in range(2):
+            seen = problem.trials[number].seen(
+                *problem.start(number, z), problem.own(number, problem.free(z)), problem.options, None
+            )
+            for sensor, data in zip(("encoder", "gyro"), problem.trials[number].channels, strict=True):
+                level = values["encoder.sigma"] if sensor == "encoder" else SIGMA["gyro"]
+                misfit = (np.asarray(seen.readings[sensor]) - np.asarray(data.values)) / level
+                out -= 0.5 * np.sum(misfit**2) + misfit.size * np.log(level)
+        return out
+
+    other = z + 0.003
+    np.testing.assert_allclose(density(other) - density(z), by_hand(other) - by_hand(z), rtol=1e-6)
+
+
+def test_a_report_shows_everything_on_one_page(three, tmp_path):
+    path = three.report(tmp_path / "out")
+    text = path.read_text()
+    assert path.name == "identification.html"
+    assert text.count("<img") == 7 and "worn encoder" in text and "exp3 gyro (held out)" in text
+
+
+def test_bands_of_predictions(three):
+    """Deviations as by hand, from central differences and the covariance."""
+    found = three.predict(["rod.angle", "pin.force"], experiment="worn", level=0.9)
+    number, z = 1, three.fit.z
+    problem = three.fit.problem
+
+    def by_hand(z):
+        own, state = problem.start(number, z)
+        return np.asarray(mb.simulate(own, state, t1=TS[-1], saveat=TS, rtol=1e-10, solver=TSIT5).quantity("pin.force"))
+
+    h = 1e-4
+    jacobian = np.stack([(by_hand(z + h * e) - by_hand(z - h * e)) / (2 * h) for e in np.eye(z.size)], axis=-1)
+    ahead = np.asarray(jax.jacfwd(problem.free.flat)(z))
+    jacobian = jacobian @ np.linalg.inv(ahead)
+    deviations = np.sqrt(np.einsum("tci,ij,tcj->tc", jacobian, three.covariance, jacobian))
+    np.testing.assert_allclose(found.deviations["pin.force"], deviations, rtol=1e-3, atol=1e-9)
+    width = found.high["rod.angle"] - found.low["rod.angle"]
+    np.testing.assert_allclose(width, 2 * float(ndtri(0.95)) * found.deviations["rod.angle"])
+
+
+def test_a_profile_is_what_fits_with_a_known_value_give(motion):
+    """Without known noise; the interval's ends are where the likelihood ratio says."""
+    own = swing()
+    data = {"theta": motion + 0.02 * np.random.default_rng(3).standard_normal(TS.size)}
+    common = {"ts": TS, "fix": {"theta": 0.5}, "solver": TSIT5}
+    fit = mb.identify(own, data, free=["length", "damping"], **common)
+    found = fit.profile("length")
+    assert found.fits.all() and np.all(np.diff(found.values) > 0)
+    limit = float(ndtri(0.975)) ** 2
+    for value in found.interval:
+        known = mb.with_parameters(own, {"length": value})
+        again = mb.identify(known, data, free=["damping"], **common)
+        ratio = TS.size * np.log(np.sum(again.residuals**2) / np.sum(fit.residuals**2))
+        np.testing.assert_allclose(ratio, limit, rtol=2e-3)
+    low, high = found.interval
+    np.testing.assert_allclose((high - low) / (2 * 1.96 * fit.deviations["length"]), 1.0, atol=0.15)
+    given = fit.profile("length", values=[0.8, 0.81])
+    known = mb.identify(mb.with_parameters(own, {"length": 0.81}), data, free=["damping"], **common)
+    np.testing.assert_allclose(given.parameters["damping"][1], known.parameters["damping"], rtol=1e-6)
+
+
+def test_intervals_cover_the_truth():
+    """95 % intervals of both parameters of 200 synthetic data sets, all by one compiled program."""
+    own = swing()
+    start = {"theta": 0.5}
+    exact = np.asarray(mb.simulate(own, mb.assemble(own, fix=start), t1=TS[-1], saveat=TS, solver=TSIT5)["theta"])
+    random, inside, all_ = np.random.default_rng(0), 0, 0
+    for _ in range(200):
+        data = {"theta": exact + 0.01 * random.standard_normal(TS.size)}
+        fit = mb.identify(
+            own, data, ts=TS, fix=start, free={"length": 0.9, "damping": 0.2}, sigma={"theta": 0.01}, solver=TSIT5
+        )
+        assert fit.success
+        for name, true in (("length", 0.8), ("damping", 0.3)):
+            inside += int(abs(fit.parameters[name] - true) < 1.96 * fit.deviations[name])
+            all_ += 1
+    assert 0.92 <= inside / all_ <= 0.98
+
+
+def test_several_starts_find_the_best_minimum():
+    """A pendulum's length from many swings: too long or too short a start misses some of them."""
+    own = mb.with_parameters(swing(), {"damping": 0.0})
+    ts = jnp.linspace(0.0, 8.0, 81)[1:]
+    true = mb.simulate(own, mb.assemble(own, fix={"theta": 0.5}), t1=ts[-1], saveat=ts, solver=TSIT5)
+    common = {
+        "ts": ts,
+        "fix": {"theta": 0.5},
+        "free": {"length": 2.6},
+        "bounds": {"length": (0.3, 4.0)},
+        "sigma": {"theta": 0.01},
+        "solver": TSIT5,
+    }
+    data = {"theta": true["theta"]}
+    alone = mb.identify(own, data, **common)
+    assert abs(alone.parameters["length"] - 0.8) > 0.1
+    several = mb.identify(own, data, starts=12, **common)
+    np.testing.assert_allclose(several.parameters["length"], 0.8, rtol=1e-5)
+    assert len(several.objectives) == 12 and list(several.objectives) == sorted(several.objectives)
+    given = mb.identify(own, data, starts=[{"length": 0.9}], **common)
+    np.testing.assert_allclose(given.parameters["length"], 0.8, rtol=1e-5)
+
+
+def unstable():
+    """A rod upright on a pin, whose motion passes the unstable equilibrium again and again."""
+    rod = planar.Body("rod", mass=2.0, inertia=0.25, position=(0.0, 0.5), angle=np.pi / 2)
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    damper = planar.TorsionalSpringDamper("damper", "ground", "rod", stiffness=0.0, damping=0.01)
+    return mb.Scene([rod], joints=[pin], forces=[damper, mb.Gravity((0.0, -9.81))]).compile()
+
+
+def test_multiple_shooting_where_single_shooting_fails():
+    """Both have the same minimum, which only the segments lead to."""
+    own = unstable()
+    ts = jnp.linspace(0.0, 8.0, 161)[1:]
+    start = mb.assemble(own, fix={"rod.angle": np.pi / 2 + 0.01})
+    exact = mb.simulate(own, start, t1=ts[-1], saveat=ts, solver=TSIT5)["rod"].angle
+    data = {"rod.angle": exact + 0.01 * np.random.default_rng(0).standard_normal(ts.size)}
+    common = {
+        "ts": ts,
+        "fix": {"rod.angle": np.pi / 2},
+        "free_initial": ("rod.angle", "rod.angle.rate"),
+        "sigma": {"rod.angle": 0.01},
+        "solver": TSIT5,
+    }
+    free = {"rod.inertia": 0.5, "damper.damping": 0.05}
+    fit = mb.identify(own, data, free=free, segments=16, **common)
+    assert fit.success and fit.continuity < 1e-8
+    assert 0.8 < fit.rms < 1.2
+    for name, true in {"rod.inertia": 0.25, "damper.damping": 0.01, "initial.rod.angle": np.pi / 2 + 0.01}.items():
+        assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name], name
+    assert fit.deviations["rod.inertia"] < 0.01
+    alone = mb.identify(own, data, free=free, **common)
+    assert not alone.success or alone.rms > 10 * fit.rms
+    again = mb.identify(own, data, free=fit.parameters, **(common | {"free_initial": ()}))
+    for name, value in fit.parameters.items():
+        np.testing.assert_allclose(again.parameters[name], value, atol=1e-3 * fit.deviations[name])
+        np.testing.assert_allclose(again.deviations[name], fit.deviations[name], rtol=1e-3)
+
+
+def double_pendulum():
+    """Two rods with friction in both joints."""
+    bodies = [
+        planar.Body("upper", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0)),
+        planar.Body("lower", mass=0.5, inertia=planar.rod(0.5, 0.8), position=(1.4, 0.0)),
+    ]
+    joints = [
+        planar.Revolute("shoulder", "ground", "upper", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+        planar.Revolute("elbow", "upper", "lower", point_a=(0.5, 0.0), point_b=(-0.4, 0.0)),
+    ]
+    forces = [
+        planar.TorsionalSpringDamper("friction1", "ground", "upper", stiffness=0.0, damping=0.2),
+        planar.TorsionalSpringDamper("friction2", "upper", "lower", stiffness=0.0, damping=0.1),
+        mb.Gravity((0.0, -9.81)),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def test_double_pendulum_with_friction_from_encoders():
+    """The lower rod and the friction of both joints from two experiments; the upper rod is known."""
+    own, random = double_pendulum(), np.random.default_rng(5)
+    ts = jnp.linspace(0.0, 2.0, 101)[1:]
+    experiments = []
+    for start in ({"upper.angle": 0.0, "lower.angle": 0.3}, {"upper.angle": -0.8, "lower.angle": -1.0}):
+        motion = mb.simulate(own, mb.assemble(own, fix=start), t1=ts[-1], saveat=ts, solver=TSIT5)
+        data = {name: motion.quantity(name) + 1e-3 * random.standard_normal(ts.size) for name in start}
+        experiments.append(mb.Experiment(data, ts=ts, fix=start))
+    true = {"lower.mass": 0.5, "lower.inertia": 0.5 * 0.64 / 12, "friction1.damping": 0.2, "friction2.damping": 0.1}
+    free = {name: 1.5 * value for name, value in true.items()}
+    sigma = {"upper.angle": 1e-3, "lower.angle": 1e-3}
+    fit = mb.identify(own, experiments, free=free, sigma=sigma, solver=TSIT5)
+    assert fit.success and not fit.undetermined and 0.9 < fit.rms < 1.1
+    for name, value in true.items():
+        assert abs(fit.parameters[name] - value) < 4 * fit.deviations[name] < 0.1 * value, name
+
+
+def test_four_bar_with_biased_sensors():
+    """A closed loop: the coupler's inertia and a spring from biased readings of the rocker's angle and rate."""
+    lengths = {"crank": 1.0, "coupler": 2.0, "rocker": 2.0}
+    bodies = [
+        planar.Body("crank", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.0, 0.5), angle=np.pi / 2),
+        planar.Body("coupler", mass=2.0, inertia=planar.rod(2.0, 2.0), position=(1.0, 1.2), angle=0.3),
+        planar.Body("rocker", mass=2.0, inertia=planar.rod(2.0, 2.0), position=(2.2, 0.9), angle=1.3),
+    ]
+    ends = {name: length / 2 for name, length in lengths.items()}
+    joints = [
+        planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-ends["crank"], 0.0)),
+        planar.Revolute("B", "crank", "coupler", point_a=(ends["crank"], 0.0), point_b=(-ends["coupler"], 0.0)),
+        planar.Revolute("C", "coupler", "rocker", point_a=(ends["coupler"], 0.0), point_b=(ends["rocker"], 0.0)),
+        planar.Revolute("D", "ground", "rocker", point_a=(2.5, 0.0), point_b=(-ends["rocker"], 0.0)),
+    ]
+    damper = planar.TorsionalSpringDamper("hinge", "ground", "rocker", stiffness=0.0, damping=1.5)
+    own = mb.Scene(bodies, joints=joints, forces=[damper, mb.Gravity((0.0, -9.81))]).compile()
+    start = {"fix": {"crank.angle": 1.2}}
+    motion = mb.simulate(own, mb.assemble(own, **start), t1=TS[-1], saveat=TS, solver=TSIT5)
+    random = np.random.default_rng(1)
+    data = {
+        "encoder": motion["rocker"].angle + 0.05 + 1e-3 * random.standard_normal(TS.size),
+        "gyro": motion["rocker"].angular_velocity - 0.2 + 1e-2 * random.standard_normal(TS.size),
+    }
+    sensors = [
+        mb.Sensor("rocker.angle", name="encoder", sigma=1e-3),
+        mb.Sensor("rocker.angular_velocity", name="gyro", sigma=1e-2),
+    ]
+    free = {"coupler.inertia": 1.0, "hinge.damping": 1.0, "encoder.bias": 0.0, "gyro.bias": 0.0}
+    fit = mb.identify(own, data, ts=TS, free=free, sensors=sensors, **start, solver=TSIT5)
+    true = {"coupler.inertia": 2.0 * 4.0 / 12, "hinge.damping": 1.5, "encoder.bias": 0.05, "gyro.bias": -0.2}
+    assert fit.success and 0.8 < fit.rms < 1.2
+    for name, value in true.items():
+        assert abs(fit.parameters[name] - value) < 4 * fit.deviations[name] < abs(value), name
+
+
+def test_a_prior_is_one_more_measurement():
+    """With a strong one the estimate is its mean; without data on a parameter, its deviation is the prior's."""
+    own = swing()
+    data = {"theta": np.asarray(TS) * 0.0 + 0.4}
+    common = {"ts": TS, "fix": {"theta": 0.5}, "free": ["length", "damping"], "sigma": {"theta": 1.0}, "solver": TSIT5}
+    fit = mb.identify(own, data, prior={"length": (0.7, 1e-6), "damping": (0.3, 0.02)}, **common)
+    np.testing.assert_allclose(fit.parameters["length"], 0.7, atol=1e-9)
+    np.testing.assert_allclose(fit.deviations["length"], 1e-6, rtol=1e-6)
+    np.testing.assert_allclose(fit.deviations["damping"], 0.02, rtol=1e-2)
+
+
+def test_combinations_that_make_no_difference():
+    """A product and a sum of three numbers, of which each pair can change alone."""
+    jacobian = np.array([[2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [2.0, 2.0, 1.0]])
+    found = covariance(jacobian, np.eye(3), None, 3)
+    assert found.undetermined.tolist() == [True, True, False]
+    ((own),) = combinations(("a", "b", "c"), np.array([1.0, 2.0, 1.0]), found)
+    assert set(own) == {"a", "b"}
+    np.testing.assert_allclose([own["a"], own["b"]], [1.0, -0.5])
+    np.testing.assert_allclose(found.matrix[2, 2], 2 / 3)
+
+
+def test_iterations_together_are_those_alone():
+    residuals = lambda z: np.array([10 * (z[1] - z[0] ** 2), 1 - z[0]])
+    jacobian = lambda z: np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
+    linearised = lambda z: (residuals(np.asarray(z)), jacobian(np.asarray(z)))
+    starts = [jnp.array([-1.2, 1.0]), jnp.array([3.0, -2.0])]
+    both = minimise_together(lambda zs: list(map(linearised, zs)), starts, 1e-10, 100)
+    for start, found in zip(starts, both, strict=True):
+        alone = levenberg_marquardt(linearised, start, 1e-10, 100)
+        assert alone.iterations == found.iterations and found.success
+        np.testing.assert_array_equal(alone.z, found.z)
+    held = levenberg_marquardt(linearised, starts[0], 1e-10, 100, np.array([True, False]))
+    np.testing.assert_allclose(held.z, [-1.2, 1.44], rtol=1e-9)
+
+
+def test_inertia_matrices_stay_those_of_bodies():
+    """Second moments of mass are positive, so principal moments satisfy the triangle inequalities."""
+    inertia = np.diag([2.0, 1.5, 1.0])
+    own = mb.Scene([spatial.Body("top", mass=1.0, inertia=inertia)]).compile()
+    free = free_parameters(own, ["top.inertia"], None)
+    for z in np.random.default_rng(0).normal(size=(10, 6)):
+        value = free(jnp.asarray(z))["top.inertia"]
+        assert np.all(np.linalg.eigvalsh(second_moments(value)) > 0)
+        moments = np.linalg.eigvalsh(value)
+        assert moments[2] < moments[0] + moments[1]
+        np.testing.assert_allclose(free.locate({"top.inertia": value}), z, atol=1e-9)
+    with pytest.raises(ValueError, match="slightly thicker"):
+        free_parameters(own, {"top.inertia": np.diag([1.0, 1.0, 2.0])}, None)
+
+
+def test_vectors_of_values_and_back(system):
+    """For every kind of range, with the volume of a change."""
+    names = {"rod.mass": 3.0, "spring.stiffness": 7.0, "pin.point_b": [-0.4, 0.1], "spring.damping": 0.2}
+    free = free_parameters(system, names, {"spring.stiffness": (5.0, 9.0), "spring.damping": (None, 1.0)})
+    z = jnp.asarray(np.random.default_rng(0).normal(size=free.size))
+    np.testing.assert_allclose(free.locate(free(z)), z, atol=1e-12)
+    np.testing.assert_allclose(free.log_volume(z), np.linalg.slogdet(jax.jacfwd(free.flat)(z))[1], rtol=1e-12)
+    assert free.place("pin.point_b") == slice(2, 4)
+
+
+def test_measurements_from_files_and_tables(tmp_path):
+    path = tmp_path / "data.csv"
+    path.write_text("t;phi;x;y\n0.1;1;2;3\n0.2;;NaN;4\n0.4;1.5;2;5\n")
+    own = mb.read_measurements(path, {"rod.angle": "phi", "rod.position": ["x", "y"]})
+    np.testing.assert_array_equal(own.ts, [0.1, 0.2, 0.4])
+    np.testing.assert_array_equal(own.values["rod.angle"], [1.0, np.nan, 1.5])
+    np.testing.assert_array_equal(own.values["rod.position"], [[2.0, 3.0], [np.nan, 4.0], [2.0, 5.0]])
+    frame = pytest.importorskip("pandas").DataFrame({"time": [0.0, 1.0], "rod.angle": [1.0, None]})
+    table = mb.read_measurements(frame, time="time")
+    np.testing.assert_array_equal(table.values["rod.angle"], [1.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    "text, columns, message",
+    [
+        ("t,phi\n0,1\n1,2\n", {"rod.angle": "ph"}, "did you mean 'phi'"),
+        ("time,phi\n0,1\n1,2\n", None, "column of time 't'"),
+        ("t,phi\n0,1\n1,two\n", None, "no number in row 2 of column 'phi', but 'two'"),
+        ("t,phi\n0,1\n1\n", None, "1 cells in row 2"),
+        ("t,phi,phi\n0,1,1\n1,1,2\n", None, "more than one column 'phi'"),
+        ("t,phi\n0,1\n0,2\n", None, "must increase, but 0 in row 2 follows 0"),
+        ("t,phi\n0,1\n,2\n", None, "no number in row 2"),
+        ("t,phi\n0,1\n", None, "too few data"),
+        ("t\n0\n1\n", None, "no column but that of time"),
+        ("\n", None, "is empty"),
+    ],
+)
+def test_messages_of_files(tmp_path, text, columns, message):
+    path = tmp_path / "data.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        mb.read_measurements(path, columns)
+
+
+ANGLE = {"rod.angle": np.linspace(0.0, 1.0, 30)}
+
+
+@pytest.mark.parametrize(
+    "measured, change, message",
+    [
+        ([mb.Experiment(ANGLE, ts=TS)], {"ts": TS}, "ts belongs to each experiment"),
+        ([mb.Experiment(ANGLE, ts=TS), ANGLE], {}, "a jaxmb.Experiment"),
+        ([mb.Experiment(ANGLE, ts=TS, held_out=True)], {}, "no experiment to fit"),
+        ([mb.Experiment(ANGLE, ts=TS, name="a"), mb.Experiment(ANGLE, ts=TS, name="a")], {}, "'a' of an experiment"),
+        ([mb.Experiment(ANGLE, ts=TS, own=("rod.mas",))], {}, "did you mean 'rod.mass'"),
+        ([mb.Experiment(ANGLE, ts=TS, parameters={"rod.mas": 1.0})], {}, "did you mean 'rod.mass'"),
+        ([mb.Experiment(ANGLE, ts=TS, parameters={"rod.mass": 1.0})], {}, "unknown to every experiment"),
+        ([mb.Experiment(ANGLE, ts=TS, free_initial=("rod.angel",))], {}, "did you mean 'rod.angle'"),
+        ([mb.Experiment(ANGLE, ts=TS), mb.Experiment(ANGLE, ts=TS, own=["rod.mass"], held_out=True)], {}, "held out"),
+        (ANGLE, {}, "ts is missing"),
+        (ANGLE, {"ts": TS.at[3].set(jnp.nan)}, r"ts\[3\] is nan"),
+        (ANGLE, {"ts": TS.at[3].set(0.0)}, r"ts\[3\] = 0 follows"),
+        ({"rod.angle": np.full(30, np.inf)}, {"ts": TS}, "infinite at sample 0"),
+        ({"rod.angle": np.full(30, np.nan)}, {"ts": TS}, "holds no number"),
+        ({"encoder": np.zeros(30)}, {"ts": TS, "sensors": [mb.Sensor("rod.angel", name="encoder")]}, "quantity of a"),
+        (ANGLE, {"ts": TS, "sensors": [mb.Sensor("rod.position", name="rod.angle")]}, "is taken"),
+        (
+            ANGLE,
+            {"ts": TS, "free": ["rod.angle.delay"], "t0": 0.0, "fix": {}, "bounds": {"rod.angl": (0, 1)}},
+            "bounds",
+        ),
+        (ANGLE, {"ts": TS, "free": {"rod.angle.delay": 0.1}}, "smaller than 0.0333333 s"),
+        (ANGLE, {"ts": TS, "prior": {"rod.mass": (1.0, 0.1)}}, "noise of a known size"),
+        (ANGLE, {"ts": TS, "prior": {"rod.mass": (1.0, 0.0)}, "sigma": {"rod.angle": 1.0}}, "positive deviation"),
+        (ANGLE, {"ts": TS, "prior": {"rod.mass": 1.0}, "sigma": {"rod.angle": 1.0}}, r"must be \(mean, deviation\)"),
+        (ANGLE, {"ts": TS, "starts": 0}, "at least 1"),
+        (ANGLE, {"ts": TS, "starts": [{"rod.inertia": 1.0}]}, "not free"),
+        (ANGLE, {"ts": TS, "segments": 31}, "number of times, 30"),
+        (ANGLE, {"ts": TS, "segments": 3, "starts": 2}, "one start"),
+        (ANGLE, {"ts": TS, "segments": 3, "free": ["rod.angle.delay"]}, "has a delay"),
+        (ANGLE, {"ts": TS, "inputs": {}}, "give it to an Experiment"),
+    ],
+)
+def test_messages(system, measured, change, message):
+    with pytest.raises(ValueError, match=message):
+        mb.identify(system, measured, **({"free": ["rod.mass"]} | change))
+
+
+def test_orientations_cannot_be_free():
+    own = mb.Scene([spatial.Body("top", mass=1.0, inertia=np.diag([2.0, 1.5, 1.0]))]).compile()
+    data = {"top.angular_velocity": np.zeros((30, 3))}
+    with pytest.raises(ValueError, match="not independent of each other"):
+        mb.identify(own, data, ts=TS, free_initial=["top.orientation"])
