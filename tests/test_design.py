@@ -9,6 +9,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
+from jaxmb.report.subject import subject
 from jaxmb.studies.ranges import free_parameters
 
 HALF = jnp.array([0.5, 0.0])
@@ -55,6 +56,12 @@ def test_a_batch_of_designs(machine, plain):
 
     rods = jnp.array([2.8, 3.0, 3.1])
     np.testing.assert_allclose(jax.jit(jax.vmap(height))(rods), [height(rod) for rod in rods], rtol=1e-12)
+
+
+def test_reports_vary_every_parameter_by_itself(machine, plain):
+    about = subject(machine, plain.state, 1.0).system
+    assert about.design == () and "rod" not in mb.parameters(about)
+    assert float(mb.parameters(mb.with_parameters(about, {"coupler.inertia": 1.0}))["coupler.inertia"]) == 1.0
 
 
 def test_variables_of_variables(machine):

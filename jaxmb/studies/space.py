@@ -89,7 +89,10 @@ class Space(eqx.Module):
 
         **Raises:** `ValueError` for a parameter without both bounds.
         """
-        from scipy.stats import qmc
+        try:
+            from scipy.stats import qmc
+        except ImportError:
+            raise ImportError("Several starts are spread by SciPy: install it, or jaxmb[studies].") from None
 
         low, high = self.box
         for name, a, b in zip(self.components(), low, high, strict=True):
