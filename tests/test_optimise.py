@@ -12,6 +12,7 @@ from jaxmb.studies.evaluation import Program, differentiable
 
 START = {"x": [-1.2, 1.0]}
 DISK = {"square": (None, 1.0)}
+METHODS = ["slsqp", "trust-constr", "bfgs", "optax"]
 
 
 def valley(v):
@@ -50,7 +51,7 @@ def test_trust_constr_agrees(in_disk):
     np.testing.assert_allclose(other.constraints[0].multiplier, in_disk.constraints[0].multiplier, rtol=1e-2)
 
 
-@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.lbfgs()], ids=str)
+@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.lbfgs()], ids=METHODS)
 def test_bounds_by_every_method(method):
     """The optimum on a bound: x = (0.8, 0.64)."""
     bounds = {"x": (-3.0, [0.8, 1.5])}
@@ -111,7 +112,7 @@ def edge(v):
     return jnp.where(v["x"] < 0.5, (v["x"] - 1.0) ** 2, jnp.nan)
 
 
-@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.sgd(0.4)], ids=str)
+@pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.sgd(0.4)], ids=METHODS)
 def test_trials_that_fail_shorten_the_step(method):
     best = mb.optimise(edge, {"x": -3.0}, method=method, max_iterations=60)
     assert 0.45 < best.parameters["x"] < 0.5 and np.isfinite(best.objective)

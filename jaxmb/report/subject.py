@@ -1,6 +1,9 @@
 """What a report is about: a mechanism of the library, or a system and a state of a user's."""
 
+import dataclasses
 from typing import Any
+
+import equinox as eqx
 
 from .._types import State
 from ..mechanisms import Mechanism
@@ -10,7 +13,7 @@ from ..trajectory import Trajectory
 
 
 def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: float | None = None) -> Mechanism:
-    """The motion of a report.
+    """The motion of a report. It is about every parameter by itself, so a system loses its design variables.
 
     **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism, with its own.
 
@@ -21,14 +24,19 @@ def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: 
             raise ValueError(
                 "A report on a system needs a state, from jaxmb.assemble, and t1=, the end of the motion [s]."
             )
-        return Mechanism("scene", None, system, state, 0.0, None, natural_coordinates, "").until(t1)
+        return Mechanism("scene", None, _alone(system), state, 0.0, None, natural_coordinates, "").until(t1)
     own: Any = system
     if not hasattr(own, "references") or state is not None:
         raise ValueError(
             "A report is about a compiled system and a state, from scene.compile() and jaxmb.assemble, or about a "
             f"mechanism of the library alone; got {type(system).__name__}{'' if state is None else ' and a state'}."
         )
+    own = dataclasses.replace(own, system=_alone(own.system))
     return own if t1 is None else own.until(t1)
+
+
+def _alone(system: Any) -> Any:
+    return eqx.tree_at(lambda s: s.design, system, ()) if system.design else system
 
 
 def natural_coordinates(trajectory: Trajectory) -> Observation:

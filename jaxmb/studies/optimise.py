@@ -11,6 +11,7 @@ from jaxtyping import ArrayLike
 
 from .._types import VectorLike
 from ..system import AbstractSystem
+from ..system.design import Bounds
 from .constrained import multipliers, slsqp, trust_constr
 from .evaluation import (
     Limits,
@@ -22,7 +23,7 @@ from .evaluation import (
     rows_of_batch,
     takes_adjoint,
 )
-from .space import Bounds, Space, component_names, space
+from .space import Space, component_names, space
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate, first_feasible
 from .unconstrained import bfgs, descend
 

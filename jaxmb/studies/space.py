@@ -7,17 +7,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.names import unknown
 from ..system import AbstractSystem, parameters
 from ..system.arguments import real_array
-from ..system.design import design_bounds
+from ..system.design import Bounds, design_bounds
 from .ranges import FreeParameters, HalfLine, Interval, Line
-
-Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
 
 class Space(eqx.Module):
@@ -89,7 +87,10 @@ class Space(eqx.Module):
 
         **Raises:** `ValueError` for a parameter without both bounds.
         """
-        from scipy.stats import qmc
+        try:
+            from scipy.stats import qmc
+        except ImportError:
+            raise ImportError("Several starts are spread by SciPy: install it, or jaxmb[studies].") from None
 
         low, high = self.box
         for name, a, b in zip(self.components(), low, high, strict=True):
