@@ -82,7 +82,9 @@ def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
     reverse = jax.jit(jax.grad(lambda x: angle(x, **fixed)))(values)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
     moved = np.eye(len(TS)) * 1e-3
-    both = jax.jit(jax.vmap(lambda x: angle(x, rtol=1e-11)))(jnp.concatenate([values[None] + moved, values[None] - moved]))
+    both = jax.jit(jax.vmap(lambda x: angle(x, rtol=1e-11)))(
+        jnp.concatenate([values[None] + moved, values[None] - moved])
+    )
     differences = (both[: len(TS)] - both[len(TS) :]) / 2e-3
     np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-7)
 
