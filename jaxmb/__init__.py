@@ -31,20 +31,25 @@ from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
 from .states.gap import assembly_gap as assembly_gap
-from .studies import cases as cases
-from .studies.experiment import Experiment as Experiment
-from .studies.floquet import Floquet as Floquet, floquet as floquet
-from .studies.identification import Identification as Identification
-from .studies.identify import identify as identify
-from .studies.linearisation import Linearisation as Linearisation
-from .studies.linearise import linearise as linearise
-from .studies.measurements import Measurements as Measurements, read_measurements as read_measurements
-from .studies.optimise import Optimum as Optimum, optimise as optimise
-from .studies.robust import robust as robust
-from .studies.root_locus import RootLocus as RootLocus, root_locus as root_locus
-from .studies.sensors import Sensor as Sensor
-from .studies.steady import steady_motion as steady_motion
-from .studies.sweep import load_sweep as load_sweep, sweep as sweep
+from .studies.identify import (
+    Experiment as Experiment,
+    Identification as Identification,
+    Measurements as Measurements,
+    Sensor as Sensor,
+    identify as identify,
+    read_measurements as read_measurements,
+)
+from .studies.linear import (
+    Floquet as Floquet,
+    Linearisation as Linearisation,
+    RootLocus as RootLocus,
+    floquet as floquet,
+    linearise as linearise,
+    root_locus as root_locus,
+    steady_motion as steady_motion,
+)
+from .studies.optimise import Optimum as Optimum, optimise as optimise, robust as robust
+from .studies.sweep import cases as cases, load_sweep as load_sweep, sweep as sweep
 from .system import (
     RigidBodySystem as RigidBodySystem,
     Variable as Variable,

@@ -10,7 +10,7 @@ from jax.scipy.special import ndtri
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.lagrangian import LagrangianSystem
-from jaxmb.studies.covariance import combinations, covariance
+from jaxmb.studies.identify.covariance import combinations, covariance
 from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
 from jaxmb.studies.ranges import free_parameters, second_moments
 

@@ -8,7 +8,7 @@ import optax
 import pytest
 
 import jaxmb as mb
-from jaxmb.studies.evaluation import Program, differentiable
+from jaxmb.studies.optimise.evaluation import Program, differentiable
 
 START = {"x": [-1.2, 1.0]}
 DISK = {"square": (None, 1.0)}

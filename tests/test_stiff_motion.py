@@ -64,10 +64,10 @@ def test_few_steps_at_every_tolerance():
 
 
 @pytest.mark.parametrize(
-    "rtol, of_velocities", [(1e-3, None), (1e-4, None), (1e-5, 1e-3), (1e-6, 1e-3), (1e-7, 1e-3), (1e-8, 1e-3)]
+    "rtol, of_velocities", [(2e-2, None), (2e-3, None), (1e-5, 2e-2), (1e-6, 2e-2), (1e-7, 2e-2), (1e-8, 2e-2)]
 )
 def test_stiffness_does_not_make_steps_shorter(rtol, of_velocities):
-    """Where the vibration that the start excites is below the tolerance or nearly so."""
+    """Where the vibration that the start excites is below the tolerance of a step, a twentieth, or nearly so."""
     runs = [bushing()(stiffness=k, rtol=rtol, of_velocities=of_velocities) for k in (1e8, 1e10)]
     assert all(successful for _, _, successful in runs)
     steps = [int(stats["num_accepted_steps"]) for _, stats, _ in runs]
@@ -81,7 +81,7 @@ def test_velocities_that_need_not_be_known_so_well():
     """
     expected = library("stiff_four_bar").references.values[-1, :3]
     counts = {1e8: [], 1e10: []}
-    for of_velocities in np.geomspace(5e-4, 2e-3, 9):
+    for of_velocities in np.geomspace(1e-2, 4e-2, 9):
         for stiffness in counts:
             ys, stats, successful = bushing()(stiffness=stiffness, rtol=1e-6, of_velocities=of_velocities)
             assert successful

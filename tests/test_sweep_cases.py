@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 import jaxmb as mb
-from jaxmb.studies.cases import grid, sobol, table
+from jaxmb.studies.sweep.cases import grid, sobol, table
 
 
 def test_a_grid_has_all_combinations_and_the_last_parameter_runs_fastest():

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..studies.root_locus import RootLocus
+from ..studies.linear.root_locus import RootLocus
 from .figure import new_figure
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from ..cases import Cases
+from .cases import Cases
 from .outputs import OK, Outputs, Returned, check_same, outputs_of, returned, statuses
 
 # The members that a budget of steps is chosen from, and by how much it exceeds the steps of those that it is to suit.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cases import MEMBER, Cases
+from .cases import MEMBER, Cases
 from .outputs import Outputs
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..cases import Cases
+from .cases import Cases
 
 
 def identity_of_function(function: Callable[..., Any]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...parts.names import unknown
-from ..cases import MEMBER, Cases
+from .cases import MEMBER, Cases
 from .dataset import variables
 from .outputs import Outputs
 

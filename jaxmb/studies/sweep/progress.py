@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from ..cases import Cases
+from .cases import Cases
 from .outputs import OK
 
 

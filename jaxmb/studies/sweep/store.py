@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cases import MEMBER
+from .cases import MEMBER
 from .dataset import packages
 from .outputs import PENDING
 

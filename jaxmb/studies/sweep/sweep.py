@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..cases import table
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
+from .cases import table
 from .engine import Task, here, on_executor, on_processes
 from .identity import identity_of_cases, identity_of_function, identity_of_outputs
 from .labels import described

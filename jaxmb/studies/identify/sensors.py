@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, VectorLike
+from ..._types import Scalar, VectorLike
 
 # What can be unknown of a sensor.
 SENSOR_FIELDS = ("bias", "gain", "delay", "sigma")

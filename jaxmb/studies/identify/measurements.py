@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..parts.names import unknown
+from ...parts.names import unknown
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 

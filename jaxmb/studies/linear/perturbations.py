@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar, State
-from ..linalg.arrays import is_traced
-from ..linalg.elimination import PivotSearch, eliminate, full_pivot
-from ..parts.names import unknown
-from ..system import AbstractSystem
+from ..._types import Scalar, State
+from ...linalg.arrays import is_traced
+from ...linalg.elimination import PivotSearch, eliminate, full_pivot
+from ...parts.names import unknown
+from ...system import AbstractSystem
 from .quantities import checked_names, components, measured
 
 # How much rather a state is chosen than another that serves as well: turns than displacements, the rates of coordinates

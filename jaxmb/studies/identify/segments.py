@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._types import State
-from ..states.assembly import assemble
-from ..system import AbstractSystem
+from ..._types import State
+from ...states.assembly import assemble
+from ...system import AbstractSystem
 from .experiment import Trial
 from .problem import Problem, numbers, values_and_derivatives
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .._results import RESULTS
-from .._types import Scalar, State, VectorLike
-from ..parts.names import unknown
-from ..simulate import simulate
-from ..states.assembly import assemble
-from ..system import AbstractSystem, parameters, with_parameters
-from ..trajectory import Trajectory
+from ..._results import RESULTS
+from ..._types import Scalar, State, VectorLike
+from ...parts.names import unknown
+from ...simulate import simulate
+from ...states.assembly import assemble
+from ...system import AbstractSystem, parameters, with_parameters
+from ...trajectory import Trajectory
 from .sensors import Channel, Rows, Sensor, readings_of
 
 

@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._types import Scalar, State
-from ..linalg.arrays import is_traced
-from ..linalg.eigen import eigen
-from ..linalg.failure import not_a_number_where
-from ..parts.names import unknown
-from ..simulate import simulate
-from ..states.arguments import check_system, checked_guess, checked_time
-from ..states.consistency import consistent
-from ..system import AbstractSystem
-from ..system.arguments import real_array
+from ..._types import Scalar, State
+from ...linalg.arrays import is_traced
+from ...linalg.eigen import eigen
+from ...linalg.failure import not_a_number_where
+from ...parts.names import unknown
+from ...simulate import simulate
+from ...states.arguments import check_system, checked_guess, checked_time
+from ...states.consistency import consistent
+from ...system import AbstractSystem
+from ...system.arguments import real_array
 from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names

@@ -12,7 +12,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import ArrayLike
 
-from ..parts.names import unknown
+from ...parts.names import unknown
 from .experiment import checked_times
 from .fit import Fit
 

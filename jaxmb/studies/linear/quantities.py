@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State
-from ..parts.names import unknown
-from ..system import AbstractSystem, Solved
+from ..._types import Scalar, State
+from ...parts.names import unknown
+from ...system import AbstractSystem, Solved
 
 
 def component_names(name: str, shape: tuple[int, ...]) -> list[str]:

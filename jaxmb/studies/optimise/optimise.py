@@ -9,9 +9,9 @@ import numpy as np
 import optax
 from jaxtyping import ArrayLike
 
-from .._types import VectorLike
-from ..system import AbstractSystem
-from ..system.design import Bounds
+from ..._types import VectorLike
+from ...system import AbstractSystem
+from ...system.design import Bounds
 from .constrained import multipliers, slsqp, trust_constr
 from .evaluation import (
     Limits,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import State
+from ..._types import State
 from .problem import Problem, with_likely_levels
 from .segments import Point, evaluated, initial_everywhere, moved, retracted, segmented
 

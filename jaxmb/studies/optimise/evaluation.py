@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..parts.names import unknown
-from .ranges import FreeParameters
+from ...parts.names import unknown
+from ..ranges import FreeParameters
 from .space import Space, component_names
 
 # Reverse mode costs about as much as this many tangents in forward mode, for every row.

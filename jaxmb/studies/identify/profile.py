@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 
-from ..parts.names import unknown
+from ...parts.names import unknown
+from ..minimise import Minimum, levenberg_marquardt
 from .fit import Fit
-from .minimise import Minimum, levenberg_marquardt
 from .problem import linearise
 
 # Values on either side of the estimate before the search for the ends of the interval is given up.

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import VectorLike
-from ..parts.names import unknown
-from ..states.assembly import assemble
-from ..system import AbstractSystem, parameters, with_parameters
-from ..system.arguments import check_kind
-from ..system.design import design_bounds
+from ..._types import VectorLike
+from ...parts.names import unknown
+from ...states.assembly import assemble
+from ...system import AbstractSystem, parameters, with_parameters
+from ...system.arguments import check_kind
+from ...system.design import design_bounds
+from ..ranges import Bounds, FreeParameters, range_of
 from .experiment import Experiment, Trial, arrays, channels_of, checked_times, initial_unknown, known_parameters
-from .ranges import Bounds, FreeParameters, range_of
 from .sensors import SENSOR_FIELDS, Channel, Sensor
 
 Prior = tuple[VectorLike, VectorLike]

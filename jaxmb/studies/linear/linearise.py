@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, State
-from ..linalg.arrays import is_traced
-from ..linalg.failure import not_a_number_where
-from ..states.arguments import check_system, checked_guess, checked_time
-from ..states.consistency import consistent
-from ..system import AbstractSystem, parameters
+from ..._types import Scalar, State
+from ...linalg.arrays import is_traced
+from ...linalg.failure import not_a_number_where
+from ...states.arguments import check_system, checked_guess, checked_time
+from ...states.consistency import consistent
+from ...system import AbstractSystem, parameters
 from .linear_equations import LinearEquations, linear_equations
 from .linearisation import Linearisation
 from .perturbations import (

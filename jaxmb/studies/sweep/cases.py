@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..parts.names import unknown
+from ...parts.names import unknown
 
 MEMBER = "member"
 

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, State
-from ..formulations import accelerations
-from ..manifold.manifold import all_rows_formulation
-from ..system import AbstractSystem, Solved, parameters, with_parameters
+from ..._types import Scalar, State
+from ...formulations import accelerations
+from ...manifold.manifold import all_rows_formulation
+from ...system import AbstractSystem, Solved, parameters, with_parameters
 from .comoving import carriers
 from .perturbations import Perturbations, StateNames, perturbations
 from .quantities import measured

@@ -11,16 +11,16 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, State
-from ..linalg.arrays import is_traced
-from ..linalg.failure import not_a_number_where
-from ..linalg.newton import newton, root
-from ..linalg.rotations import unrotate
-from ..linalg.shortest import pseudoinverse
-from ..parts.names import unknown
-from ..states.arguments import check_system, checked_guess, checked_time
-from ..system import AbstractSystem
-from ..system.arguments import real_array
+from ..._types import Scalar, State
+from ...linalg.arrays import is_traced
+from ...linalg.failure import not_a_number_where
+from ...linalg.newton import newton, root
+from ...linalg.rotations import unrotate
+from ...linalg.shortest import pseudoinverse
+from ...parts.names import unknown
+from ...states.arguments import check_system, checked_guess, checked_time
+from ...system import AbstractSystem
+from ...system.arguments import real_array
 from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
 from .linear_equations import fastest, vector_field
 from .linearise import remaining

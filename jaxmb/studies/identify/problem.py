@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._results import RESULTS
-from .._types import State
-from ..system import AbstractSystem
+from ..._results import RESULTS
+from ..._types import State
+from ...system import AbstractSystem
+from ..minimise import Linearised
+from ..ranges import FreeParameters
 from .experiment import Seen, Trial
-from .minimise import Linearised
-from .ranges import FreeParameters
 from .unknowns import Priors
 
 

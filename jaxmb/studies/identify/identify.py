@@ -8,15 +8,15 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike
 
-from .._results import RESULTS
-from .._types import Scalar, State, VectorLike
-from ..system import AbstractSystem
-from ..trajectory import Trajectory
+from ..._results import RESULTS
+from ..._types import Scalar, State, VectorLike
+from ...system import AbstractSystem
+from ...trajectory import Trajectory
+from ..minimise import Minimum, descend, minimise_together
+from ..ranges import Bounds
 from .experiment import Experiment
 from .identification import Identification, identification
-from .minimise import Minimum, descend, minimise_together
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
-from .ranges import Bounds
 from .sensors import Sensor
 from .shooting import shoot
 from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns

@@ -18,11 +18,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import State
-from ..linalg import rotations
-from ..linalg.rotations import cross, from_axis_angle, multiply, rotate, unrotate
-from ..linalg.shortest import pseudoinverse
-from ..system import AbstractSystem
+from ..._types import State
+from ...linalg import rotations
+from ...linalg.rotations import cross, from_axis_angle, multiply, rotate, unrotate
+from ...linalg.shortest import pseudoinverse
+from ...system import AbstractSystem
 
 # Terms of the series of a displacement by about one radian.
 _TERMS = 20

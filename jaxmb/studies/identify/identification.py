@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._types import State
-from ..system import AbstractSystem
+from ..._types import State
+from ...system import AbstractSystem
 from .covariance import combinations, covariance
 from .density import LogDensity, logdensity
 from .fit import Fit
-from .identification_report import write_report
 from .prediction import HeldOut, Prediction, held_out, predict
 from .problem import Problem
 from .profile import Profile, profile
+from .report import write_report
 
 
 @dataclasses.dataclass(frozen=True)
