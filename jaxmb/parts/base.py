@@ -10,6 +10,7 @@ A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes th
 """
 
 import abc
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
@@ -158,6 +159,10 @@ class AbstractLink(AbstractPart):
         """Hook: a copy with omitted numbers computed from the given poses; see `filled`."""
         del space, poses
         return self
+
+    def wrapped(self, wrap: Callable[["AbstractLink"], "AbstractLink"]) -> "AbstractLink":
+        """Hook: what `wrap` makes of the part whose kernel sees the poses of the bodies, usually this one."""
+        return wrap(self)
 
     def anchor(self, k: int) -> Array | None:
         """The part's point [m] on its k-th body, in that body's frame; None if it has none."""

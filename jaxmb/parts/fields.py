@@ -328,11 +328,11 @@ def anonymous(part: Any) -> Any:
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
     for name, own in declarations(type(part)).items():
-        value = getattr(part, name)
+        value: Any = getattr(part, name)
         if own.kind == "part" and value is not None:
             held = [((*prefix, name), value)]
         elif own.kind == "parts":
-            held = [((*prefix, name, key), inner) for key, inner in value.items()]
+            held = [((*prefix, name, key), value[key]) for key in value or ()]
         else:
             continue
         for keys, inner in held:

@@ -15,7 +15,6 @@ from .base import (
     AbstractVelocityConstraint,
 )
 from .frames import AbstractFrame
-from .servo import Servo
 from .space import AbstractSpace
 
 
@@ -30,15 +29,16 @@ def on_frames(part: AbstractLink, frames: tuple[AbstractFrame | None, ...]) -> A
     given = {str(k): frame for k, frame in enumerate(frames) if frame is not None}
     if not given:
         return part
-    # A concrete class: the program of a servo is a constraint that acts on accelerations.
-    if isinstance(part, Servo):
-        return part.with_fields(program=on_frames(part.program, frames))
+    return part.wrapped(lambda own: _on(own, given))
+
+
+def _on(part: AbstractLink, frames: dict[str, AbstractFrame]) -> AbstractLink:
     if isinstance(part, AbstractConstraint):
-        return ConstraintOnFrames(part=part, frames=given)
+        return ConstraintOnFrames(part=part, frames=frames)
     if isinstance(part, AbstractVelocityConstraint):
-        return VelocityConstraintOnFrames(part=part, frames=given)
+        return VelocityConstraintOnFrames(part=part, frames=frames)
     assert isinstance(part, AbstractForce)
-    return ForceOnFrames(part=part, frames=given)
+    return ForceOnFrames(part=part, frames=frames)
 
 
 class AbstractOnFrames(AbstractPart):

@@ -118,7 +118,7 @@ class Series(AbstractSignal):
         values = np.asarray(self.values).reshape(len(self.ts), -1)
         return np.asarray(self.ts)[1:][np.any(np.diff(values, axis=0) != 0, axis=1)]
 
-    def check_interval(self, label, t0, t1):
+    def check_interval(self, label, t0: Any, t1: Any):
         if is_traced((self.ts, t0, t1)):
             return
         first, last = float(self.ts[0]), float(self.ts[-1])
@@ -136,9 +136,9 @@ class Series(AbstractSignal):
 class Signal(AbstractSignal):
     """A value from a function of time. The arrays of a function that is an equinox module are differentiable."""
 
-    function: Callable[[Scalar], Array]
+    function: Any
 
-    def __init__(self, function: Callable[[Scalar], Array]):
+    def __init__(self, function: Callable[..., Any]):
         self.function = function if isinstance(function, eqx.Module) else _Static(function)
 
     def __call__(self, t):

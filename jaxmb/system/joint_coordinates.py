@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,9 +37,10 @@ class JointCoordinate(NamedTuple):
 def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name."""
     space, out = layout.space, {}
-    ground = jnp.tile(space.prepare(np.asarray(space.ground, jnp.result_type(float))), (layout.bodies + 1, 1))
+    ground: Any = np.asarray(space.ground, jnp.result_type(float))
+    poses = jnp.tile(space.prepare(ground), (layout.bodies + 1, 1))
     for g, own in enumerate(groups):
-        found = jax.eval_shape(own.coordinates, jnp.zeros(()), ground)
+        found = jax.eval_shape(own.coordinates, jnp.zeros(()), poses)
         for field, values in found.items():
             for k, name in enumerate(own.group.names):
                 coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)

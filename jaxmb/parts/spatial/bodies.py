@@ -72,7 +72,7 @@ class Body(AbstractRigidBody):
         pose = super().pose()
         if self.centre is None:
             return pose
-        return pose + np.append(rot.rotate(pose[3:], self.centre), np.zeros(4))
+        return pose + np.append(rot.rotate(rot.normalize(self.orientation), self.centre), np.zeros(4))
 
     def velocities(self):
         velocities = super().velocities()
