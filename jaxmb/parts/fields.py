@@ -332,7 +332,7 @@ def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple
         if own.kind == "part" and value is not None:
             held = [((*prefix, name), value)]
         elif own.kind == "parts":
-            held = [((*prefix, name, key), value[key]) for key in value or ()]
+            held = [((*prefix, name, key), inner) for key, inner in (value or {}).items()]
         else:
             continue
         for keys, inner in held:
