@@ -205,7 +205,17 @@ def drag(poses, velocities, t, p):
     return -p["drag"] * jnp.sum(velocities**2) * velocities
 
 
+def of_joint(cls, parameter, *, rests=True, **options):
+    """A part of the angle of a pin."""
+    own = body_2d(f"{cls.__name__} body")
+    pin = pin_2d(own)
+    return Example(cls(cls.__name__, f"{pin.name}.angle", **options), [own], parameter, (pin,), (hold_2d(own),), rests)
+
+
 FUNCTIONS = [
+    of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
+    of_joint(mb.JointForce, "force", force=0.8),
+    of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
     on_body_2d(mb.Constraint, "curvature", function=on_parabola, parameters={"curvature": 0.4}, rheonomic=False),
     on_body_2d(mb.VelocityConstraint, "angle", function=skate, parameters={"angle": 0.1}, homogeneous=True),
     on_body_2d(mb.Force, "drag", function=drag, parameters={"drag": 0.2}),

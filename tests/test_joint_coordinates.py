@@ -150,7 +150,7 @@ def test_coordinates_of_joints_that_are_not_there(arm, options, message):
 
 def test_a_joint_says_which_coordinates_it_has(arm):
     motion = mb.simulate(arm, mb.assemble(arm), t1=0.01)
-    with pytest.raises(AttributeError, match="'knee' has angle_a, angle_a_acceleration, angle_a_rate, angle_b"):
+    with pytest.raises(AttributeError, match="'knee' has angle_a, angle_a_acceleration"):
         _ = motion["knee"].angle
-    with pytest.raises(ValueError, match="Unknown body or joint 'hips'"):
+    with pytest.raises(ValueError, match="Unknown body, joint or frame 'hips'"):
         _ = motion["hips"]
