@@ -32,6 +32,8 @@ INDEPENDENT = 1e-5
 
 # Largest number of Gauss–Newton steps to the constraints.
 _ITERATIONS = 100
+# Each of them must reduce the squares of the residuals to less than this share.
+_PROGRESS = 0.999
 
 # Newton's method on the optimality conditions, started near their solution: size of its last step, and largest number
 # of steps.
@@ -163,8 +165,11 @@ def meet_constraints(
         step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
         lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
         sizes = jax.vmap(lambda a: squares(q + a * step))(lengths)
-        q = q + lengths[jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))] * step
-        return (q, jacobian), jnp.max(jnp.abs(step))
+        sizes = jnp.where(jnp.isfinite(sizes), sizes, jnp.inf)
+        best = jnp.argmin(sizes)
+        # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
+        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
+        return (q + lengths[best] * step, jacobian), jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
 
     def far(at, size):
         q, _ = at

@@ -94,7 +94,7 @@ def sweep(
     **Returns:** an `xarray.Dataset`, with a dimension for each parameter of a grid, or else with the dimension
     `member`; parameters are coordinates. With the outputs there are `status`: 0 pending, 1 ok, 2 an output is not
     finite, and further numbers by `flag_meanings` of its attributes; `message`, empty if ok; and `num_steps` if it is
-    known. A member that fails costs nothing to the others. With a store, a list of members is read when it is looked
+    known. A member that fails does not spoil the others. With a store, a list of members is read when it is looked
     at.
 
     **Raises:** `ValueError` for names that are unknown, missing, or there twice, for values that do not fit, for a
