@@ -22,7 +22,7 @@ from .parts.base import (
 from .parts.boundary import check_kernels
 from .parts.fields import anonymous, declarations, inner_parts
 from .parts.forces import Gravity
-from .parts.frames import AbstractFrame, LinkFrame
+from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
 from .parts.names import unknown
 from .parts.on_frames import framed, on_frames
@@ -97,36 +97,9 @@ class Scene(eqx.Module):
         )
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
-        frames = _frames(self)
-        index |= {name: index[_body_of(frame)] for name, frame in frames.items()}
-        gravity, parts, laws, joints = None, [], [], {}
-        # Parts of joints after the joints that they act on.
-        for part in sorted((*self.joints, *self.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
-            if isinstance(part, AbstractNonIdeal):
-                joint, own, on = joints[part.joint]
-                if any(on) and getattr(part, "point", None) is not None:
-                    raise ValueError(f"{part.label}: leave point out; {joint.label} is on frames, and has its own.")
-                laws.append((part.resolve(space, on_frames(joint, on), given[list(own)]), own))
-            elif isinstance(part, AbstractCoordinatePart):
-                joint, own, on = joints[part.joint_name]
-                resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
-                parts.append((on_frames(resolved, on), own))
-            elif isinstance(part, AbstractLink):
-                own = tuple(index[name] for name in part.bodies)
-                moving = [k for k in own if k < len(self.bodies)]
-                if len({*moving}) < len(moving):
-                    raise ValueError(f"{part.label} connects two frames of one body: {', '.join(part.bodies)}.")
-                on = tuple(frames.get(name) for name in part.bodies)
-                poses = given[list(own)]
-                resolved = _call(part, "resolve", space, framed(space, on, poses) if any(on) else poses)
-                joints[part.name] = resolved, own, on
-                components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
-                components = tuple(on_frames(component, on) for component in components)
-                _check_rotation(resolved, components, own, layout, poses)
-                parts += [(component, own) for component in components]
-            else:
-                part.check(space.dimension)
-                gravity = part
+        frames = frames_by_name(self.frames, self.bodies)
+        index |= {name: index[frame.of_body] for name, frame in frames.items()}
+        parts, laws, gravity = _resolved(self, layout, index, frames, given)
 
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
@@ -155,36 +128,41 @@ class Scene(eqx.Module):
         return with_structure(system)
 
 
-def _frames(scene: Scene) -> dict[str, AbstractFrame]:
-    """Frames by name with their bases, also those of bodies whose mass centre is not their origin."""
-    given = {frame.name: frame for frame in scene.frames}
-    bodies = {body.name: body for body in scene.bodies}
-    out: dict[str, Any] = {
-        name: LinkFrame(name=name, body=name, centre=body.centre)
-        for name, body in bodies.items()
-        if getattr(body, "centre", None) is not None
-    }
+def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[str, AbstractFrame], given: Any):
+    """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity.
 
-    def based(name, path):
-        if name in out or name not in given:
-            return
-        frame = given[name]
-        if name in path:
-            raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
-        if frame.body not in (*given, *bodies, GROUND):
-            raise ValueError(f"{frame.label}: {unknown('body', frame.body, [*bodies, GROUND, *given])}")
-        based(frame.body, (*path, name))
-        frame.check(scene.bodies[0].dimension)
-        out[name] = frame.with_fields(base=out.get(frame.body))
-
-    for name in given:
-        based(name, ())
-    return out
-
-
-def _body_of(frame: AbstractFrame) -> str:
-    """The name of the body that a frame is fixed in."""
-    return frame.body if frame.base is None else _body_of(frame.base)
+    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `given`: the poses of all bodies.
+    """
+    space = layout.space
+    gravity, parts, laws, joints = None, [], [], {}
+    # Parts of joints after the joints that they act on.
+    for part in sorted((*scene.joints, *scene.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
+        if isinstance(part, AbstractNonIdeal):
+            joint, own, on = joints[part.joint]
+            if any(on) and getattr(part, "point", None) is not None:
+                raise ValueError(f"{part.label}: leave point out; {joint.label} is on frames, and has its own.")
+            laws.append((part.resolve(space, on_frames(joint, on), given[list(own)]), own))
+        elif isinstance(part, AbstractCoordinatePart):
+            joint, own, on = joints[part.joint_name]
+            resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
+            parts.append((on_frames(resolved, on), own))
+        elif isinstance(part, AbstractLink):
+            own = tuple(index[name] for name in part.bodies)
+            moving = [k for k in own if k < len(scene.bodies)]
+            if len({*moving}) < len(moving):
+                raise ValueError(f"{part.label} connects two frames of one body: {', '.join(part.bodies)}.")
+            on = tuple(frames.get(name) for name in part.bodies)
+            poses = given[list(own)]
+            resolved = _call(part, "resolve", space, framed(space, on, poses) if any(on) else poses)
+            joints[part.name] = resolved, own, on
+            components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
+            components = tuple(on_frames(component, on) for component in components)
+            _check_rotation(resolved, components, own, layout, poses)
+            parts += [(component, own) for component in components]
+        else:
+            part.check(space.dimension)
+            gravity = part
+    return parts, laws, gravity
 
 
 def _check_program(servo, space, bodies):

@@ -1,13 +1,15 @@
 """Named frames fixed in bodies, which parts may act on and whose motion may be observed."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 
 from ..linalg.arrays import namespace
 from . import fields
-from .base import AbstractPart
+from .base import GROUND, AbstractBody, AbstractPart
+from .names import unknown
 from .space import AbstractSpace, Point, Pose, Velocity, Wrench
 
 
@@ -37,6 +39,11 @@ class AbstractFrame(AbstractPart):
     @abc.abstractmethod
     def own_point(self, point: Point) -> Point:
         """The point of the base [m] at a point of the frame."""
+
+    @property
+    def of_body(self) -> str:
+        """The name of the body that the frame is fixed in."""
+        return self.body if self.base is None else self.base.of_body
 
     # From the body itself.
 
@@ -87,3 +94,33 @@ class LinkFrame(AbstractFrame):
 
     def own_point(self, point):
         return point - self.centre
+
+
+def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBody]) -> dict[str, AbstractFrame]:
+    """Checked frames with their bases, by name; also those of the bodies whose mass centre is not their origin, by the
+    names of these.
+
+    **Raises:** `ValueError` for frames on unknown bodies, and those that are fixed in themselves.
+    """
+    given, known = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
+    out: dict[str, Any] = {
+        name: LinkFrame(name=name, body=name, centre=body.centre)
+        for name, body in known.items()
+        if getattr(body, "centre", None) is not None
+    }
+
+    def based(name, path):
+        if name in out or name not in given:
+            return
+        frame = given[name]
+        if name in path:
+            raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
+        if frame.body not in (*given, *known, GROUND):
+            raise ValueError(f"{frame.label}: {unknown('body', frame.body, [*known, GROUND, *given])}")
+        based(frame.body, (*path, name))
+        frame.check(bodies[0].dimension)
+        out[name] = frame.with_fields(base=out.get(frame.body))
+
+    for name in given:
+        based(name, ())
+    return out

@@ -37,8 +37,9 @@ def _on(part: AbstractLink, frames: dict[str, AbstractFrame]) -> AbstractLink:
         return ConstraintOnFrames(part=part, frames=frames)
     if isinstance(part, AbstractVelocityConstraint):
         return VelocityConstraintOnFrames(part=part, frames=frames)
-    assert isinstance(part, AbstractForce)
-    return ForceOnFrames(part=part, frames=frames)
+    if isinstance(part, AbstractForce):
+        return ForceOnFrames(part=part, frames=frames)
+    raise ValueError(f"{part.label} has friction of its own parts and cannot be on frames; name its bodies.")
 
 
 class AbstractOnFrames(AbstractPart):
