@@ -34,6 +34,7 @@ from jaxmb.parts import (
     fields,
     terrain,
 )
+from jaxmb.system import Solved
 
 TIMES = np.array([0.06, 0.1])
 MOTION = ("position", "velocity", "angle", "orientation", "angular_velocity")
@@ -99,7 +100,7 @@ def at_one_instant(examples, formulation):
     def observe(system, extra, rtol, adjoint):
         state, t = mb.assemble(system, throw=False), jnp.zeros(())
         udot, multipliers = formulations.accelerations(system, formulation, t, state.q, state.u)
-        along = t[None], mb.State(state.q[None], state.u[None]), multipliers[None]
+        along = t[None], mb.State(state.q[None], state.u[None]), Solved(udot[None], multipliers[None])
         out = {}
         for name in (name for machine in machines for name in machine.outputs):
             body, field = name.rsplit(".", 1)
