@@ -207,7 +207,7 @@ def test_no_effect(system):
         ({"measured": {"rod.angle": np.zeros(29)}}, "must have shape"),
         ({"measured": {}}, "at least one quantity"),
         ({"measured": None}, "either measured quantities"),
-        ({"sigma": {"rod.position": 1.0}}, "not for 'rod.angle'"),
+        ({"sigma": {"rod.position": 1.0}}, "'rod.position', which is not measured"),
         ({"sigma": {"rod.angle": 0.0}}, "must be positive"),
         ({"ts": TS[::-1]}, "increasing"),
         ({"t0": 0.5}, "after t0"),

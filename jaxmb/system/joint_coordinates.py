@@ -63,22 +63,22 @@ def joint_quantities(system: AbstractSystem, known: Mapping[str, JointCoordinate
 
 
 def _along(system, coordinate, order, ts, ys, solved):
-    accelerations = ys.u if solved is None else solved.accelerations
-    every = jax.vmap(lambda t, y, a: _derivatives(system, coordinate, t, y, a, 1 if order < 2 else 2))
-    values = every(ts, ys, accelerations)
-    return _continued(ts, *values[:2]) if order == 0 and coordinate.periodic else values[order]
+    def with_rate(t, q, u):
+        """The coordinate and its rate."""
+        value = lambda t, q: system.joint_coordinate(coordinate, t, q)
+        return jax.jvp(value, (t, q), (jnp.ones_like(t), system.rates(t, q, u)))
 
+    def acceleration(t, q, u, udot):
+        rate = lambda t, q, u: with_rate(t, q, u)[1]
+        return jax.jvp(rate, (t, q, u), (jnp.ones_like(t), system.rates(t, q, u), udot))[1]
 
-def _derivatives(system, coordinate, t, y, acceleration, order) -> tuple[Array, ...]:
-    """The coordinate and its derivatives with respect to time up to an order, 1 or 2."""
-    t = jnp.asarray(t, y.q.dtype)
-    one = jnp.ones_like(t)
-    value = lambda t, q: system.joint_coordinate(coordinate, t, q)
-    along = lambda t, q, u: jax.jvp(value, (t, q), (one, system.rates(t, q, u)))
+    ts = jnp.asarray(ts, ys.q.dtype)
+    if order == 2:
+        return jax.vmap(acceleration)(ts, ys.q, ys.u, solved.accelerations)
+    value, rate = jax.vmap(with_rate)(ts, ys.q, ys.u)
     if order == 1:
-        return along(t, y.q, y.u)
-    both, second = jax.jvp(along, (t, y.q, y.u), (one, system.rates(t, y.q, y.u), acceleration))
-    return *both, second[1]
+        return rate
+    return _continued(ts, value, rate) if coordinate.periodic else value
 
 
 def _continued(ts, angles, rates):
