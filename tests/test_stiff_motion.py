@@ -105,7 +105,7 @@ def test_every_stiffness(stiffness, damping):
 
 @pytest.mark.parametrize("ratio", [1e-8, 1e-4, 1e4, 1e8])
 def test_every_ratio_of_masses(ratio):
-    loose, tight = (bushing()(mass=3.0 * ratio, rtol=rtol) for rtol in (1e-5, 1e-7))
+    loose, tight = (bushing()(mass=3.0 * ratio, rtol=rtol) for rtol in (2e-4, 2e-6))
     assert loose[2] and tight[2]
     np.testing.assert_allclose(loose[0].q, tight[0].q, rtol=0, atol=2e-4 * np.max(np.abs(tight[0].q)))
 

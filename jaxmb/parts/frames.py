@@ -104,9 +104,9 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
     """
     given, known = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
     out: dict[str, Any] = {
-        name: LinkFrame(name=name, body=name, centre=body.centre)
+        name: LinkFrame(name=name, body=name, centre=centre)
         for name, body in known.items()
-        if getattr(body, "centre", None) is not None
+        if (centre := getattr(body, "centre", None)) is not None
     }
 
     def based(name, path):

@@ -227,7 +227,7 @@ class AbstractBodySystem(AbstractSystem):
         return out | frame_quantities(self, self.frames, self.layout)
 
     def joint_coordinates(self):
-        return joint_coordinates(self.constraints, self.layout)
+        return joint_coordinates(self.constraints, self.layout, batch=self.length.ndim)
 
     def joint_coordinate(self, coordinate, t, q):
         values = self.constraints[coordinate.group].coordinates(t, self.prepared_poses(q))

@@ -34,13 +34,14 @@ class JointCoordinate(NamedTuple):
     periodic: bool
 
 
-def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout) -> dict[str, JointCoordinate]:
-    """The coordinates of all joints, by name."""
+def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout, batch: int = 0) -> dict[str, JointCoordinate]:
+    """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
     space, out = layout.space, {}
     ground: Any = np.asarray(space.ground, jnp.result_type(float))
     poses = jnp.tile(space.prepare(ground), (layout.bodies + 1, 1))
     for g, own in enumerate(groups):
-        found = jax.eval_shape(own.coordinates, jnp.zeros(()), poses)
+        single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[batch:], x.dtype), own)
+        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), single, jnp.zeros(()), poses)
         for field, values in found.items():
             for k, name in enumerate(own.group.names):
                 coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)
