@@ -233,17 +233,17 @@ def test_several_starts_find_the_best_minimum():
     common = {
         "ts": ts,
         "fix": {"theta": 0.5},
-        "free": {"length": 2.6},
-        "bounds": {"length": (0.3, 4.0)},
+        "free": {"length": 1.4},
+        "bounds": {"length": (0.4, 1.6)},
         "sigma": {"theta": 0.01},
         "solver": TSIT5,
     }
     data = {"theta": true["theta"]}
     alone = mb.identify(own, data, **common)
     assert abs(alone.parameters["length"] - 0.8) > 0.1
-    several = mb.identify(own, data, starts=12, **common)
+    several = mb.identify(own, data, starts=24, **common)
     np.testing.assert_allclose(several.parameters["length"], 0.8, rtol=1e-5)
-    assert len(several.objectives) == 12 and list(several.objectives) == sorted(several.objectives)
+    assert len(several.objectives) == 24 and list(several.objectives) == sorted(several.objectives)
     given = mb.identify(own, data, starts=[{"length": 0.9}], **common)
     np.testing.assert_allclose(given.parameters["length"], 0.8, rtol=1e-5)
 
