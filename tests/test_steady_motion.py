@@ -75,8 +75,8 @@ def test_a_flyball_governor_balances_its_springs():
     _, s = scipy.optimize.fsolve(slope, [0.3, 0.6], xtol=1e-12)
     names = mechanism.system.coordinate_names()
     assert float(state.q[names["slider.z"][0]]) == pytest.approx(s, abs=1e-4)
-    # Four freedoms: the turn of the shaft, two arms and the slider on its springs. Turn and speed of the free shaft have
-    # no effect on the others, so that no eigenvalue is positive.
+    # Four freedoms: the turn of the shaft, two arms and the slider on its springs. Turn and speed of the free shaft
+    # have no effect on the others, so that no eigenvalue is positive.
     linear = mb.linearise(mechanism.system, state, coordinates=["slider.z", "shaft.rotation_z"])
     assert np.max(linear.eigenvalues.real) < 1e-6 and len(linear.states) == 8
 
