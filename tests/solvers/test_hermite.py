@@ -101,9 +101,10 @@ def test_error_is_in_proportion_to_the_tolerance(name, rtol):
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
 def test_robertson_does_not_break_down(rtol):
     problem = PROBLEMS["Robertson"]
-    solution = solve(problem, rtol)
+    # Steps err by a twentieth of the tolerance, so each may err by `rtol`.
+    solution = solve(problem, 20 * rtol)
     assert np.all(np.abs(solution.ys[-1] / problem.y1 - 1)[[0, 2]] <= 100 * rtol)
-    assert solution.stats["num_steps"] < 2000
+    assert solution.stats["num_steps"] < 1000
 
 
 @pytest.mark.parametrize("family, points", [("E", (2, 4)), ("H", (1, 2)), ("B", None), ("Y", None), ("E", (1,))])
