@@ -18,8 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..._types import Scalar, State
-from ...formulations import accelerations
-from ...manifold.manifold import all_rows_formulation
+from ...formulations import Partitioned, accelerations
 from ...system import AbstractSystem, Solved, parameters, with_parameters
 from .comoving import carriers
 from .perturbations import Perturbations, StateNames, perturbations
@@ -33,8 +32,12 @@ _SAME = 1e-6
 
 
 def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
-    """q̇ and u̇ of a state, and the multipliers."""
-    udot, multipliers = accelerations(system, all_rows_formulation(system), t, state.q, state.u)
+    """q̇ and u̇ of a state, and the multipliers.
+
+    In independent accelerations: with multipliers, derivatives along the motion of light and heavy bodies together lose
+    as many digits as their masses differ by.
+    """
+    udot, multipliers = accelerations(system, Partitioned(), t, state.q, state.u)
     return State(system.rates(t, state.q, state.u), udot), multipliers
 
 
