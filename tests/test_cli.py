@@ -1,6 +1,5 @@
 """The command line, run in this process."""
 
-import importlib
 import json
 import subprocess
 import sys
@@ -9,7 +8,8 @@ import diffrax
 import pytest
 
 import jaxmb as mb
-from jaxmb.cli import _parser, main
+from jaxmb.cli import main
+from jaxmb.cli.commands import parser
 
 
 def test_mechanisms(capsys):
@@ -21,7 +21,7 @@ def test_mechanisms(capsys):
 
 def test_run(capsys, tmp_path, monkeypatch):
     """A run prints errors against reference values and a fit next to the truth, and writes its files."""
-    monkeypatch.setattr("jaxmb.cli._TOLERANCES", (1e-6,))
+    monkeypatch.setattr("jaxmb.cli.run._TOLERANCES", (1e-6,))
     assert main(["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     for text in ("pendulum", "elliptic functions", "Error against run time", "Identifying bar.length", "true value 1"):
@@ -34,9 +34,8 @@ def test_run(capsys, tmp_path, monkeypatch):
 
 def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
     """Coordinates take the place of positions, and of the picture of the mechanism."""
-    monkeypatch.setattr("jaxmb.cli._TOLERANCES", (1e-6,))
-    module = importlib.import_module("jaxmb.report.work_precision")
-    monkeypatch.setattr(module, "default_solvers", lambda: {"Dopri8": diffrax.Dopri8()})
+    monkeypatch.setattr("jaxmb.cli.run._TOLERANCES", (1e-6,))
+    monkeypatch.setattr("jaxmb.cli.run.default_solvers", lambda: {"Dopri8": diffrax.Dopri8()})
     assert main(["run", "roller_racer", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     for text in (
@@ -53,7 +52,7 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path, monkeypatch):
 
 def test_report(capsys, tmp_path, monkeypatch):
     """Of a mechanism, and of a variant of it."""
-    monkeypatch.setattr("jaxmb.cli._REPORT_VARIANTS", {"pendulum": ({"mass": 2.0},)})
+    monkeypatch.setattr("jaxmb.cli.report._VARIANTS", {"pendulum": ({"mass": 2.0},)})
     words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -123,7 +122,7 @@ def test_no_command(capsys):
 
 
 def test_parameters_of_a_mechanism():
-    parse = _parser().parse_args
+    parse = parser().parse_args
     assert dict(parse(["run", "tracked_vehicle", "--set", "units=2", "--set", "model=bodies"]).set) == {
         "units": 2,
         "model": "bodies",

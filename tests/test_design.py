@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from identifying import free_parameters
 
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
 from jaxmb.report.subject import subject
-from jaxmb.studies.ranges import free_parameters
 
 HALF = jnp.array([0.5, 0.0])
 FIX = {"crank.angle": np.pi}
@@ -105,7 +105,7 @@ def test_a_lagrangian_system_has_design_variables():
 
 
 def test_studies_take_the_bounds(machine):
-    free = free_parameters(machine, {"rod": 3.0}, None)
+    free = free_parameters(machine, {"rod": 3.0})
     far = free(jnp.array([200.0]))["rod"]
     np.testing.assert_allclose(far, 9.0)
     assert mb.parameters(mb.with_parameters(machine, {"rod": far}))["rod"] == far

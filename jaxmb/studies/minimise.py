@@ -95,10 +95,12 @@ def _trials(
     free = np.ones(z.size, bool) if held is None else ~held
 
     def at(point, model):
-        numbers = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
-        return point, *numbers, model.value
+        residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
+        return point, residuals, jacobian, model.value if np.all(np.isfinite(jacobian)) else np.inf
 
     z, residuals, jacobian, objective = at(z, (yield z))
+    if not np.isfinite(objective):
+        return Minimum(z, 1, False, np.inf)
     damping, growth = _FIRST_DAMPING, 2.0
     for iteration in range(1, limit):
         norms = np.linalg.norm(jacobian, axis=0)

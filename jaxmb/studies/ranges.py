@@ -1,7 +1,7 @@
 """Bijections between bounded parameters and an unconstrained vector, which is zero at the starting values."""
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -9,11 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-
-from .._types import VectorLike
-from ..parts.names import unknown
-from ..system import AbstractSystem, parameters
-from ..system.design import design_bounds
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -208,50 +203,6 @@ class FreeParameters(eqx.Module):
         number = self.names.index(name)
         first = sum(r.size for r in self.ranges[:number])
         return slice(first, first + self.ranges[number].size)
-
-
-def free_parameters(
-    system: AbstractSystem,
-    free: Mapping[str, VectorLike] | Sequence[str],
-    bounds: Mapping[str, Bounds] | None,
-) -> FreeParameters:
-    """Free parameters with their starting values and ranges.
-
-    **Arguments:** `free`: starting values by name, or names alone, starting from the system's own values; `bounds`:
-    `(low, high)` by name, either of them None; default those of design variables. The system's `positive_parameters`,
-    such as masses and moments of inertia of bodies, stay positive without bounds, or positive definite if they are
-    matrices.
-
-    **Raises:** `ValueError` for unknown names, wrong shapes, and starting values that are not strictly within their
-    bounds.
-    """
-    known = parameters(system)
-    starts = starting_values(free, known)
-    for name in bounds or {}:
-        if name not in starts:
-            raise unknown("free parameter with bounds", name, starts)
-    bounds = design_bounds(system, bounds)
-    positive = system.positive_parameters()
-    ranges = [
-        range_of(name, value, known[name], bounds.get(name), positive=name in positive)
-        for name, value in starts.items()
-    ]
-    return FreeParameters(tuple(starts), tuple(ranges))
-
-
-def starting_values(
-    free: Mapping[str, VectorLike | None] | Sequence[str], known: Mapping[str, Array]
-) -> dict[str, VectorLike]:
-    """Starting values by name; those that are not given are the known ones."""
-    if isinstance(free, str):
-        free = (free,)
-    if not free:
-        raise ValueError("Nothing is free: give the names of the parameters, or their starting values by name.")
-    for name in free:
-        if name not in known:
-            raise unknown("parameter", name, known)
-    given = free if isinstance(free, Mapping) else dict.fromkeys(free)
-    return {name: known[name] if value is None else value for name, value in given.items()}
 
 
 def range_of(

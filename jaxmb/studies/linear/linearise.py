@@ -54,8 +54,8 @@ def linearise(
     - `coordinates`: names of coordinates that should be states: entries of q, `"crank.angle"`; displacements and small
         turns of spatial bodies about their own axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a
         smooth function of q. They may be fewer than the independent ones; the others are chosen, by pivoting.
-    - `rates`: likewise names of velocities, `"crank.angle"`, `"frame.wx"`, or `"crank.angle.rate"` of any coordinate;
-        default the rates of the coordinates, as far as they are independent.
+    - `rates`: likewise names of velocities, `"crank.angle"`, `"frame.wx"`, of joints' coordinates, `"hip.angle"`, or
+        `"crank.angle.rate"` of any coordinate; default the rates of the coordinates, as far as they are independent.
 
     **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have no names but numbers, since numbers decide
     on the choice; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to parameters
@@ -107,7 +107,7 @@ def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations
 
 def _rate_label(system, name):
     """The name of a rate as a state, which differs from that of its coordinate."""
-    return f"{name}.rate" if name in system.coordinate_names() else name
+    return f"{name}.rate" if name in {**system.coordinate_names(), **system.joint_coordinates()} else name
 
 
 def _label(item, shapes):

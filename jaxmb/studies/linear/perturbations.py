@@ -121,7 +121,7 @@ def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Ca
     base = name.removesuffix(".rate")
     if base in known:
         return lambda state: state.u[known[base][0]]
-    if base != name:
+    if base != name or name in system.joint_coordinates():
         function = coordinate_function(system, t, at, base)
         if not _depends_on_velocities(function, at):
             return lambda state: _rate(system, t, function, state)

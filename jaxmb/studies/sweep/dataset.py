@@ -91,8 +91,9 @@ def load_sweep(store: str | Path) -> Any:
 def unstacked(dataset: Any) -> Any:
     """A result with the messages of its members, and with the dimensions of its grid instead of that of members."""
     (xarray,) = packages("xarray")
-    messages = np.array(json.loads(dataset["status"].attrs.pop("messages")))
-    dataset["message"] = (MEMBER, messages[dataset["status"].to_numpy()])
+    messages = json.loads(dataset["status"].attrs.pop("messages"))
+    # As long as the longest message that occurs, not the longest one there is.
+    dataset["message"] = (MEMBER, np.array([messages[code] for code in dataset["status"].to_numpy()]))
     dataset.attrs.pop("coordinates", None)
     grid = json.loads(dataset.attrs.pop("grid"))
     if not grid:

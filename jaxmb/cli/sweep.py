@@ -1,16 +1,16 @@
 """`jaxmb sweep file.py --out runs.zarr`."""
 
 import argparse
-import importlib.util
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from ...parts.names import unknown
-from .outputs import OK
-from .sweep import sweep
+from ..parts.names import unknown
+from ..studies.sweep import sweep
+from ..studies.sweep.outputs import OK
+from .subject import module_from
 
 _OPTIONS = ("dims", "coords", "units")
 
@@ -33,16 +33,6 @@ def add_to(commands: Any) -> None:
     command.add_argument("--chunk", type=int, help="members computed together (default 256 or fewer)")
     command.add_argument("--overwrite", action="store_true", help="replace a store that holds another sweep")
     command.set_defaults(command=_sweep)
-
-
-def module_from(source: str) -> ModuleType:
-    """A user's file as a module, which cannot be imported by its name."""
-    spec = importlib.util.spec_from_file_location(Path(source).stem, source)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{source} is no Python file.")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def _sweep(arguments: argparse.Namespace) -> None:

@@ -1,0 +1,3 @@
+"""The command line: `jaxmb mechanisms | run | report | sweep`."""
+
+from .commands import main as main

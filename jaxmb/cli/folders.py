@@ -1,0 +1,49 @@
+"""The folder that a command writes to."""
+
+import argparse
+import os
+from pathlib import Path
+
+from ..report import WorkPrecision
+from ..trajectory import Trajectory
+from ..viz import plot_mechanism, plot_motion
+
+
+def output_folder(arguments: argparse.Namespace) -> Path:
+    """The folder that was asked for, or the default."""
+    return Path("jaxmb-output") / arguments.mechanism.split(":")[-1] if arguments.out is None else arguments.out
+
+
+def check_folder(arguments: argparse.Namespace) -> None:
+    """Raise a `ValueError`, before anything is computed, for a folder that cannot be written to."""
+    out = output_folder(arguments)
+    existing = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise ValueError(f"--out {out}: {existing} is a file and not a folder; give another folder.")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {out}: {existing} is not writable; give another folder.")
+
+
+def made_folder(arguments: argparse.Namespace) -> Path:
+    """The folder, which is there afterwards."""
+    out = output_folder(arguments)
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def write_figures(out: Path, precision: WorkPrecision, trajectory: Trajectory | None) -> None:
+    """Write the figures of a report and of a motion; without Matplotlib, say so."""
+    try:
+        precision.figure(out / "work_precision.png")
+        written = [out / "work_precision.png"]
+        if trajectory is not None:
+            figures = {"motion.png": plot_motion(trajectory)}
+            if trajectory.system.has_bodies:
+                figures["mechanism.png"] = plot_mechanism(trajectory)
+            for name, figure in figures.items():
+                figure.savefig(out / name, dpi=150)
+                written.append(out / name)
+    except ImportError as error:
+        print(error)
+        return
+    print("Wrote " + ", ".join(map(str, written)))

@@ -1,0 +1,165 @@
+"""`jaxmb run NAME`: simulate a mechanism, compare it with its reference values, and fit one of its parameters."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..mechanisms import Mechanism
+from ..report import work_precision
+from ..report.work_precision import default_solvers
+from ..simulate import simulate
+from ..states.assembly import assemble
+from ..studies.identify import identify
+from ..system import parameters, with_parameters
+from ..trajectory import Trajectory
+from .folders import check_folder, made_folder, write_figures
+from .options import add_parameters
+from .subject import mechanism_of
+
+# What `run` does: saved times, tolerances of the table, and the fit of one parameter to every other saved time of the
+# first part of the motion, with noise, from a start that is off.
+_TIMES = 401
+_TOLERANCES = (1e-5, 1e-7, 1e-9)
+_FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to a parser's commands."""
+    command = commands.add_parser(
+        "run", help="simulate a mechanism, compare it with its reference values, and fit one of its parameters"
+    )
+    command.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
+    command.add_argument("--rtol", type=float, default=1e-9, help="relative tolerance of a step (default %(default)g)")
+    command.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
+    command.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
+    command.set_defaults(command=_run)
+    add_parameters(command)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    check_folder(arguments)
+    mechanism = mechanism_of(arguments)
+    print(f"{mechanism.name}: {mechanism.description}\n\n{mechanism.system}\n")
+
+    trajectory, seconds = _simulate(mechanism, arguments.rtol)
+    stats = {name: int(trajectory.stats[name]) for name in ("num_steps", "num_rejected_steps", "num_evaluations")}
+    print(
+        f"Motion over {mechanism.t1:g} s at rtol {arguments.rtol:g}: {stats['num_steps']} steps "
+        f"({stats['num_rejected_steps']} rejected), {stats['num_evaluations']} evaluations, "
+        f"{seconds:.1f} s with compiling; {_residuals(trajectory)}."
+    )
+    _compare(mechanism, trajectory)
+
+    print("\nError against run time:")
+    chosen = {name: solver for name, solver in default_solvers().items() if name != "Tsit5"}
+    precision = work_precision(mechanism, solvers=chosen, tolerances=_TOLERANCES)
+    print(precision)
+
+    _fit(mechanism, trajectory)
+
+    out = made_folder(arguments)
+    trajectory.save(out / "motion.npz")
+    print(f"\nWrote {out / 'motion.npz'}")
+    write_figures(out, precision, trajectory)
+
+
+def _simulate(mechanism: Mechanism, rtol: float) -> tuple[Trajectory, float]:
+    ts = np.linspace(0.0, mechanism.t1, _TIMES)
+    if mechanism.references is not None:
+        times = mechanism.references.times
+        apart = np.min(np.abs(ts[:, None] - times[None, :]), axis=1) > 1e-9 * mechanism.t1
+        ts = np.sort(np.concatenate([ts[apart], times[times <= mechanism.t1]]))
+    meter = diffrax.TqdmProgressMeter() if sys.stderr.isatty() else diffrax.NoProgressMeter()
+    begin = time.perf_counter()
+    trajectory = simulate(mechanism.system, mechanism.state, t1=ts[-1], rtol=rtol, saveat=ts, progress_meter=meter)
+    jax.block_until_ready(trajectory.ys)
+    return trajectory, time.perf_counter() - begin
+
+
+def _residuals(trajectory: Trajectory) -> str:
+    if not trajectory.system.velocity_rows:
+        return "no constraints"
+    position, velocity = (float(values.max()) for values in trajectory.constraint_violation)
+    return f"largest constraint residuals {position:.1e} of positions, {velocity:.1e} 1/s of velocities"
+
+
+def _compare(mechanism: Mechanism, trajectory: Trajectory) -> None:
+    known = mechanism.references
+    if known is None:
+        print("There are no reference values for this motion.")
+        return
+    print(f"Relative error at {known.times[-1]:g} s against reference values:")
+    print(f"  {known.source}; good to {known.tolerance:.0e}")
+    errors = mechanism.errors(trajectory)
+    width = max(map(len, errors))
+    for k, (label, error) in enumerate(errors.items()):
+        print(f"  {label:{width}}  {known.values[-1, k]:20.12g}  {error[-1]:.1e}")
+
+
+def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
+    """Estimate the parameter to which the motion is most sensitive from a noisy sample of it."""
+    system = mechanism.system
+    saved = np.asarray(trajectory.ts)
+    own = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
+    ts = saved[own]
+    name = _most_sensitive(mechanism, ts)
+    if name is None:
+        print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
+        return
+    random = np.random.default_rng(0)
+    measured, sigma = {}, {}
+    for place in system.position_quantities():
+        exact = np.asarray(trajectory.quantity(place))[own]
+        noise = _NOISE * np.ptp(exact)
+        if noise > 0:
+            measured[place] = exact + noise * random.standard_normal(exact.shape)
+            sigma[place] = noise
+    true = float(parameters(system)[name])
+    what = "positions" if system.has_bodies else "coordinates"
+    print(
+        f"\nIdentifying {name} from {what} at {ts.size} times up to {ts[-1]:g} s, "
+        f"with noise of {_NOISE:.1%} of their range, from a start {_START - 1:.0%} off:"
+    )
+    start = {name: _START * true}
+    fit = identify(
+        system,
+        measured,
+        ts=ts,
+        free=start,
+        state=mechanism.state,
+        fix=mechanism.fix,
+        rates=mechanism.rates,
+        sigma=sigma,
+    )
+    print(f"{fit}\ntrue value {true:.6g}")
+
+
+def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
+    """The scalar parameter, in relative terms, that moves positions or coordinates most; None if none does."""
+    known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
+    if not known:
+        return None
+
+    @eqx.filter_jit
+    def sensitivities(system, state):
+        def positions(scale):
+            values = {name: value * factor for (name, value), factor in zip(known.items(), scale, strict=True)}
+            changed = with_parameters(system, values)
+            start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
+            adjoint = diffrax.ForwardMode()
+            motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, adjoint=adjoint, throw=False)
+            return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
+
+        return jax.jacfwd(positions)(jnp.ones(len(known)))
+
+    moved = np.linalg.norm(sensitivities(mechanism.system, mechanism.state), axis=0)
+    size = float(mechanism.system.length)
+    return list(known)[int(np.argmax(moved))] if np.max(moved) > 1e-6 * size else None

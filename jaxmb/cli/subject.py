@@ -1,0 +1,73 @@
+"""The machine that a command is about: of the library, or from a function of the user."""
+
+import argparse
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from .. import mechanisms
+from ..mechanisms import Mechanism
+from ..report.subject import subject
+from ..states.assembly import assemble
+
+
+def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
+    """The mechanism, ending at `--t1` with the reference values up to there."""
+    parameters = dict(arguments.set)
+    own = _function(arguments.mechanism) if ":" in arguments.mechanism else None
+    try:
+        mechanism = mechanisms.get(arguments.mechanism, **parameters) if own is None else _made(own, arguments)
+    except Exception as error:
+        if not parameters:
+            raise
+        # A value of the wrong type may fail anywhere in the mechanism.
+        given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
+        reason = str(error).split("\n")[0]
+        raise ValueError(f"{arguments.mechanism} cannot be built with --set {given}: {reason}") from error
+    if arguments.t1 is None:
+        return mechanism
+    if not 0 < arguments.t1 < float("inf"):
+        raise ValueError(f"--t1 must be positive and finite, got {arguments.t1:g}.")
+    return mechanism.until(arguments.t1)
+
+
+def _function(where: str) -> Callable[..., Any]:
+    """A function from `module:function` or `file.py:function`."""
+    source, _, name = where.rpartition(":")
+    try:
+        if source.endswith(".py"):
+            module = module_from(source)
+        else:
+            sys.path.insert(0, "")
+            module = importlib.import_module(source)
+        return getattr(module, name)
+    except (ImportError, FileNotFoundError, AttributeError) as error:
+        raise ValueError(f"{where}: {error}; give module:function or file.py:function.") from error
+
+
+def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechanism:
+    """The motion of a user's function: a scene, a mechanism, or system, state and perhaps t1."""
+    given, *rest = made if isinstance(made := function(**dict(arguments.set)), tuple) else (made,)
+    system = given.compile() if hasattr(given, "compile") else given
+    if hasattr(system, "references"):
+        return system
+    state = rest[0] if rest else assemble(system)
+    t1 = arguments.t1 if arguments.t1 is not None else rest[1] if len(rest) > 1 else None
+    if t1 is None:
+        raise ValueError(f"{arguments.mechanism} gives no end of the motion; add --t1 [s].")
+    return dataclasses.replace(subject(system, state, t1), name=function.__name__)
+
+
+def module_from(source: str) -> ModuleType:
+    """A user's file as a module, which cannot be imported by its name."""
+    spec = importlib.util.spec_from_file_location(Path(source).stem, source)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{source} is no Python file.")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
