@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._types import State
+from .linalg.arrays import is_traced
 from .parts.base import (
     GROUND,
     AbstractBody,
@@ -84,7 +85,7 @@ class Scene(eqx.Module):
 
         **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given
         poses, for constraints that contradict each other, and for singular poses, near which other rows are independent
-        than there; the message names the parts.
+        than there; the message names the parts. Also within a function under `jit`: change parameters there instead.
         """
         for body in self.bodies:
             _call(body, "check")
@@ -95,6 +96,8 @@ class Scene(eqx.Module):
             jax.device_put(np.concatenate([_call(body, "pose") for body in self.bodies])),
             jax.device_put(np.concatenate([_call(body, "velocities") for body in self.bodies])),
         )
+        if is_traced(guess):
+            raise ValueError("A scene cannot be compiled within a function that JAX traces, such as one under jit.")
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         frames = frames_by_name(self.frames, self.bodies)

@@ -395,3 +395,9 @@ def test_what_only_bodies_have():
             getattr(motion, name)
     with pytest.raises(ValueError, match=r"Unknown quantity 'q0.rat'; did you mean 'q0.rate'"):
         motion.quantity("q0.rat")
+
+
+def test_a_scene_is_compiled_before_it_is_traced():
+    scene = mb.Scene([planar.PointMass("mass", mass=1.0)])
+    with pytest.raises(ValueError, match="cannot be compiled within a function that JAX traces"):
+        jax.jit(lambda x: x * mb.parameters(scene.compile())["mass.mass"])(1.0)

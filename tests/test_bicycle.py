@@ -146,6 +146,7 @@ def test_the_locus_follows_weave_capsize_and_castering():
 
 
 def test_the_weave_speed_changes_with_the_trail():
+    bicycle()
 
     def growth(x):
         linear = mb.linearise(*running(x[0], x[1]), coordinates=COORDINATES, rates=RATES)

@@ -52,6 +52,11 @@ class AbstractCoordinatePart(AbstractLink):
             raise ValueError(f"{self.label}: {unknown('coordinate', self.coordinate, names)}")
         return self.with_numbers(np.asarray(known[self.within]))
 
+    def unit(self, alternatives: str) -> str:
+        """Of the units of an angle and of a displacement, `"N m or N"`, that of the coordinate."""
+        of_angle, of_displacement = alternatives.split(" or ")
+        return of_displacement if self.within == "displacement" else of_angle
+
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
         """A checked copy with omitted numbers filled in, from the coordinate at the given poses."""
@@ -83,9 +88,9 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     spring of an angle takes the shortest way to it, up to half a turn.
     """
 
-    stiffness: fields.Number = fields.parameter(unit="N m/rad, N/m", sign="non-negative")
-    damping: fields.Number = fields.parameter(unit="N m s/rad, N s/m", sign="non-negative", default=0.0)
-    free: fields.Number = fields.parameter(shape=None, unit="rad, m", optional=True)
+    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
+    free: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
 
     def with_numbers(self, given):
         part = self.filled(free=given)
@@ -108,7 +113,7 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
     function of time.
     """
 
-    force: fields.Number = fields.parameter(shape=None, unit="N m, N")
+    force: fields.Number = fields.parameter(shape=None, unit="N m or N")
 
     def with_numbers(self, given):
         self._check_shape("force", given)
@@ -127,8 +132,8 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     function of time.
     """
 
-    value: fields.Number = fields.parameter(shape=None, unit="rad, m", optional=True)
-    rate: fields.Number = fields.parameter(shape=None, unit="rad/s, m/s", optional=True)
+    value: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    rate: fields.Number = fields.parameter(shape=None, unit="rad/s or m/s", optional=True)
     rows: int = eqx.field(static=True, default=1, kw_only=True)
     rheonomic: ClassVar[bool] = True
 

@@ -222,7 +222,7 @@ def _lengths(base: _Base) -> Iterator[_Trial]:
         try:
             scaled = scaled_lengths(own.system, own.state, factor)
         except ValueError as reason:
-            raise _NotHereError(f"left out, {reason}") from None
+            raise _NotHereError(f"left out, {str(reason).rstrip('.')}") from None
         yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
 
 

@@ -27,6 +27,8 @@ def units(system: AbstractSystem) -> dict[str, str | None]:
     for g in _groups(system):
         for _, shown, declared in paths(g.group.part):
             known = declared.unit if declared.unit or declared.shape is not None else None
+            if known is not None and " or " in known:
+                known = g.group.part.unit(known)
             out |= {f"{name}.{'.'.join(shown)}": known for name in g.group.names}
     gravity = f"{getattr(system, 'gravity_name', '')}.acceleration"
     return out | ({gravity: "m/s²"} if gravity in out else {})

@@ -333,7 +333,8 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
     """From a start that fails to one that does not, by the constraints that have a value there."""
     finite = [name for name in limited.names if name in first.outputs and np.all(np.isfinite(first.outputs[name]))]
     lost = [name for name in program.names if name not in finite]
-    what = f"At the start {', '.join(map(repr, lost))} {'is' if len(lost) == 1 else 'are'} not finite"
+    named = f"{', '.join(map(repr, lost))} {'is' if len(lost) == 1 else 'are'}" if lost else "derivatives are"
+    what = f"At the start {named} not finite"
     cure = (
         "Start elsewhere, or return an output that tells how far the start is from a feasible one, such as "
         "jaxmb.assembly_gap(...), with a constraint: constraints={'gap': (None, 0)}. Give assemble and simulate "
