@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, VectorLike
 from ..linalg.arrays import is_traced
-from .fields import as_jax
+from .fields import as_jax, as_parameter
 
 Interpolation = Literal["linear", "cubic", "held"]
 
@@ -64,7 +64,8 @@ class Series(AbstractSignal):
         if interpolation not in ("linear", "cubic", "held"):
             raise ValueError(f"Series: interpolation must be 'linear', 'cubic' or 'held', got {interpolation!r}.")
         try:
-            self.ts, self.values = as_jax(ts), as_jax(values)
+            # Times stay numbers in a function that JAX traces: where a value jumps, a motion is restarted.
+            self.ts, self.values = as_parameter(ts), as_jax(values)
         except (ValueError, TypeError) as error:
             raise ValueError(f"Series: {error}.") from error
         if self.ts.ndim != 1 or self.ts.shape[0] < 2 or self.values.shape[:1] != self.ts.shape:
@@ -88,10 +89,10 @@ class Series(AbstractSignal):
                 f"Series: values must be finite, got another at t = {missing[0]:g}; leave such samples out."
             )
         self.interpolation = interpolation
-        self.slopes = _spline_slopes(self.ts, self.values) if interpolation == "cubic" else None
+        self.slopes = _spline_slopes(jnp.asarray(self.ts), self.values) if interpolation == "cubic" else None
 
     def __call__(self, t):
-        ts, values = self.ts, self.values
+        ts, values = jnp.asarray(self.ts), self.values
         k = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, ts.shape[0] - 2)
         if self.interpolation == "held":
             # At a time of the series the value is the new one.
