@@ -5,12 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from identifying import free_parameters
+from identifying import free_parameters, pendulum, swing
 from jax.scipy.special import ndtri
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.lagrangian import LagrangianSystem
 from jaxmb.studies.identify.covariance import combinations, covariance
 from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
 from jaxmb.studies.ranges import second_moments
@@ -20,29 +19,9 @@ TS = jnp.linspace(0.0, 1.0, 31)[1:]
 TSIT5 = diffrax.Tsit5()
 
 
-def pendulum():
-    """A rod on a pin with a torsional spring and damper."""
-    rod = planar.Body("rod", mass=2.0, inertia=planar.rod(2.0, 1.0), position=(0.5, 0.0))
-    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
-    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=6.0, damping=0.3)
-    return mb.Scene([rod], joints=[pin], forces=[spring, mb.Gravity((0.0, -9.81))]).compile()
-
-
 @pytest.fixture(scope="module")
 def system():
     return pendulum()
-
-
-def swing():
-    """The rod's angle alone, as a Lagrangian system with damping."""
-    return LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * p["length"] ** 2 * (v @ v),
-        potential=lambda t, q, p: -9.81 * p["length"] * jnp.cos(q[0]),
-        force=lambda t, q, v, p: -p["damping"] * v,
-        q=[1.0],
-        coordinates=("theta",),
-        parameters={"length": 0.8, "damping": 0.3},
-    )
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,13 @@
 
 import diffrax
 import equinox as eqx
+import identifying
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from identifying import free_parameters
+from identifying import free_parameters, pendulum
 from scipy.optimize import least_squares
 
 import jaxmb as mb
@@ -20,14 +21,6 @@ TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
 SIGMA = {"rod.angle": 1e-3}
 # Compiles faster than Adams, where the solver does not matter.
 TSIT5 = diffrax.Tsit5()
-
-
-def pendulum():
-    """A rod on a pin with a torsional spring and damper."""
-    rod = planar.Body("rod", mass=2.0, inertia=planar.rod(2.0, 1.0), position=(0.5, 0.0))
-    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
-    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=6.0, damping=0.3)
-    return mb.Scene([rod], joints=[pin], forces=[spring, mb.Gravity((0.0, -9.81))]).compile()
 
 
 @pytest.fixture(scope="module")
@@ -109,15 +102,7 @@ def test_everything_listed_can_be_measured(system, motion):
 
 @pytest.fixture(scope="module")
 def swing():
-    """The rod's angle alone, as a Lagrangian system with damping."""
-    return LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * p["length"] ** 2 * (v @ v),
-        potential=lambda t, q, p: -9.81 * p["length"] * jnp.cos(q[0]),
-        force=lambda t, q, v, p: -p["damping"] * v,
-        q=[1.0],
-        coordinates=("theta",),
-        parameters={"length": 0.8, "damping": 0.3},
-    )
+    return identifying.swing()
 
 
 def test_lagrangian_system(swing):
