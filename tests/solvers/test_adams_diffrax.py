@@ -93,7 +93,8 @@ def test_batch_equals_loop():
     assert np.all(batch[1] > 0) and len(set(np.sum(batch[2], axis=1).tolist())) > 1
     np.testing.assert_array_equal(batch[1], loop[1])
     np.testing.assert_array_equal(batch[2], loop[2])
-    _assert_close(batch[0], loop[0], atol=1e-12)
+    # Rounding, relative to the largest velocity.
+    _assert_close(batch[0], loop[0], atol=1e-12 * 20.0)
 
 
 def test_continuation_repeats_the_unbroken_solve():
