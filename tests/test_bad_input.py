@@ -146,7 +146,7 @@ def test_unknown_names(pendulum):
     with pytest.raises(ValueError, match=r"Unknown rate 'baar.angle'"):
         mb.assemble(pendulum, rates={"baar.angle": 0.1})
     sol = mb.simulate(pendulum, mb.assemble(pendulum), t1=0.1)
-    with pytest.raises(ValueError, match="Unknown body 'baar'; did you mean 'bar'"):
+    with pytest.raises(ValueError, match=r"Unknown body, joint or frame 'baar'; did you mean 'bar'\?"):
         sol["baar"]
     with pytest.raises(ValueError, match="Unknown joint 'pim'; did you mean 'pin'"):
         sol.reactions["pim"]

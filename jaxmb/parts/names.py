@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 def unknown(what: str, name: str, known: Iterable[str]) -> ValueError:
     """An error for an unknown name, with the nearest known ones."""
-    known = list(known)
+    known = list(dict.fromkeys(known))
     near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
     if near:
         hint = f"; did you mean {' or '.join(map(repr, near))}?"

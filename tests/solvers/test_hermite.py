@@ -84,7 +84,8 @@ def test_order_with_steps_of_any_size(name):
 def test_van_der_pol_takes_few_steps():
     problem = PROBLEMS["van der Pol 1e3"]
     for rtol, steps, bound in ((1e-8, 700, 1e-6), (1e-10, 1150, 5e-9)):
-        error, solution = relative_error(problem, rtol)
+        # Steps err by a twentieth of the tolerance, so each may err by `rtol`.
+        error, solution = relative_error(problem, 20 * rtol)
         assert solution.stats["num_accepted_steps"] <= steps
         assert error <= bound
 
