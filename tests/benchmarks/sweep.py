@@ -27,7 +27,8 @@ from jaxmb.studies.sweep import engine
 from jaxmb.studies.sweep.batch import Batch
 from jaxmb.studies.sweep.outputs import declared, statuses
 
-CHUNK, REPEATS = 256, 8
+# Members of the batch with some that take long, and of a chunk as sweeps have it.
+CHUNK, DEFAULT, REPEATS = 256, 512, 8
 LONG, FAILED = [17, 101, 202], [40, 90, 250]
 
 
@@ -52,17 +53,17 @@ def batch_of(cases, **options):
     return Batch(four_bar, declared(four_bar, {k: v[0] for k, v in cases.columns.items()}, max_steps=65536), **options)
 
 
-def overhead(chunks=8):
+def overhead(chunks=4):
     """Chunks of a sweep, computed and written, against a bare `jax.vmap` of the function, and against a single run."""
     folder = tempfile.mkdtemp()
     store = Path(folder) / "runs.zarr"
-    cases = mb.cases.table(length=np.linspace(0.8, 1.1, chunks * CHUNK), t1=np.full(chunks * CHUNK, 0.5))
+    cases = mb.cases.table(length=np.linspace(0.8, 1.1, chunks * DEFAULT), t1=np.full(chunks * DEFAULT, 0.5))
     bare = jax.jit(jax.vmap(lambda length, t1: {"angle": four_bar(length, t1)["angle"]}))
-    parts = [cases[slice(k * CHUNK, (k + 1) * CHUNK)] for k in range(chunks)]
+    parts = [cases[slice(k * DEFAULT, (k + 1) * DEFAULT)] for k in range(chunks)]
     begin = time.perf_counter()
-    mb.sweep(four_bar, cases, store, chunk=CHUNK, budget=None, progress=False)
+    mb.sweep(four_bar, cases, store, chunk=DEFAULT, budget=None, progress=False)
     print(f"the whole sweep with compiling: {time.perf_counter() - begin:.1f} s")
-    work = engine.Work(batch_of(cases, chunk=CHUNK, max_steps=65536), store)
+    work = engine.Work(batch_of(cases, chunk=DEFAULT, max_steps=65536), store)
     swept = lambda: [work(engine.Task(k, part)) for k, part in enumerate(parts)] and None
     plain = lambda: [np.asarray(bare(**part)["angle"]) for part in parts]
     swept(), plain()

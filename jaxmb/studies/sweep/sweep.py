@@ -21,8 +21,8 @@ from .labels import described
 from .outputs import RESERVED, check_parameters, declared, step_limit
 from .progress import shown_progress
 
-# Large enough that what a chunk costs besides its members does not count, small enough that little is lost.
-_CHUNK = 256
+# Large enough that what a chunk costs besides its members, 5 ms, does not count, small enough that little is lost.
+_CHUNK = 512
 # With fewer members it takes longer to compile a second program than any of them can hold up the others.
 _FEWEST_FOR_BUDGET = 64
 
@@ -73,7 +73,7 @@ def sweep(
 
     **Other arguments:**
 
-    - `chunk`: members that are computed together, default 256 or fewer; what is lost when a process is killed, and what
+    - `chunk`: members that are computed together, default 512 or fewer; what is lost when a process is killed, and what
         takes memory. The store keeps it.
     - `budget`: most steps of a member in a chunk. Members that run together take as long as the slowest of them. So if
         the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`, members that
