@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -386,3 +387,38 @@ def test_a_lambda_and_a_closure_go_to_processes(tmp_path):
     lock = threading.Lock()
     with pytest.raises(ValueError, match="cannot be sent to other processes"):
         mb.sweep(lambda a: {"x": a + float(lock.locked())}, mb.cases.grid(a=[1.0, 2.0]), processes=2, progress=False)
+
+
+def test_two_devices_give_the_result_of_one():
+    """In a process of its own: devices are made when JAX starts. Without threads for them they are refused."""
+    code = """
+import os, sys
+import jax, numpy as np
+import jaxmb as mb
+from jaxmb.lagrangian import LagrangianSystem
+
+spring = LagrangianSystem(
+    kinetic=lambda t, q, v, p: 0.5 * v[0] ** 2,
+    potential=lambda t, q, p: 0.5 * p["k"] * q[0] ** 2,
+    q=(1.0,),
+    parameters={"k": 1.0},
+)
+
+def place(k, max_steps=4096):
+    sol = mb.simulate(mb.with_parameters(spring, {"k": k}), spring.guess, t1=1.0, throw=False, max_steps=max_steps)
+    return {"x": sol.ys.q[-1, 0], "result": sol}
+
+cases = mb.cases.grid(k=np.linspace(1.0, 4.0, 16))
+one, two = (mb.sweep(place, cases, devices=count, progress=False) for count in (1, 2))
+np.testing.assert_allclose(two["x"], one["x"], rtol=1e-13)
+np.testing.assert_allclose(two["x"], np.cos(np.sqrt(cases.columns["k"])), atol=1e-6)
+os.environ["NPROC"] = "3"
+try:
+    mb.sweep(place, cases, devices=2, progress=False)
+except ValueError as error:
+    sys.exit("need 4 threads" not in str(error))
+sys.exit(1)
+"""
+    flags = {"JAX_ENABLE_X64": "1", "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": "4"}
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | flags, timeout=300, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()

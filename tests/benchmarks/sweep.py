@@ -17,6 +17,7 @@ from pathlib import Path
 os.environ["JAX_ENABLE_X64"] = "1"
 if sys.argv[1:] == ["devices"]:
     os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    os.environ["NPROC"] = "4"
 
 import jax
 import numpy as np
@@ -110,6 +111,7 @@ def devices(chunks=8):
     print(f"first run on devices {timed(on_devices):.1f} s")
     context = multiprocessing.get_context("spawn")
     os.environ.pop("XLA_FLAGS")
+    os.environ["NPROC"] = "1"
     with futures.ProcessPoolExecutor(2, mp_context=context) as pool:
         halves = [{k: v[j * CHUNK : (j + 1) * CHUNK] for k, v in part.items()} for part in parts for j in (0, 1)]
         on_processes = lambda: list(pool.map(in_process, halves)) and None

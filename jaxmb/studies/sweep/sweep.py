@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.metadata
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -83,7 +84,8 @@ def sweep(
     - `executor`: any `concurrent.futures.Executor` instead: Dask's `client.get_executor()`,
         `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves.
     - `devices`: a number of `jax.local_devices()`, or a list of them, among which the members of a chunk are divided,
-        each device with loops of its own. On several hosts, each with devices, start the same script on every host with
+        each device with loops of its own. Several devices that are parts of one CPU need two threads each, `NPROC=4` in
+        the environment for two of them. On several hosts, each with devices, start the same script on every host with
         `jax.distributed.initialize()`, give each call its own part of the cases and its own store, and
         `devices=jax.local_devices()`; a sweep needs no communication.
     - `progress`: whether to show what is done and the time that is left, in one line.
@@ -186,10 +188,24 @@ def _devices(given: Any) -> tuple[Any, ...]:
     if isinstance(given, int | np.integer):
         if not 1 <= given <= len(there):
             raise ValueError(f"devices must be between 1 and the {len(there)} that JAX has here, got {given}.")
-        return tuple(there[:given])
+        given = there[:given]
     if not (isinstance(given, Sequence) and given and all(isinstance(device, jax.Device) for device in given)):
         raise ValueError(f"devices must be a number or a list of jax.local_devices(), got {given!r}.")
+    _check_threads(given)
     return tuple(given)
+
+
+def _check_threads(devices: Sequence[Any]) -> None:
+    """Refuse devices that are this processor, in parts, with too few threads for them.
+
+    Each holds a thread of XLA while its program runs, and waits for others, for ever if there are none.
+    """
+    threads, parts = int(os.environ.get("NPROC") or os.cpu_count() or 1), len(devices)
+    if parts > 1 and devices[0].platform == "cpu" and threads < 2 * parts:
+        raise ValueError(
+            f"{parts} devices of a CPU need {2 * parts} threads, and JAX has {threads}: set NPROC={2 * parts} in the "
+            "environment before JAX starts, or use processes=."
+        )
 
 
 def _chunk(given: Any, members: int, processes: int) -> int:
