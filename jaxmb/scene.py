@@ -97,7 +97,10 @@ class Scene(eqx.Module):
             jax.device_put(np.concatenate([_call(body, "velocities") for body in self.bodies])),
         )
         if is_traced(guess):
-            raise ValueError("A scene cannot be compiled within a function that JAX traces, such as one under jit.")
+            raise ValueError(
+                "A scene cannot be compiled within a function that JAX traces, such as one under jit: compile it "
+                "before, and change its numbers there with jaxmb.with_parameters."
+            )
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         frames = frames_by_name(self.frames, self.bodies)

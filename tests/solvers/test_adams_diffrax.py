@@ -82,9 +82,12 @@ def test_event_is_located():
 
 def test_batch_equals_loop():
     omegas = jnp.array([0.5, 1.0, 7.0, 20.0])
+    # A step may err by 1e-8, a twentieth of this: shorter steps gather more rounding errors than the bound allows.
+    controller = MultistepController(2e-7, 2e-7)
+    saved = diffrax.SaveAt(ts=jnp.linspace(0.0, 4.0, 5), solver_state=True)
 
     def run(omega):
-        solution = _solve(omega=omega, dt0=0.5, saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 4.0, 5), solver_state=True))
+        solution = _solve(omega=omega, dt0=0.5, saveat=saved, controller=controller)
         return solution.ys, solution.stats["num_rejected_steps"], solution.solver_state.step_counts
 
     batch = jax.jit(jax.vmap(run))(omegas)
@@ -93,8 +96,7 @@ def test_batch_equals_loop():
     assert np.all(batch[1] > 0) and len(set(np.sum(batch[2], axis=1).tolist())) > 1
     np.testing.assert_array_equal(batch[1], loop[1])
     np.testing.assert_array_equal(batch[2], loop[2])
-    # Rounding, relative to the largest velocity.
-    _assert_close(batch[0], loop[0], atol=1e-12 * 20.0)
+    _assert_close(batch[0], loop[0], atol=1e-12)
 
 
 def test_continuation_repeats_the_unbroken_solve():
