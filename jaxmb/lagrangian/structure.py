@@ -14,7 +14,7 @@ from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
-from ..states.redundancy import check_gradients, check_implied
+from ..states.redundancy import check_gradients, check_implied_as_one
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
@@ -117,7 +117,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     if not np.all(np.isfinite(found.jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
     position, velocity, acceleration, *others = map(int, found.row_ranks)
-    check_gradients(system, found.jacobian)
+    check_gradients(system, np.linalg.norm(found.jacobian, axis=1))
     linear = system.kinematics.linear and all(c.is_linear(q, p) for c in system.constraints)
     drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
     if linear:
@@ -126,7 +126,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
     rows = slice(system.velocity_rows, system.acceleration_rows)
     _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
-    check_implied(system, found.q, found.row_orders[0, :position], found.row_orders[2, :acceleration])
+    check_implied_as_one(system, found.q, found.row_orders[0, :position], found.row_orders[2, :acceleration])
     _check_nonideal(system, acceleration, others)
     diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
     sizes = np.linalg.eigvalsh(found.inertia)

@@ -9,7 +9,6 @@ Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", Â
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
@@ -20,6 +19,7 @@ from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, newton, root
 from ..system import AbstractSystem
+from ..system.displacement import displaced
 from .manifold import normalize_state
 
 _ITERATIONS = 8
@@ -104,7 +104,7 @@ def project_in_metric(
 
     def correct(q):
         step = fixed.cancel(_position_rows(fixed_system, fixed_t, q))
-        return _moved(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
+        return displaced(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
 
     first = jnp.ones((), y.q.dtype)
     found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
@@ -113,19 +113,11 @@ def project_in_metric(
     own = fixed_system.structured_jacobian(fixed_t, found, before.u)
     own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
     q = y.q + (found - before.q)
-    q = _moved(system, t, q, own.cancel(_position_rows(system, t, q)))
+    q = displaced(system, t, q, own.cancel(_position_rows(system, t, q)))
     at = State(q, y.u)
     here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
     u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
     return State(q, u), here, iterations, failed
-
-
-def _moved(system, t, q, step):
-    """The coordinates after a small displacement along the velocities."""
-    if system.rates_are_velocities:
-        return q + step
-    _, change = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))
-    return system.normalize(q + change)
 
 
 def _position_rows(system, t, q):

@@ -23,6 +23,7 @@ from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractSystem
+from ..system.displacement import displaced
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
 MANY_ROWS = 300
@@ -39,6 +40,9 @@ _PROGRESS = 0.999
 # of steps.
 _REFINED = 1e-10
 _REFINEMENTS = 16
+
+# Implied rows get this share of their diagonal as a pivot.
+_SHIFT = 1e-13
 
 # Largest number of linearisations by blocks.
 _LINEARIZATIONS = 30
@@ -198,6 +202,42 @@ def tolerance(dtype) -> float:
 
 
 # By blocks
+
+
+def meet_by_blocks(
+    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"]
+) -> tuple[Float[Array, "nq"], Float[Array, ""]]:
+    """`meet_constraints` by an order of elimination of the rows of Φ; implied rows are allowed.
+
+    **Returns:** the configuration, and the largest residual as in `residual_size`.
+    """
+    scale = system.velocity_scale()
+    metric, at_rest = DiagonalInertia(1 / scale**2), jnp.zeros_like(scale)
+    more = system.acceleration_rows - system.position_rows
+
+    def squares(q):
+        return jnp.sum(system.position_residual(t, q) ** 2)
+
+    def correct(q):
+        residual = system.position_residual(t, q)
+        jacobian = system.structured_jacobian(t, q, at_rest)
+        factor = jacobian.gram(metric).eliminate(_SHIFT)
+        multipliers = factor.substitute(jacobian.gather_rows(jnp.pad(residual, (0, more))))
+        step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
+        longest = jnp.max(jnp.abs(step) / scale)
+        step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+        lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
+        moved = jax.vmap(lambda a: displaced(system, t, q, a * step))(lengths)
+        sizes = jax.vmap(squares)(moved)
+        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
+        return moved[best], jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
+
+    far = lambda q, size: (size > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+    q = newton(correct, far, start, most=_ITERATIONS, dtype=start.dtype)[0]
+    norms = system.structured_jacobian(t, q, at_rest).row_norms(scale)[: system.position_rows]
+    floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
+    return q, jnp.max(jnp.abs(system.position_residual(t, q)) / jnp.maximum(norms, floor))
 
 
 def configuration_by_blocks(

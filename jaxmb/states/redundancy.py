@@ -6,13 +6,13 @@ mechanism without them is another one. The kept rows are independent, so nearby 
 method: there the rows left out must hold, and their gradients must depend on those of the kept rows.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..system import AbstractSystem
 
@@ -29,10 +29,9 @@ _NEAR = 0.2
 _ITERATIONS = 10
 
 
-def check_gradients(system: AbstractSystem, jacobian: Float[np.ndarray, "m nu"]) -> None:
-    """Raise a `ValueError` naming the rows of A, its columns scaled, that are zero."""
-    sizes = np.linalg.norm(jacobian, axis=1)
-    zero = sizes <= np.finfo(jacobian.dtype).eps ** 0.75 * np.max(sizes, initial=0.0)
+def check_gradients(system: AbstractSystem, sizes: Float[np.ndarray, "m"]) -> None:
+    """Raise a `ValueError` naming the rows of A that are zero, from the norms of all rows."""
+    zero = sizes <= np.finfo(sizes.dtype).eps ** 0.75 * np.max(sizes, initial=0.0)
     if np.any(zero):
         listed = ", ".join(f"row {k} of {name}" for (name, k), z in zip(system.rows, zero, strict=True) if z)
         raise ValueError(
@@ -41,68 +40,125 @@ def check_gradients(system: AbstractSystem, jacobian: Float[np.ndarray, "m nu"])
         )
 
 
+class Group(NamedTuple):
+    """Rows of A that depend on each other only.
+
+    **Fields:** the `rows`; `independent` ones among them; `positions`: independent rows of Φ, also those that keep
+    invariants of the coordinates; all by their numbers among the rows of A, or of the coordinates.
+    """
+
+    rows: Int[np.ndarray, "m"]
+    independent: Int[np.ndarray, "r"]
+    positions: Int[np.ndarray, "p"]
+
+
+class Nearby(NamedTuple):
+    """What is known at a displaced configuration.
+
+    **Fields:** `unmet`: Φ, and the coordinates' invariants; `of_positions(rows)`: derivatives of some of these with
+    respect to the displacement of the group `number`; `jacobian(rows)`: these rows of A, its columns scaled.
+    """
+
+    unmet: Float[np.ndarray, "mq"]
+    of_positions: Callable[[int, np.ndarray], np.ndarray]
+    jacobian: Callable[[int, np.ndarray], np.ndarray]
+
+
 def check_implied(
     system: AbstractSystem,
-    q: Float[Array, "nq"],
-    positions: np.ndarray,
-    independent: np.ndarray,
+    groups: Sequence[Group],
+    places: Sequence[Int[np.ndarray, "n"]],
+    evaluate: Callable[[float, Float[np.ndarray, "n"]], Nearby],
+    size: int,
+    dtype: Any,
     bodies: Mapping[str, Iterable[str]] = MappingProxyType({}),
 ) -> None:
     """Raise a `ValueError` naming the rows that others imply at a configuration on the constraints, but not near it.
 
-    **Arguments:** `positions`: independent rows of Φ; `independent`: those of A; `bodies` of each joint, for messages.
+    **Arguments:** `groups` with implied rows; `places`: for each the entries of a displacement that determine its rows;
+    `evaluate(t, moved)`: after a displacement of this `size` in multiples of scales; `bodies` of each joint, for
+    messages.
     """
-    dropped = np.setdiff1d(np.arange(system.acceleration_rows), independent)
-    if not dropped.size:
+    if not groups:
         return
-    for t, unmet, jacobian in _nearby(system, np.asarray(q), positions):
-        zero = float(np.finfo(jacobian.dtype).eps) ** _ZERO
-        sizes = np.maximum(np.linalg.norm(jacobian, axis=1), np.finfo(jacobian.dtype).tiny)
-        rows = jacobian / sizes[:, None]
-        share, *_ = np.linalg.lstsq(rows[independent].T, rows[dropped].T, rcond=None)
-        off = np.linalg.norm(rows[dropped] - share.T @ rows[independent], axis=1)
-        left = np.abs(np.pad(unmet, (0, sizes.size - unmet.size)) / sizes)
-        bad = np.maximum(off, left[dropped]) > zero
-        if np.any(bad):
-            by = independent[np.any(np.abs(share[:, bad]) > zero, axis=1)]
-            raise ValueError(_not_implied(system, t, dropped[bad], by, bodies))
-
-
-def _nearby(system, q, positions) -> Iterator[tuple[float, Any, Any]]:
-    """States near a configuration that satisfy the independent rows of Φ: time, Φ, and A with its columns scaled.
-
-    Places that cannot be reached, or only far away, say nothing and are left out.
-    """
-    shifts = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSES, q.size)) * np.finfo(q.dtype).eps ** _DISPLACEMENT
+    eps = float(np.finfo(dtype).eps)
+    zero = eps**_ZERO
+    shifts = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSES, size)) * eps**_DISPLACEMENT
     times = () if system.drift_free else _TIMES
-    _, of_coordinates, _ = map(np.asarray, _evaluate(system, np.asarray(0.0, q.dtype), q, np.zeros_like(q)))
+    for t, shift in [*((0.0, shift) for shift in shifts), *((t, np.zeros(size)) for t in times)]:
+        for number, (near, reached) in enumerate(_settled(groups, places, evaluate, t, shift.astype(dtype))):
+            if reached:
+                _check_near(system, t, groups[number], number, near, zero, bodies)
+
+
+def _settled(groups, places, evaluate, t, moved):
+    """A state near a displaced one that satisfies the independent rows of Φ, and for each group whether it was found.
+
+    Places that cannot be reached, or only far away, say nothing.
+    """
+    small = np.finfo(moved.dtype).eps ** 0.75
+    going, reached = set(range(len(groups))), set()
+    near = evaluate(t, moved)
+    for _ in range(_ITERATIONS):
+        if not going:
+            break
+        moved = moved.copy()
+        for k in sorted(going):
+            own = near.of_positions(k, groups[k].positions)
+            if not (np.all(np.isfinite(own)) and np.max(np.abs(moved[places[k]]), initial=0.0) <= _NEAR):
+                going.discard(k)
+                continue
+            step = np.linalg.lstsq(own, -near.unmet[groups[k].positions], rcond=None)[0]
+            moved[places[k]] += step
+            if np.max(np.abs(step), initial=0.0) <= small:
+                going.discard(k)
+                reached.add(k)
+        near = evaluate(t, moved)
+    return [(near, k in reached) for k in range(len(groups))]
+
+
+def _check_near(system, t, group, number, near, zero, bodies):
+    """Raise the error where rows of a group that are not independent do not follow from the others."""
+    dropped = np.setdiff1d(group.rows, group.independent)
+    (kept, _), (others, sizes) = (_unit_rows(near.jacobian(number, rows)) for rows in (group.independent, dropped))
+    share, *_ = np.linalg.lstsq(kept.T, others.T, rcond=None)
+    off = np.linalg.norm(others - share.T @ kept, axis=1)
+    left = np.where(dropped < system.position_rows, np.abs(near.unmet[np.minimum(dropped, near.unmet.size - 1)]), 0.0)
+    left = left / sizes
+    bad = np.maximum(off, left) > zero
+    if np.any(bad):
+        by = group.independent[np.any(np.abs(share[:, bad]) > zero, axis=1)]
+        raise ValueError(_not_implied(system, t, dropped[bad], by, bodies))
+
+
+def _unit_rows(jacobian):
+    sizes = np.maximum(np.linalg.norm(jacobian, axis=1), np.finfo(jacobian.dtype).tiny)
+    return jacobian / sizes[:, None], sizes
+
+
+def check_implied_as_one(
+    system: AbstractSystem, q: Float[Array, "nq"], positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
+) -> None:
+    """`check_implied` of all rows as one group, by full matrices.
+
+    **Arguments:** `q` on the constraints; `positions`: independent rows of Φ; `independent`: those of A.
+    """
+    rows = np.arange(system.acceleration_rows)
+    if independent.size == rows.size:
+        return
+    dtype = q.dtype
+
+    def evaluate(t, moved):
+        found = map(np.asarray, _evaluate(system, np.asarray(t, dtype), q, moved))
+        unmet, of_coordinates, jacobian = found
+        return Nearby(unmet, lambda _, own: of_coordinates[own], lambda _, own: jacobian[own])
+
     # Coordinates may need more rows than velocities: those that keep invariants of the coordinates come last.
-    own = np.append(positions, np.arange(system.position_rows, system.coordinate_rows))
-    kept = _independent_rows(of_coordinates, [*own, *np.setdiff1d(np.arange(system.coordinate_rows), own)])
-    small = np.finfo(q.dtype).eps ** 0.75
-    for t, shift in [*((0.0, shift) for shift in shifts), *((t, 0.0) for t in times)]:
-        at = lambda moved, t=t: map(np.asarray, _evaluate(system, np.asarray(t, q.dtype), q, moved))
-        moved = np.full_like(q, shift)
-        unmet, of_coordinates, jacobian = at(moved)
-        for _ in range(_ITERATIONS):
-            if not (np.all(np.isfinite(of_coordinates)) and np.max(np.abs(moved)) <= _NEAR):
-                break
-            step = np.linalg.lstsq(of_coordinates[kept], -unmet[kept], rcond=None)[0]
-            moved = moved + step
-            unmet, of_coordinates, jacobian = at(moved)
-            if np.max(np.abs(step)) <= small:
-                yield t, unmet[: system.position_rows], jacobian
-                break
-
-
-def _independent_rows(jacobian, order):
-    """Rows that do not depend on those before them, in an order."""
-    kept, basis = [], np.zeros((0, jacobian.shape[1]), jacobian.dtype)
-    for k in order:
-        own = jacobian[k] - basis.T @ (basis @ jacobian[k])
-        if np.linalg.norm(own) > np.finfo(jacobian.dtype).eps ** 0.5 * np.linalg.norm(jacobian[k]):
-            kept, basis = [*kept, k], np.vstack([basis, own / np.linalg.norm(own)])
-    return np.array(kept, int)
+    coordinate_rows = np.arange(system.coordinate_rows)
+    first = np.append(positions, np.arange(system.position_rows, system.coordinate_rows)).astype(int)
+    of_coordinates = evaluate(0.0, np.zeros(q.size, dtype)).of_positions(0, coordinate_rows)
+    kept = _independent_rows(of_coordinates, [*first, *np.setdiff1d(coordinate_rows, first)])
+    check_implied(system, [Group(rows, independent, kept)], [np.arange(q.size)], evaluate, q.size, dtype)
 
 
 @eqx.filter_jit
@@ -112,6 +168,16 @@ def _evaluate(system, t, q, moved):
     q = q + scale * moved
     jacobian = system.jacobian(t, q, system.guess.u) * system.velocity_scale()[None, :]
     return system.coordinate_residual(t, q), system.coordinate_jacobian(t, q) * scale[None, :], jacobian
+
+
+def _independent_rows(jacobian: Float[np.ndarray, "m n"], order: Iterable[int]) -> Int[np.ndarray, "r"]:
+    """Rows that do not depend on those before them, in an order."""
+    kept, basis = [], np.zeros((0, jacobian.shape[1]), jacobian.dtype)
+    for k in order:
+        own = jacobian[k] - basis.T @ (basis @ jacobian[k])
+        if np.linalg.norm(own) > np.finfo(jacobian.dtype).eps ** 0.5 * np.linalg.norm(jacobian[k]):
+            kept, basis = [*kept, k], np.vstack([basis, own / np.linalg.norm(own)])
+    return np.array(kept, int)
 
 
 def _not_implied(system, t, rows, by, bodies):

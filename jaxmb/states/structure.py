@@ -1,36 +1,39 @@
 """The structure of a compiled scene: numbers of independent rows, which rows are implied by which joints, and the order
 in which joints are eliminated.
+
+Everything follows the joint graph: constraints are met by sparse elimination, and independent rows are found component
+by component, so that the time is proportional to the number of bodies where loops are local.
 """
 
 import dataclasses
+import itertools
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from ..linalg.elimination import full_pivot
+from ..linalg.inertia import DiagonalInertia
+from ..linalg.rotations import unrotate
 from ..system.bodies import Implied
+from ..system.displacement import displaced
 from ..system.equation import Ranks
-from ..system.joint_graph import elimination_order
+from ..system.joint_graph import elimination_order, joint_order
 from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
-from .closest import (
-    INDEPENDENT,
-    configuration_by_blocks,
-    eliminates_by_blocks,
-    meet_constraints,
-    residual_size,
-    tolerance,
-)
-from .redundancy import check_gradients, check_implied
+from .closest import meet_by_blocks, tolerance
+from .independence import Part, absolute_parts, matrix, subsets
+from .redundancy import Group, Nearby, check_gradients, check_implied
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
 # bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
 # mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# Dense matrices with more rows are too large.
-_DENSE = 3000
+# A row is implied by others whose share of it, both of unit norm, exceeds this.
+_NEGLIGIBLE = 1e-6
 
 
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
@@ -40,138 +43,177 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations, or if the given pose is singular.
     """
-    order, rows = elimination_order(system), system.velocity_rows
-    structured = dataclasses.replace(system, elimination=order)
-    if eliminates_by_blocks(structured):
-        if bool(_independent_by_blocks(structured)):
-            return dataclasses.replace(structured, ranks=Ranks(rows, rows, rows, rows))
-        if rows > _DENSE:
-            listed = violated_joints(system, 0.0, system.guess.q)
-            raise ValueError(
-                f"These {rows} constraint rows are too many for dense matrices, and by blocks they cannot be "
-                + (
-                    f"assembled from the given poses, which violate {listed}. Give poses nearer to the constraints."
-                    if listed
-                    else "distinguished from redundant rows. Move the points of joints apart."
-                )
-            )
-    found = _analyse(system)
-    if system.position_rows and not float(found["residual"]) <= tolerance(system.guess.q.dtype):
-        listed = violated_joints(system, 0.0, found["q"], least=0.0)
+    invariants = system.coordinate_rows - system.position_rows
+    if not system.acceleration_rows:
+        return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
+    others = tuple(range(system.position_rows, system.acceleration_rows))
+    of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
+    q = _on_constraints(of_positions)
+    parts = _parts(system)
+    at = _evaluated(of_positions, 0.0, q)
+    check_gradients(system, np.asarray(at.row_norms))
+    blocks, scale = _of_parts(at.blocks), np.asarray(system.velocity_scale())
+    row = np.arange(system.acceleration_rows)
+    level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
+    absolute = absolute_parts(parts, blocks, _motions_as_one(system, np.asarray(q)))
+    found = subsets(parts, blocks, system.layout, scale, level, absolute)
+    dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
+    components = [_shares(parts, blocks, system.layout, own) for own in found if own.dropped.size]
+
+    order = joint_order(system, dropped, absolute)
+    _check_contradictions(dataclasses.replace(system, elimination=order), q, components)
+    _check_locked(system, parts, blocks, scale)
+    implied = _implied(system, components)
+    _check_determined(system, implied)
+    _check_nearby(of_positions, q, parts, found)
+    position, velocity, acceleration = (sum(int(np.sum(level[own.kept] <= k)) for own in found) for k in range(3))
+    return dataclasses.replace(
+        system,
+        ranks=Ranks(position, position + invariants, velocity, acceleration),
+        implied=implied,
+        elimination=elimination_order(system, dropped, absolute),
+    )
+
+
+def _on_constraints(system):
+    """The configuration on the constraints, from the given poses."""
+    q = system.normalize(system.guess.q)
+    if not system.position_rows:
+        return q
+    q, residual = _met(system)
+    if not float(residual) <= tolerance(q.dtype):
+        listed = violated_joints(system, 0.0, q, least=0.0)
         raise ValueError(
             f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
             "points and axes for joints that contradict each other, or give better poses."
         )
-    for what in ("velocities", "accelerations"):
-        _check_left_over(system, what, *map(np.asarray, found[what]))
-    jacobian, scale = np.asarray(found["jacobian"]), np.asarray(found["scale"])
-    _check_locked(system, jacobian[: system.position_rows] * scale)
-    check_gradients(system, np.asarray(found["A"]) * scale)
-    position, velocity = int(found["position rank"]), int(found["rank"])
-    coordinate = position + system.coordinate_rows - system.position_rows
-    implied = _implied(system, jacobian, np.asarray(found["order"]), velocity)
-    _check_determined(system, implied)
-    acceleration = int(found["acceleration rank"])
-    check_implied(
-        system,
-        found["q"],
-        np.asarray(found["position order"])[:position],
-        np.asarray(found["acceleration order"])[:acceleration],
-        _bodies_of_joints(system),
-    )
-    ranks = Ranks(position, coordinate, velocity, acceleration)
-    # Block elimination drops no rows.
-    order = order if velocity == rows else None
-    return dataclasses.replace(system, ranks=ranks, implied=implied, elimination=order)
+    return q
+
+
+def _shares(parts, blocks, layout, own):
+    """Rows that are dropped, the ones that are kept, and the share of these in each of those."""
+    whole = matrix(parts, blocks, layout, own.parts, own.columns)
+    kept, dropped = (whole[np.searchsorted(own.rows, rows)] for rows in (own.kept, own.dropped))
+    sizes, own_sizes = (np.linalg.norm(rows, axis=1) for rows in (kept, dropped))
+    unit = np.linalg.lstsq((kept / sizes[:, None]).T, (dropped / own_sizes[:, None]).T, rcond=None)[0].T
+    shares = np.where(np.abs(unit) > _NEGLIGIBLE, unit, 0.0) * own_sizes[:, None] / sizes
+    return own.dropped, own.kept, shares
+
+
+def _parts(system):
+    """Bodies, first row and number of rows of every part."""
+    sizes = [(own, g.rows) for g in system.joints for own in g.group.bodies]
+    starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
+    return [Part(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
+
+
+def _of_parts(groups):
+    return [own for group in groups for own in np.asarray(group)]
 
 
 @eqx.filter_jit
-def _independent_by_blocks(system):
-    """Whether the scene can be assembled by blocks, and none of its rows is nearly redundant."""
-    held = np.zeros(system.nq, bool)
-    _, ok, pivot = configuration_by_blocks(
-        system, jnp.zeros((), system.guess.q.dtype), system.guess.q, held, tolerance(system.guess.q.dtype)
-    )
-    return ok & (pivot > INDEPENDENT)
+def _met(system):
+    """The configuration where constraints are met, and the size of the residuals that remain."""
+    return meet_by_blocks(system, jnp.zeros((), system.guess.q.dtype), system.normalize(system.guess.q))
+
+
+class _Evaluation(NamedTuple):
+    """Φ, the blocks of A group by group, and the norms of its rows, their columns scaled."""
+
+    unmet: Array
+    blocks: Any
+    row_norms: Array
 
 
 @eqx.filter_jit
-def _analyse(system):
-    """All evaluations of the system, in one compiled function."""
-    q, u = system.normalize(system.guess.q), system.guess.u
-    t = jnp.zeros((), q.dtype)
-    scale = system.velocity_scale()
-    residual = jnp.zeros((), q.dtype)
-    if system.position_rows:
-        q, linearized = meet_constraints(system, t, q, system.coordinate_scale())
-        residual = residual_size(system, t, q, linearized)
-    jacobian = system.velocity_jacobian(t, q, u)
-    level = (jnp.arange(system.velocity_rows) >= system.position_rows).astype(int)
-    every = full_pivot(jacobian, scale=scale, level=level)
-    holonomic = system.velocity_rows == system.position_rows
-    positions = every if holonomic else full_pivot(jacobian[: system.position_rows], scale=scale)
-    A = system.jacobian(t, q, u) if system.servos else jacobian
-    accelerations = full_pivot(A, scale=scale) if system.servos else every
-    out = {
-        "q": q,
-        "residual": residual,
-        "jacobian": jacobian,
-        "scale": scale,
-        "position rank": positions.rank,
-        "rank": every.rank,
-        "acceleration rank": accelerations.rank,
-        "position order": positions.order.rows,
-        "order": every.order.rows,
-        "acceleration order": accelerations.order.rows,
-        "A": A,
-        "velocities": (jnp.zeros(0), jnp.zeros(0)),
-        "accelerations": (jnp.zeros(0), jnp.zeros(0)),
-    }
-    if system.linear and (system.servos or not system.drift_free):
-        # Implied rows must be consistent with the rows that imply them: a least-squares residual is a contradiction.
-        if system.velocity_rows:
-            asked = system.velocity_residual(t, q, u)
-            change, left = _least_squares(jacobian, scale, asked)
-            out["velocities"] = left, asked
-            u = u + change
-        asked = system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-        out["accelerations"] = _least_squares(system.jacobian(t, q, u), scale, asked)[1], asked
+def _evaluated(system, t, q):
+    """At coordinates on the constraints or near them, and the given velocities."""
+    t, u = jnp.asarray(t, q.dtype), system.guess.u
+    poses, velocities = system.prepared_poses(q), system.all_velocities(u)
+    blocks = [g.jacobian(t, poses, velocities) for g in system.joints]
+    norms = system.structured_jacobian(t, q, u).row_norms(system.velocity_scale())
+    return _Evaluation(system.position_residual(t, q), blocks, norms)
+
+
+@eqx.filter_jit
+def _displaced(system, t, q, moved):
+    """The same after displacements along velocities, in multiples of their scales."""
+    return _evaluated(system, t, displaced(system, t, q, system.velocity_scale() * moved))
+
+
+@eqx.filter_jit
+def _asked(system, q):
+    """What constraints ask of the given velocities, and of accelerations where velocities satisfy the constraints."""
+    t, u = jnp.zeros((), q.dtype), system.guess.u
+    asked = system.velocity_residual(t, q, u)
+    metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
+    more = jnp.zeros(system.acceleration_rows - system.velocity_rows, q.dtype)
+    u = u + system.structured_jacobian(t, q, u).projector(metric).cancel(jnp.concatenate([asked, more]))
+    return asked, system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+
+
+def _motions_as_one(system, q):
+    """Velocities of all bodies, and zeros of the ground, in translations and rotations of all bodies as one."""
+    space, layout = system.layout.space, system.layout
+    d = space.dimension
+    poses = np.asarray(system.poses(q))
+    size = space.velocity_size
+    out = np.zeros((d + (1 if d == 2 else 3), layout.bodies + 1, size), q.dtype)
+    for k in range(d):
+        out[k, :-1, k] = 1.0
+    if d == 2:
+        out[2, :-1, :2] = np.stack([-poses[:, 1], poses[:, 0]], axis=1)
+        out[2, :-1, 2] = 1.0
+        return out
+    for k, axis in enumerate(np.eye(3, dtype=q.dtype)):
+        out[3 + k, :-1, :3] = np.cross(axis, poses[:, :3])
+        out[3 + k, :-1, 3:] = jax.vmap(lambda p, axis=axis: unrotate(p, axis))(poses[:, 3:])
     return out
 
 
-def _least_squares(jacobian, scale, asked):
-    """The smallest least-squares solution x of `jacobian x + asked = 0`, and its residual."""
-    x = -scale * (jnp.linalg.pinv(jacobian * scale[None, :], rtol=1e-8) @ asked)
-    return x, jacobian @ x + asked
+def _check_contradictions(system, q, components):
+    """Refuse rows that contradict those that imply them, in velocities or accelerations.
+
+    **Arguments:** `components`: rows that are dropped, those that imply them, and the shares of these.
+    """
+    if not components or not system.linear or (system.drift_free and not system.servos):
+        return
+    for what, asked in zip(("velocities", "accelerations"), map(np.asarray, _asked(system, q)), strict=True):
+        least = 1e-6 * max(np.max(np.abs(asked), initial=0.0), 1e-6)
+        names, largest = set(), 0.0
+        for dropped, kept, shares in components:
+            for row, share in zip(dropped, shares, strict=True):
+                by = kept[share != 0]
+                if row >= asked.size or np.any(by >= asked.size):
+                    continue
+                left = abs(asked[row] - share @ asked[np.minimum(kept, asked.size - 1)])
+                if left > least:
+                    names |= {system.rows[r][0] for r in (row, *by)}
+                    largest = max(largest, float(left))
+        if names:
+            raise ValueError(
+                f"The {what} prescribed by {', '.join(sorted(names))} contradict each other (largest residual "
+                f"{largest:.3g}). Remove one of them, or make their motions agree."
+            )
 
 
-def _check_left_over(system, what, left, asked):
-    bad = np.abs(left) > 1e-6 * np.maximum(np.max(np.abs(asked), initial=0.0), 1e-6)
-    if np.any(bad):
-        names = sorted({name for (name, _), b in zip(system.rows, bad, strict=True) if b})
-        raise ValueError(
-            f"The {what} prescribed by {', '.join(names)} contradict each other (largest residual "
-            f"{np.abs(left).max():.3g}). Remove one of them, or make their motions agree."
-        )
-
-
-def _check_locked(system, jacobian):
+def _check_locked(system, parts, blocks, scale):
     """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
 
     Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
     if at all, where they lock. No row is implied there, but some nearly are.
-
-    **Arguments:** `jacobian` (position rows × nu), its columns scaled.
     """
-    scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
-    for bodies, rows in _connected(system):
+    for bodies, own in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
-        columns = columns[columns < system.nu]
-        if len(rows) < len(columns):
+        columns = np.sort(columns[columns < system.nu])
+        if sum(parts[p].rows for p in own) < len(columns):
             continue
-        left, sizes, _ = np.linalg.svd(scaled[np.ix_(rows, columns)])
+        scaled = matrix(parts, blocks, system.layout, own, columns) * scale[columns]
+        scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
+        left, sizes, _ = np.linalg.svd(scaled)
         if _MOVES < sizes[-1] < _LOCKED:
             share = np.abs(left[:, len(columns) - 1])
+            rows = [r for p in own for r in range(parts[p].first, parts[p].first + parts[p].rows)]
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
             raise ValueError(
                 f"{', '.join(system.body_names[k] for k in bodies)} cannot move: {', '.join(names)} leave no degree of "
@@ -180,9 +222,11 @@ def _check_locked(system, jacobian):
             )
 
 
-def _connected(system):
-    """Sets of bodies that joints connect without the ground, with their rows, except sets with a driver."""
-    ground, row = system.layout.bodies, 0
+def _connected(system, parts):
+    """Sets of bodies that position constraints connect without the ground, with these parts, except sets with a
+    driver.
+    """
+    ground = system.layout.bodies
     # A union-find forest: the root of a tree represents all bodies connected to it.
     parent = list(range(ground))
 
@@ -192,22 +236,19 @@ def _connected(system):
             body = parent[body]
         return body
 
-    parts = []
-    for g in system.constraints:
-        for own in g.group.bodies:
-            moving = [k for k in own if k != ground]
-            for k in moving[1:]:
-                parent[root(k)] = root(moving[0])
-            parts.append((moving, range(row, row + g.rows), g.rheonomic))
-            row += g.rows
-    bodies, rows, driven = ([[] for _ in parent] for _ in range(3))
+    rheonomic = [g.rheonomic for g in system.constraints for _ in g.group.bodies]
+    moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
+    for own in moving:
+        for k in own[1:]:
+            parent[root(k)] = root(own[0])
+    bodies, of_parts, driven = ([[] for _ in parent] for _ in range(3))
     for k in range(ground):
         bodies[root(k)].append(k)
-    for moving, own, rheonomic in parts:
-        if moving:
-            rows[root(moving[0])] += own
-            driven[root(moving[0])].append(rheonomic)
-    return [(b, r) for b, r, d in zip(bodies, rows, driven, strict=True) if d and not any(d)]
+    for p, own in enumerate(moving):
+        if own:
+            of_parts[root(own[0])].append(p)
+            driven[root(own[0])].append(rheonomic[p])
+    return [(b, p) for b, p, d in zip(bodies, of_parts, driven, strict=True) if d and not any(d)]
 
 
 def _bodies_of_joints(system):
@@ -229,14 +270,42 @@ def _check_determined(system, implied):
                 )
 
 
-def _implied(system, jacobian, order, rank):
-    """Express each dropped row by the kept ones; the joints that contribute imply it."""
-    kept, dropped = order[:rank], order[rank:]
+def _implied(system, components):
+    """The names of rows that are dropped, and of the joints that imply them."""
     out = []
-    for row in dropped:
-        share, *_ = np.linalg.lstsq(jacobian[kept].T, jacobian[row], rcond=None)
-        weight = np.abs(share) * np.linalg.norm(jacobian[kept], axis=1)
-        name, k = system.rows[row]
-        by = {system.rows[r][0] for r, w in zip(kept, weight, strict=True) if w > 1e-6 * np.linalg.norm(jacobian[row])}
-        out.append(Implied(name, k, tuple(sorted(by - {name})) or (name,)))
+    for dropped, kept, shares in components:
+        for row, share in zip(dropped, shares, strict=True):
+            if row >= system.velocity_rows:
+                continue
+            by = {system.rows[r][0] for r in kept[share != 0]}
+            name, k = system.rows[row]
+            out.append(Implied(name, k, tuple(sorted(by - {name})) or (name,)))
     return tuple(sorted(out, key=lambda item: (item.name, item.row)))
+
+
+def _check_nearby(system, q, parts, found):
+    """Refuse rows that are implied at this configuration, but not near it."""
+    groups = [own for own in found if own.dropped.size]
+    scale = np.asarray(system.velocity_scale())
+
+    def evaluate(t, moved):
+        at = _displaced(system, np.asarray(t, q.dtype), q, moved)
+        blocks = _of_parts(at.blocks)
+
+        def rows_of(k, rows):
+            own = groups[k]
+            whole = matrix(parts, blocks, system.layout, own.parts, own.columns) * scale[own.columns]
+            return whole[np.searchsorted(own.rows, rows)]
+
+        return Nearby(np.asarray(at.unmet), rows_of, rows_of)
+
+    holonomic = lambda own: own.kept[own.kept < system.position_rows]
+    check_implied(
+        system,
+        [Group(own.rows, own.kept, holonomic(own)) for own in groups],
+        [own.columns for own in groups],
+        evaluate,
+        system.nu,
+        q.dtype,
+        _bodies_of_joints(system),
+    )

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..linalg.arrays import is_traced, unchecked_take
-from ..linalg.jacobian import EliminationOrder
+from ..linalg.block_jacobian import JointOrder
 from ..linalg.rotations import normalize
 from ..parts.forces import Gravity
 from .body_motion import attachments, body_motion, body_quantities, outline
@@ -70,7 +70,7 @@ class AbstractBodySystem(AbstractSystem):
     gravity_name: str = eqx.field(static=True)
     ranks: Ranks
     implied: tuple[Implied, ...] = eqx.field(static=True)
-    elimination: EliminationOrder | None = eqx.field(static=True)
+    elimination: JointOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
     frames: tuple[FrameGroup, ...] = ()
 

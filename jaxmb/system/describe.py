@@ -91,7 +91,7 @@ def describe_scene(
     }
     specialised = specialised_constraints(system)
     if system.elimination is not None:
-        specialised.append("joint chain: no dense Jacobian and no charts with Adams; block-tridiagonal elimination")
+        specialised.append(f"no dense Jacobian and no charts with Adams: {_elimination(system.elimination)}")
     if not spatial:
         specialised.append("planar: no Euler parameters, no gyroscopic moment")
     if not forces and not laws:
@@ -99,3 +99,12 @@ def describe_scene(
     redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in implied]
     remarks = {"redundant rows": tuple(redundant), "specialised away": tuple(specialised)}
     return Description(tuple(facts), {title: tuple(rows) for title, rows in tables.items()}, remarks)
+
+
+def _elimination(order):
+    """The order of elimination, in words."""
+    nodes = order.nodes
+    text = f"sparse elimination of {len(order.kept)} joints"
+    if order.hubs.size:
+        text += f" and {order.hubs.size} bodies of many joints"
+    return f"{text} in {nodes.levels} levels" + (f" and a rest of {nodes.rest.size}" if nodes.rest.size else "")

@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, State
+from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
-from ..linalg.jacobian import AbstractJacobian, EliminationOrder
+from ..linalg.jacobian import AbstractJacobian
 from ..parts.series import AbstractSignal
 from .description import Description
 from .design_variables import DesignVariables
@@ -87,7 +88,7 @@ class AbstractSystem(eqx.Module):
     length: AbstractVar[Float[Array, ""]]
     ranks: AbstractVar[Ranks]
     rows: AbstractVar[tuple[tuple[str, int], ...]]
-    elimination: AbstractVar[EliminationOrder | None]
+    elimination: AbstractVar[JointOrder | None]
     design: AbstractVar[tuple[DesignVariables, ...]]
 
     @abc.abstractmethod

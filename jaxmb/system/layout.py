@@ -44,11 +44,11 @@ class Layout:
         """Index of each velocity among all bodies' velocities, body by body, shape (nu,)."""
         return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu)
 
-    @property
+    @functools.cached_property
     def nq(self) -> int:
         return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)
 
-    @property
+    @functools.cached_property
     def nu(self) -> int:
         return sum(self.space.velocity_size if r else self.space.dimension for r in self.rotates)
 

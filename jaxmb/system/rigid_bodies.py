@@ -8,8 +8,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import unchecked_take
+from ..linalg.block_jacobian import block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
-from ..linalg.jacobian import DenseJacobian, block_jacobian
+from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, rotate
 from .bodies import AbstractBodySystem
 from .layout import Layout

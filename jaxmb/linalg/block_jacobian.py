@@ -1,0 +1,208 @@
+"""The Jacobian of constraints as blocks of joints on bodies, and its Gram matrix by sparse elimination.
+
+The Gram matrix `A M⁻¹ Aᵀ` couples the joints that share a body. A body of very many joints would couple them all, so
+such a body is a node of the elimination itself, eliminated after the joints that hang on it:
+
+    [ G    C ] [λ]   [b]       C = A_hubs L⁻ᵀ,   M = L Lᵀ,   G of the other bodies,
+    [ Cᵀ  −1 ] [z] = [0]
+
+a symmetric quasi-definite matrix. No other body couples to another through M.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .arrays import unchecked_take
+from .block_elimination import BlockFactor, eliminate_blocks
+from .blocks import matrix_products
+from .elimination_order import NodeOrder
+from .inertia import AbstractInertia
+from .jacobian import AbstractJacobian, DenseJacobian
+from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor
+from .sums import PlacedSums
+
+
+@dataclasses.dataclass(frozen=True)
+class JointOrder:
+    """The order of elimination of a scene's joints: static index arithmetic, compared by its `key`.
+
+    A joint has up to r rows and k bodies, a body v velocities.
+
+    **Fields:**
+
+    - `rows` (joints, r): index of the rows of each joint among all m; padding has the index m.
+    - `kept` (joints, r): whether a row is independent of the others; not of padding.
+    - `place` (m,): index of each row among those of the joints in order, raveled.
+    - `bodies` (joints, k): the bodies; their number for none.
+    - `blocks` (joints, k, r, v): index of their entries among the blocks of all joints as `block_jacobian` takes them;
+        padding has the index of the zero at their end.
+    - `on_bodies`: sums of what joints do to bodies, (joints · k) entries, for each body.
+    - `velocity_index` (bodies + 1, v): index of each body's velocities among all n; padding, and the last row, for no
+      body, have the index n.
+    - `velocity_place` (n,): index of each velocity among those of the bodies, raveled.
+    - `first`, `second` (products,): the blocks, by joint and body raveled, whose products make up G; `products`: sums
+        of these for the stored blocks of the matrix.
+    - `hubs` (h,): the bodies that are nodes of their own, after the joints; `on_hubs` (entries,): the blocks, by joint
+        and body raveled, of joints on hubs, and `hub_places` their places among the stored blocks.
+    - `nodes`: the order of elimination of joints and hubs.
+    """
+
+    key: Any
+    rows: np.ndarray = dataclasses.field(compare=False)
+    kept: np.ndarray = dataclasses.field(compare=False)
+    place: np.ndarray = dataclasses.field(compare=False)
+    bodies: np.ndarray = dataclasses.field(compare=False)
+    blocks: np.ndarray = dataclasses.field(compare=False)
+    on_bodies: PlacedSums = dataclasses.field(compare=False)
+    velocity_index: np.ndarray = dataclasses.field(compare=False)
+    velocity_place: np.ndarray = dataclasses.field(compare=False)
+    first: np.ndarray = dataclasses.field(compare=False)
+    second: np.ndarray = dataclasses.field(compare=False)
+    products: PlacedSums = dataclasses.field(compare=False)
+    hubs: np.ndarray = dataclasses.field(compare=False)
+    on_hubs: np.ndarray = dataclasses.field(compare=False)
+    hub_places: np.ndarray = dataclasses.field(compare=False)
+    nodes: NodeOrder = dataclasses.field(compare=False)
+
+
+class BlockJacobian(AbstractJacobian):
+    """Blocks of joints on bodies; products and elimination take a time that the graph of the joints determines, for
+    trees and local loops in proportion to the number of joints.
+
+    **Fields:** `blocks` (joints, k, r, v): those of each joint on its bodies; the `order` of elimination.
+    """
+
+    blocks: Float[Array, "j k r v"]
+    order: JointOrder = eqx.field(static=True)
+
+    def product(self, v):
+        return self._all_rows(self.on_joints(v))
+
+    def on_joints(self, v: Float[Array, "n"]) -> Float[Array, "j r"]:
+        """`A v`, joint by joint."""
+        own = unchecked_take(_of_bodies(self.order, v), self.order.bodies)
+        return jnp.sum(self.blocks * own[:, :, None, :], axis=(1, 3))
+
+    def transpose_product(self, multipliers):
+        return self.on_velocities(self._joint_rows(multipliers))
+
+    def on_velocities(self, multipliers: Float[Array, "j r"]) -> Float[Array, "n"]:
+        """`Aᵀ λ` from multipliers joint by joint."""
+        wrenches = jnp.sum(self.blocks * multipliers[:, None, :, None], axis=2)
+        of_bodies = self.order.on_bodies(wrenches.reshape(-1, wrenches.shape[2]))
+        return unchecked_take(of_bodies.reshape(-1), self.order.velocity_place)
+
+    def row_norms(self, scale):
+        own = unchecked_take(_of_bodies(self.order, scale), self.order.bodies)
+        return self._all_rows(jnp.sqrt(jnp.sum((self.blocks * own[:, :, None, :]) ** 2, axis=(1, 3))))
+
+    def gather_rows(self, values):
+        return jnp.where(self.order.kept, self._joint_rows(values), 0.0)
+
+    def scatter_rows(self, values):
+        return self._all_rows(jnp.where(self.order.kept, values, 0.0))
+
+    def gram(self, inertia):
+        return BlockGram(self, inertia)
+
+    def dense(self):
+        unit = jnp.eye(self.order.velocity_place.size, dtype=self.blocks.dtype)
+        return DenseJacobian(jax.vmap(self.product, in_axes=1, out_axes=1)(unit))
+
+    def _joint_rows(self, values):
+        return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)
+
+    def _all_rows(self, values):
+        return unchecked_take(values.reshape(-1), self.order.place)
+
+
+class BlockGram(AbstractPositiveDefinite):
+    """`A M⁻¹ Aᵀ` of the independent rows, and the identity of the others; its vectors are (joints, r)."""
+
+    jacobian: BlockJacobian
+    inertia: AbstractInertia
+
+    def product(self, x):
+        kept = self.jacobian.order.kept
+        forces = self.jacobian.on_velocities(jnp.where(kept, x, 0.0))
+        return jnp.where(kept, self.jacobian.on_joints(self.inertia.solve(forces)), x)
+
+    def eliminate(self, shift: float = 0.0):
+        """Eliminate; with a `shift`, a share of the largest entry is added to the diagonal, so that implied rows have a
+        pivot.
+        """
+        order, blocks = self.jacobian.order, self.jacobian.blocks
+        joints, k, r, v = blocks.shape
+        scaled = jnp.where(order.kept[:, None, :, None], blocks, 0.0)
+        unit = np.zeros((order.velocity_place.size + 1, v))
+        unit[order.velocity_index, np.arange(v)] = 1.0
+        root = _of_bodies(order, self.inertia.root().solve(jnp.asarray(unit[:-1], blocks.dtype)))
+        scaled = scaled.reshape(joints * k, r, v)
+        scaled = matrix_products(scaled, unchecked_take(root, order.bodies.reshape(-1)).swapaxes(1, 2))
+        products = matrix_products(
+            unchecked_take(scaled, order.first), unchecked_take(scaled, order.second).swapaxes(1, 2)
+        )
+        stored = order.products(products)
+        hubs = order.hubs.size
+        size = max(r, v) if hubs else r
+        stored = jnp.pad(stored, ((0, 0), (0, size - r), (0, size - r)))
+        if hubs:
+            across = jnp.pad(unchecked_take(scaled, order.on_hubs), ((0, 0), (0, size - r), (0, size - v)))
+            # The later of the two nodes is the row.
+            hub_is_row = order.nodes.row[order.hub_places] >= joints
+            across = jnp.where(hub_is_row[:, None, None], across.swapaxes(1, 2), across)
+            stored = stored.at[order.hub_places].set(across, unique_indices=True, mode="promise_in_bounds")
+        stored = stored + jnp.asarray(_identities(order, size), blocks.dtype)
+        if shift:
+            own = stored[:joints]
+            largest = jnp.max(jnp.diagonal(own, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
+            stored = stored.at[:joints].set(own + shift * largest * jnp.eye(size, dtype=blocks.dtype)[None])
+        factor = eliminate_blocks(stored, order.nodes)
+        # The first stored blocks are those on the diagonal.
+        return BlockGramFactor(self, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
+
+
+class BlockGramFactor(AbstractPositiveFactor):
+    """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
+
+    matrix: BlockGram
+    factor: BlockFactor
+    diagonal: Float[Array, "nodes b"]
+
+    def substitute(self, b):
+        joints, r = b.shape
+        nodes, size = self.diagonal.shape
+        return self.factor.solve(jnp.pad(b, ((0, nodes - joints), (0, size - r))))[:joints, :r]
+
+    def smallest_pivot(self):
+        joints = self.matrix.jacobian.order.kept.shape[0]
+        return jnp.min((self.factor.pivots() / self.diagonal)[:joints], initial=1.0)
+
+
+def block_jacobian(blocks: Float[Array, "entries"], order: JointOrder) -> BlockJacobian:
+    """A from the blocks of all joints, (rows, bodies, v) each, raveled one after the other and followed by a zero."""
+    return BlockJacobian(unchecked_take(blocks, order.blocks), order)
+
+
+def _of_bodies(order, values):
+    """Values (n, …) body by body, followed by zeros, (bodies + 1, v, …)."""
+    zero = jnp.zeros((1, *values.shape[1:]), values.dtype)
+    return unchecked_take(jnp.concatenate([values, zero]), order.velocity_index)
+
+
+def _identities(order, size):
+    """Ones on the diagonal for rows that are not kept, and minus ones for hubs: (stored blocks, b, b)."""
+    nodes = order.nodes
+    joints, r = order.kept.shape
+    diagonal = np.ones((nodes.nodes, size))
+    diagonal[:joints, :r] = ~order.kept
+    diagonal[joints:] = -1.0
+    out = np.zeros((nodes.blocks, size, size))
+    out[: nodes.nodes, np.arange(size), np.arange(size)] = diagonal
+    return out
