@@ -118,7 +118,9 @@ def test_work_and_program_grow_as_the_chain():
         assert order.blocks <= 3 * n
         assert sum(stage.nodes.size for stage in order.stages) <= 2 * n
         stored = jax.ShapeDtypeStruct((order.blocks, 2, 2), float)
-        text = jax.jit(lambda s, order=order: eliminate_blocks(s, order).solve(jnp.ones((order.nodes, 2)))).lower(stored)
+        text = jax.jit(lambda s, order=order: eliminate_blocks(s, order).solve(jnp.ones((order.nodes, 2)))).lower(
+            stored
+        )
         sizes[n] = len(text.as_text().splitlines())
     assert sizes[10000] <= 3 * sizes[100]
 

@@ -18,7 +18,6 @@ from jaxmb.formulations import Multipliers, Poincare, accelerations
 from jaxmb.manifold import Partition, Projection
 from jaxmb.mechanisms._relative import velocities
 from jaxmb.mechanisms.train import coupler_forces
-from jaxmb.states import closest
 from jaxmb.system.joint_graph import joint_order
 
 # A draft gear that is a linear spring.
@@ -314,37 +313,6 @@ def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
 @pytest.fixture(scope="module")
 def long_chain():
     return mb.mechanisms.get("rod_chain", n=16)
-
-
-def test_long_chains_are_assembled_as_short_ones_are(long_chain):
-    """Assembly by blocks against that with dense matrices, with derivatives."""
-    system, rng = long_chain.system, np.random.default_rng(0)
-    bend, turn = (jnp.asarray(rng.normal(size=48)) for _ in range(2))
-    held = np.isin(np.arange(48), [5, 20])
-    direction = jax.tree.map(lambda x: 1e-2 * x * jnp.asarray(rng.normal(size=x.shape)), system)
-    of_state = jnp.asarray(rng.normal(size=(2, 48)))
-
-    def blockwise(system, guess):
-        q, ok, _ = closest.configuration_by_blocks(system, 0.0, guess.q, held, 1e-10)
-        return jnp.stack([q, closest.velocities_by_blocks(system, 0.0, q, guess.u, held)[0]]), ok
-
-    def dense(system, guess):
-        q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), 32)
-        return jnp.stack([q, closest.closest_velocities(system, 0.0, q, guess.u, tuple(held.tolist()))[0]]), ok
-
-    @jax.jit
-    def evaluate(system, guess, direction):
-        pushed = lambda f: jax.jvp(lambda s, g: f(s, g)[0], (system, guess), (direction, guess))
-        back = lambda f: jax.grad(lambda s, g: jnp.vdot(of_state, f(s, g)[0]), (0, 1))(system, guess)
-        pulled = jax.tree.map(jnp.vdot, back(blockwise), (direction, guess))
-        return pushed(blockwise), pushed(dense), sum(jax.tree.leaves(pulled)), blockwise(system, guess)[1]
-
-    guess = mb.State(long_chain.state.q + 5e-4 * bend, turn)
-    (found, dfound), (expected, dexpected), pulled, ok = evaluate(system, guess, direction)
-    assert ok
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
-    np.testing.assert_allclose(jnp.vdot(of_state, dfound), pulled, rtol=1e-10)
 
 
 def test_long_chains_need_no_choice(long_chain):

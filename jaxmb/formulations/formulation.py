@@ -101,7 +101,8 @@ def accelerations(
 
 
 def _jacobian(system, formulation, t, q, u):
-    searches = formulation.partitions or system.acceleration_rank < system.acceleration_rows
+    drops = system.elimination is None and system.acceleration_rank < system.acceleration_rows
+    searches = formulation.partitions or drops
     return pivoted_jacobian(system, t, q, u) if searches else system.structured_jacobian(t, q, u)
 
 

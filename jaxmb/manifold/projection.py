@@ -95,7 +95,7 @@ def _check_multistep(system, formulation):
             f"Projection with Adams finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
             "the formulation out, or use Partition()."
         )
-    if system.acceleration_rank < system.acceleration_rows:
+    if system.elimination is None and system.acceleration_rank < system.acceleration_rows:
         raise ValueError(
             f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and "
             "Projection with Adams drops none; use Partition()."

@@ -4,10 +4,7 @@ The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, 
 velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0`, with some rates held. Derivatives are
 those of the minimisers, by the implicit function theorem.
 
-If the system has an order of elimination and very many rows, no dense matrix is formed. The minimiser satisfies
-`q = q_guess − S² Aᵀ(q) μ`, `Φ(q) = 0` (S: scales, zero where coordinates are held). With the constraints linearised at
-the last iterate μ follows from one elimination by blocks. This iteration converges to the minimiser, in one step if the
-guess is on the constraints. It needs a better guess than Newton's method on the optimality conditions.
+If the system has an order of elimination and very many rows, no dense matrix is formed; see `closest_sparse`.
 """
 
 import equinox as eqx
@@ -19,17 +16,12 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ..linalg.elimination import full_pivot
-from ..linalg.inertia import DiagonalInertia
-from ..linalg.jacobian import MassProjector
 from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractSystem
-from ..system.displacement import displaced
+from .closest_sparse import sparse_configuration, sparse_velocities
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
-MANY_ROWS = 300
-
-# Rows are independent if every pivot of block elimination (a squared distance between rows of unit norm) exceeds this.
-INDEPENDENT = 1e-5
+MANY_ROWS = 150
 
 # Largest number of Gauss–Newton steps to the constraints.
 _ITERATIONS = 100
@@ -41,16 +33,11 @@ _PROGRESS = 0.999
 _REFINED = 1e-10
 _REFINEMENTS = 16
 
-# Implied rows get this share of their diagonal as a pivot.
-_SHIFT = 1e-13
-
-# Largest number of linearisations by blocks.
-_LINEARIZATIONS = 30
-
 
 def eliminates_by_blocks(system: AbstractSystem) -> bool:
     """Whether closest states are found without dense matrices."""
-    return system.elimination is not None and system.velocity_rows >= MANY_ROWS
+    only_positions = system.acceleration_rows == system.position_rows
+    return system.elimination is not None and only_positions and system.position_rows >= MANY_ROWS
 
 
 @eqx.filter_jit
@@ -65,9 +52,9 @@ def closest_configuration(
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
-    if eliminates_by_blocks(system):
-        q, ok, pivot = configuration_by_blocks(system, t, guess, fixed, tolerance(guess.dtype))
-        return q, ok & (pivot > INDEPENDENT)
+    without = system.held_velocities(fixed)
+    if eliminates_by_blocks(system) and without is not None:
+        return sparse_configuration(system, t, guess, fixed, without, tolerance(guess.dtype))
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
     start = lax.stop_gradient(guess)
     frozen = lax.stop_gradient(system)
@@ -122,8 +109,7 @@ def closest_velocities(
         return guess, jnp.array(True)
     fixed = np.array(held)
     if eliminates_by_blocks(system):
-        u, pivot = velocities_by_blocks(system, t, q, guess, fixed)
-        return u, jnp.all(jnp.isfinite(u)) & (pivot > INDEPENDENT)
+        return sparse_velocities(system, t, q, guess, fixed)
     scale = jnp.where(fixed, 0.0, system.velocity_scale())
     u, rank, ok = guess, system.velocity_rank, jnp.array(True)
     jacobian = system.velocity_jacobian(t, q, u)
@@ -199,86 +185,3 @@ def residual_size(
 def tolerance(dtype) -> float:
     """The largest scaled residual that counts as zero: 1e-10 in double precision."""
     return float(jnp.finfo(dtype).eps) ** 0.64
-
-
-# By blocks
-
-
-def meet_by_blocks(
-    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"]
-) -> tuple[Float[Array, "nq"], Float[Array, ""]]:
-    """`meet_constraints` by an order of elimination of the rows of Φ; implied rows are allowed.
-
-    **Returns:** the configuration, and the largest residual as in `residual_size`.
-    """
-    scale = system.velocity_scale()
-    metric, at_rest = DiagonalInertia(1 / scale**2), jnp.zeros_like(scale)
-    more = system.acceleration_rows - system.position_rows
-
-    def squares(q):
-        return jnp.sum(system.position_residual(t, q) ** 2)
-
-    def correct(q):
-        residual = system.position_residual(t, q)
-        jacobian = system.structured_jacobian(t, q, at_rest)
-        factor = jacobian.gram(metric).eliminate(_SHIFT)
-        multipliers = factor.substitute(jacobian.gather_rows(jnp.pad(residual, (0, more))))
-        step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
-        longest = jnp.max(jnp.abs(step) / scale)
-        step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
-        lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
-        moved = jax.vmap(lambda a: displaced(system, t, q, a * step))(lengths)
-        sizes = jax.vmap(squares)(moved)
-        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
-        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
-        return moved[best], jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
-
-    far = lambda q, size: (size > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
-    q = newton(correct, far, start, most=_ITERATIONS, dtype=start.dtype)[0]
-    norms = system.structured_jacobian(t, q, at_rest).row_norms(scale)[: system.position_rows]
-    floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
-    return q, jnp.max(jnp.abs(system.position_residual(t, q)) / jnp.maximum(norms, floor))
-
-
-def configuration_by_blocks(
-    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: Bool[np.ndarray, "nq"], tol: float
-) -> tuple[Float[Array, "nq"], Bool[Array, ""], Float[Array, ""]]:
-    """The configuration closest to a guess; whether it was found; and the smallest pivot there."""
-
-    def improved(q):
-        here = _projector(system, t, q, held)
-        unmet = system.position_residual(t, q) + here.jacobian.product(guess - q)
-        return guess - here.direction(here.multipliers(unmet))
-
-    def solve(_, start):
-        def correct(q):
-            new = improved(q)
-            return new, jnp.max(jnp.abs(new - q))
-
-        far = lambda _, change: change > tol * system.length
-        return newton(correct, far, start, most=_LINEARIZATIONS, dtype=start.dtype)[0]
-
-    def tangent_solve(linear, b):
-        # x = b + (1 − L) x: the linear map is near the identity where the guess is near the constraints. As many
-        # iterations as for the root give its derivative to the same accuracy.
-        return lax.fori_loop(0, _LINEARIZATIONS, lambda _, x: b + (x - linear(x)), b)
-
-    q = lax.custom_root(lambda q: q - improved(q), lax.stop_gradient(guess), solve, tangent_solve)
-    pivot = _projector(system, t, q, held).factor.smallest_pivot()
-    # Another iteration changes nothing.
-    change = jnp.max(jnp.abs(improved(q) - q))
-    return q, jnp.all(jnp.isfinite(q)) & (change <= tol * system.length), pivot
-
-
-def velocities_by_blocks(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[np.ndarray, "nu"]
-) -> tuple[Float[Array, "nu"], Float[Array, ""]]:
-    """The velocities closest to a guess, and the smallest pivot."""
-    here = _projector(system, t, q, held)
-    return guess + here.cancel(system.velocity_residual(t, q, guess)), here.factor.smallest_pivot()
-
-
-def _projector(system, t, q, held) -> MassProjector:
-    # Coordinates and rates that are held have an infinite mass.
-    metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
-    return system.structured_jacobian(t, q, jnp.zeros_like(q)).projector(metric)

@@ -23,7 +23,8 @@ from ..system.equation import Ranks
 from ..system.joint_graph import elimination_order, joint_order
 from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
-from .closest import meet_by_blocks, tolerance
+from .closest import tolerance
+from .closest_sparse import meet_sparse
 from .independence import Part, absolute_parts, matrix, subsets
 from .redundancy import Group, Nearby, check_gradients, check_implied
 
@@ -114,7 +115,8 @@ def _of_parts(groups):
 @eqx.filter_jit
 def _met(system):
     """The configuration where constraints are met, and the size of the residuals that remain."""
-    return meet_by_blocks(system, jnp.zeros((), system.guess.q.dtype), system.normalize(system.guess.q))
+    t, none = jnp.zeros((), system.guess.q.dtype), np.zeros(system.nu, bool)
+    return meet_sparse(system, t, system.guess.q, none)
 
 
 class _Evaluation(NamedTuple):

@@ -359,6 +359,17 @@ class AbstractBodySystem(AbstractSystem):
             q = q.at[index].set(normalize(q[index]))
         return q, len(whole)
 
+    def held_velocities(self, held):
+        if self.rates_are_velocities:
+            return held
+        d = self.layout.space.dimension
+        of_pose = np.append(held, np.ones(self.layout.space.pose_size, bool))[self.layout.pose_index[:-1]]
+        turns = of_pose[:, d:]
+        if np.any(np.any(turns, axis=1) & ~np.all(turns, axis=1)):
+            return None
+        of_bodies = np.concatenate([of_pose[:, :d], np.repeat(turns[:, :1], d, axis=1)], axis=1)
+        return of_bodies.reshape(-1)[self.layout.velocity_place]
+
     def _pack(self, poses):
         if self.layout.uniform:
             return poses.reshape(-1)

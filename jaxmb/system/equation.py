@@ -240,6 +240,12 @@ class AbstractSystem(eqx.Module):
         """
 
     @abc.abstractmethod
+    def held_velocities(self, held: Bool[np.ndarray, "nq"]) -> Bool[np.ndarray, "nu"] | None:
+        """The velocities along which held coordinates do not move; None where some of a rotation is held but not all
+        of it.
+        """
+
+    @abc.abstractmethod
     def coordinate_scale(self) -> Float[Array, "nq"]:
         """Size of a typical change of each coordinate; without derivative."""
 

@@ -23,6 +23,9 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def has_bodies(self) -> bool:
         return False
 
+    def held_velocities(self, held):
+        return held if self.rates_are_velocities else None
+
     def structured_jacobian(self, t, q, u):
         return DenseJacobian(self.jacobian(t, q, u))
 

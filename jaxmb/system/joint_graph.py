@@ -28,6 +28,8 @@ _HUB = 6
 
 # From this number of rows on block elimination is faster; see jaxmb.linalg for the measurement.
 _LEAST_ROWS = 30
+# The same where rows are implied by others: a chart finds others to leave out on the way, block elimination does not.
+_LEAST_ROWS_WITH_IMPLIED = 150
 
 
 def elimination_order(
@@ -37,7 +39,8 @@ def elimination_order(
 
     **Arguments:** as in `joint_order`.
     """
-    if not system.ideal_on_velocities or system.velocity_rows < _LEAST_ROWS:
+    least = _LEAST_ROWS_WITH_IMPLIED if left_out else _LEAST_ROWS
+    if not (system.ideal_on_velocities and system.linear) or system.velocity_rows < least:
         return None
     return joint_order(system, left_out, absolute)
 

@@ -1,0 +1,276 @@
+"""The closest configuration and velocities of scenes of many bodies, without dense matrices.
+
+With the rates `q̇ = K u` and the scales S the closest configuration satisfies
+
+    g(q, μ) = Kᵀ S⁻² (q − q_guess) + Aᵀ μ = 0,    Φ(q) = 0.
+
+Gauss–Newton steps lead to the constraints, and Newton's method along them to the minimiser. Its linear systems are
+solved by conjugate gradients in the null space of A, with the metric `M = Kᵀ S⁻² K` as the preconditioner, which the
+elimination of `A M⁻¹ Aᵀ` projects. Derivatives follow from the same equations.
+
+Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic programming
+problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001 (projected conjugate gradients).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar
+from ..linalg.inertia import DiagonalInertia
+from ..linalg.jacobian import MassProjector
+from ..linalg.newton import newton
+from ..system import AbstractSystem
+from ..system.displacement import displaced
+
+# Rows are independent if every pivot of the elimination (a squared distance between rows of unit norm) exceeds this.
+_INDEPENDENT = 1e-8
+# Implied rows get this share of the largest entry of the diagonal as a pivot.
+_SHIFT = 1e-13
+# Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
+# this share.
+_ITERATIONS = 100
+_PROGRESS = 0.999
+# Newton's method along the constraints: largest number of steps and halvings of steps together, and a step that is
+# small enough to be the last but one.
+_STEPS = 60
+_LAST = 1e-6
+# Conjugate gradients: reduction of the residual, and largest number of iterations.
+_REDUCTION = 1e-13
+_GRADIENTS = 300
+
+
+def meet_sparse(
+    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
+) -> tuple[Float[Array, "nq"], Float[Array, ""]]:
+    """Gauss–Newton from a guess to the constraints, with step halving, without motion along fixed velocities; without
+    derivative. Implied rows are allowed: the normal equations are regularised at rounding level.
+
+    **Returns:** the configuration, and the largest residual, each row scaled to unit norm of its gradient times the
+    system's size.
+    """
+    scale = system.velocity_scale()
+    metric, at_rest = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2)), jnp.zeros_like(scale)
+
+    def squares(q):
+        return jnp.sum(system.position_residual(t, q) ** 2)
+
+    def correct(q):
+        residual = system.position_residual(t, q)
+        jacobian = system.structured_jacobian(t, q, at_rest)
+        factor = jacobian.gram(metric).eliminate(_SHIFT)
+        multipliers = factor.substitute(jacobian.gather_rows(_all_rows(system, residual)))
+        step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
+        # Rotations by more than about a radian leave the region where the linearisation is valid.
+        longest = jnp.max(jnp.abs(step) / scale)
+        step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+        lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
+        moved = jax.vmap(lambda a: displaced(system, t, q, a * step))(lengths)
+        sizes = jax.vmap(squares)(moved)
+        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
+        return moved[best], jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
+
+    small = float(jnp.finfo(start.dtype).eps) ** 0.75
+    far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+    q = newton(correct, far, system.normalize(start), most=_ITERATIONS, dtype=start.dtype)[0]
+    norms = system.structured_jacobian(t, q, at_rest).row_norms(scale)[: system.position_rows]
+    floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
+    return q, jnp.max(jnp.abs(system.position_residual(t, q)) / jnp.maximum(norms, floor))
+
+
+def sparse_configuration(
+    system: AbstractSystem,
+    t: Scalar,
+    guess: Float[Array, "nq"],
+    held: Bool[np.ndarray, "nq"],
+    fixed: Bool[np.ndarray, "nu"],
+    tol: float,
+) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
+    """The configuration closest to a guess, with some coordinates held, and so some velocities fixed; and whether it
+    was found: the residuals are at most `tol`.
+    """
+    where = _Held(tuple(held.tolist()), tuple(fixed.tolist()))
+    return _closest(system, jnp.asarray(t, guess.dtype), guess, where, tol)
+
+
+def sparse_velocities(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[np.ndarray, "nu"]
+) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
+    """The velocities closest to a guess, with some rates held; and whether they were found."""
+    # Rates that are held have an infinite mass.
+    metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
+    here = system.structured_jacobian(t, q, jnp.zeros_like(guess)).projector(metric)
+    u = guess + here.cancel(system.velocity_residual(t, q, guess))
+    return u, jnp.all(jnp.isfinite(u)) & (here.factor.smallest_pivot() > _INDEPENDENT)
+
+
+class _Held(eqx.Module):
+    coordinates: tuple[bool, ...] = eqx.field(static=True)
+    velocities: tuple[bool, ...] = eqx.field(static=True)
+
+
+class _Optimality(NamedTuple):
+    """The equations of the closest configuration at one; `projector` in their metric."""
+
+    projector: MassProjector
+    multipliers: Float[Array, "m"]
+    gradient: Float[Array, "nu"]
+
+
+@eqx.filter_custom_jvp
+def _closest(system, t, guess, held, tol):
+    fixed = np.array(held.velocities)
+    square = 1 / system.coordinate_scale() ** 2
+    distance = lambda q: jnp.sum(square * (q - guess) ** 2)
+
+    def correct(carry):
+        q, step, length, _ = carry
+        new, residual = meet_sparse(system, t, displaced(system, t, q, length * step), fixed)
+        before, after = distance(q), distance(new)
+        size = length * jnp.max(jnp.abs(step) / system.velocity_scale())
+        # The first step leads to the constraints, and the last ones change the distance by rounding errors only.
+        better = (length == 0.0) | (after < before) | (size <= _LAST)
+        go_on = lambda: (new, _newton_step(system, t, new, guess, fixed), jnp.ones_like(length), residual)
+        halve = lambda: (q, step, 0.5 * length, residual)
+        out = lax.cond(better, go_on, halve)
+        ahead = jnp.max(jnp.abs(out[1]) / system.velocity_scale()) * out[2]
+        return out, jnp.where(residual <= tol, ahead, jnp.inf)
+
+    none = jnp.zeros(())
+    far = lambda carry, ahead: (ahead > 1e-3 * tol) & jnp.all(jnp.isfinite(carry[0])) & ~(carry[3] > tol)
+    start = guess, jnp.zeros(system.nu, guess.dtype), none.astype(guess.dtype), none.astype(guess.dtype)
+    (q, _, length, residual), ahead = newton(correct, far, start, most=_STEPS, dtype=guess.dtype)
+    at = _optimality(system, t, q, guess, fixed)
+    found = jnp.all(jnp.isfinite(q)) & (residual <= tol) & (ahead <= tol) & (length > 0)
+    return q, found & (at.projector.factor.smallest_pivot() > _INDEPENDENT)
+
+
+@_closest.def_jvp
+def _closest_jvp(primals, tangents):
+    system, t, guess, held, tol = primals
+    dsystem, dt, dguess, _, _ = tangents
+    q, found = _closest(system, t, guess, held, tol)
+    fixed = np.array(held.velocities)
+    at = _optimality(system, t, q, guess, fixed)
+    dguess = jnp.zeros_like(guess) if dguess is None else dguess
+    moved = jnp.where(np.array(held.coordinates), dguess, 0.0)
+
+    def equations(system, t, guess, q):
+        return _gradient(system, t, q, guess, at.multipliers), _all_rows(system, system.position_residual(t, q))
+
+    _, (gradient, unmet) = eqx.filter_jvp(equations, (system, t, guess, q), (dsystem, dt, dguess, moved))
+    step = _solve(system, t, q, guess, fixed, at, -gradient, -unmet)
+    along = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))[1]
+    return (q, found), (moved + along, None)
+
+
+def _optimality(system, t, q, guess, fixed):
+    metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(system, t, q)))
+    projector = system.structured_jacobian(t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
+    gradient = _gradient(system, t, q, guess, jnp.zeros(system.acceleration_rows, q.dtype))
+    multipliers = -projector.multipliers(projector.jacobian.product(metric.solve(gradient)))
+    return _Optimality(projector, multipliers, gradient + projector.jacobian.transpose_product(multipliers))
+
+
+def _gradient(system, t, q, guess, multipliers):
+    """`g`, of a configuration that the multipliers do not depend on."""
+    rates = lambda u: system.rates(t, q, u)
+    (pulled,) = jax.linear_transpose(rates, jnp.zeros(system.nu, q.dtype))((q - guess) / system.coordinate_scale() ** 2)
+    return pulled + system.constraint_force(t, q, jnp.zeros(system.nu, q.dtype), multipliers)
+
+
+def _weights(system, t, q):
+    """The diagonal of `Kᵀ S⁻² K`."""
+    rates = lambda u: system.rates(t, q, u)
+    ones = jnp.ones(system.nu, q.dtype)
+    return jax.linear_transpose(rates, ones)(rates(ones) / system.coordinate_scale() ** 2)[0]
+
+
+def _newton_step(system, t, q, guess, fixed):
+    at = _optimality(system, t, q, guess, fixed)
+    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
+    return _null_space_solution(curved, at.projector, -at.gradient)
+
+
+def _curvature(system, t, q, guess, fixed, multipliers):
+    """How g changes with a displacement along velocities that are not fixed."""
+
+    def along(v):
+        v = jnp.where(fixed, 0.0, v)
+        dq = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(v),), (v,))[1]
+        change = jax.jvp(lambda q: _gradient(system, t, q, guess, multipliers), (q,), (dq,))[1]
+        return jnp.where(fixed, 0.0, change)
+
+    return along
+
+
+def _solve(system, t, q, guess, fixed, at, gradient, unmet):
+    """The displacement that changes g and Φ by this much: `H v + Aᵀ δμ`, `A v`."""
+    projector, order = at.projector, at.projector.jacobian
+    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
+    free = ~fixed
+    independent = order.scatter_rows(order.gather_rows(jnp.ones(system.acceleration_rows, q.dtype)))
+
+    def matrix(x):
+        v, multipliers = x
+        forces = jnp.where(free, order.transpose_product(independent * multipliers), v)
+        rows = independent * order.product(jnp.where(free, v, 0.0))
+        return curved(v) + forces, rows + (1 - independent) * multipliers
+
+    def solve(_, b):
+        # Conjugate gradients lose digits by rounding, which one step of refinement restores.
+        x = once(b)
+        return jax.tree.map(jnp.add, x, once(jax.tree.map(jnp.subtract, b, matrix(x))))
+
+    def once(b):
+        forces, rows = b
+        particular = projector.direction(projector.multipliers(rows))
+        v = particular + _null_space_solution(curved, projector, forces - curved(particular))
+        left = projector.jacobian.product(projector.metric.solve(forces - curved(v)))
+        return jnp.where(free, v, forces), projector.multipliers(left) + (1 - independent) * rows
+
+    right = jnp.where(free, gradient, 0.0), independent * unmet
+    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[0]
+
+
+def _null_space_solution(curved, projector, force):
+    """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients. Where a direction of
+    negative curvature is met, what was found until then, or that direction.
+    """
+
+    def project(force):
+        free = projector.metric.solve(force)
+        return free - projector.direction(projector.multipliers(projector.jacobian.product(free)))
+
+    towards = project(force)
+    size = jnp.vdot(force, towards)
+
+    def correct(carry):
+        x, left, along, size, k, _ = carry
+        curve = curved(along)
+        curvature = jnp.vdot(along, curve)
+        convex = curvature > 0
+        length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
+        left = left - length * curve
+        towards = project(left)
+        new = jnp.vdot(left, towards)
+        along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
+        x = x + length * carry[2]
+        return x, left, along, new, k + 1, convex
+
+    def proceed(carry):
+        return (carry[3] > _REDUCTION**2 * size) & (carry[4] < _GRADIENTS) & carry[5]
+
+    start = jnp.zeros_like(force), force, towards, size, jnp.array(0), jnp.array(True)
+    return lax.while_loop(proceed, correct, start)[0]
+
+
+def _all_rows(system, residual):
+    """Φ, and zeros for the rows that bind velocities and accelerations only."""
+    return jnp.pad(residual, (0, system.acceleration_rows - system.position_rows))

@@ -1,0 +1,106 @@
+"""Assembly without dense matrices against assembly with them, with derivatives; and from rough guesses."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.states import closest
+from jaxmb.states.closest_sparse import sparse_configuration, sparse_velocities
+from jaxmb.system.joint_graph import joint_order
+
+
+def planar_tree(n=15, **options):
+    """Rods on pins, two on the end of each."""
+    ends, bodies, joints = {}, [], []
+    for k in range(n):
+        above = (k - 1) // 2
+        start, angle = ((0.0, 0.0), -1.5) if k == 0 else (ends[above][0], ends[above][1] + (0.5 if k % 2 else -0.5))
+        step = np.array([np.cos(angle), np.sin(angle)])
+        bodies.append(planar.Body(f"rod{k}", mass=1.0, inertia=0.1, position=tuple(start + 0.5 * step), angle=angle))
+        ends[k] = start + step, angle
+        joints.append(planar.Revolute(f"pin{k}", "ground" if k == 0 else f"rod{above}", f"rod{k}", point=start))
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))], **options).compile()
+
+
+def hanging_net(n=3, m=3):
+    """Balls joined by rods without mass, and bodies on ball joints at a corner."""
+    bodies = [spatial.PointMass(f"p{i}{j}", mass=1.0, position=(i, j, 0.0)) for i in range(n) for j in range(m)]
+    rods = [((i, j), (i + 1, j)) for i in range(n - 1) for j in range(m)]
+    rods += [((i, j), (i, j + 1)) for i in range(n) for j in range(m - 1)]
+    name = lambda at: f"p{at[0]}{at[1]}"
+    joints = [spatial.Distance(f"{name(a)}-{name(b)}", name(a), name(b), length=1.0) for a, b in rods]
+    for k, at in enumerate([(0, 0), (n - 1, 0)]):
+        body = spatial.Body(f"hook{k}", mass=2.0, inertia=(0.1, 0.2, 0.25), position=(*at, 0.5))
+        bodies.append(body)
+        joints += [
+            spatial.Spherical(f"eye{k}", "ground", f"hook{k}", point=(*at, 1.0)),
+            spatial.Spherical(f"end{k}", f"hook{k}", name(at), point=(*at, 0.0)),
+        ]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+def held_in(system, names):
+    held = np.zeros(system.nq, bool)
+    for name in names:
+        held[system.coordinate_names()[name]] = True
+    return held
+
+
+@pytest.mark.parametrize(
+    ("build", "names"), [(planar_tree, ["rod3.angle", "rod9.x"]), (hanging_net, ["p22.z", "hook1.orientation"])]
+)
+def test_the_closest_state_and_its_derivatives(build, names):
+    system, rng = build(), np.random.default_rng(0)
+    structured = dataclasses.replace(system, elimination=joint_order(system))
+    held = held_in(system, names)
+    fixed = system.held_velocities(held)
+    shift = lambda size, n: jnp.asarray(size * rng.normal(size=n))
+    guess = mb.State(system.guess.q + jnp.where(held, 0.1, 1.0) * shift(0.1, system.nq), shift(1.0, system.nu))
+    guess = mb.State(system.normalize_fixed(guess.q, held)[0], guess.u)
+    direction = jax.tree.map(lambda x: 1e-2 * x * shift(1.0, x.shape), structured)
+    rank = system.coordinate_rank - system.normalize_fixed(guess.q, held)[1]
+
+    def sparse(system, guess):
+        q, ok = sparse_configuration(system, 0.0, guess.q, held, fixed, 1e-10)
+        u, also = sparse_velocities(system, 0.0, q, guess.u, fixed)
+        return jnp.concatenate([q, u]), ok & also
+
+    def dense(system, guess):
+        q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), rank)
+        u, also = closest.closest_velocities(system, 0.0, q, guess.u, tuple(fixed.tolist()))
+        return jnp.concatenate([q, u]), ok & also
+
+    along = mb.State(jnp.where(held, 0.0, shift(0.1, system.nq)), shift(0.1, system.nu))
+
+    @jax.jit
+    def evaluate(system, guess):
+        push = lambda f: jax.jvp(lambda s, g: f(s, g)[0], (system, guess), (direction, along))
+        weights = jnp.cos(jnp.arange(system.nq + system.nu, dtype=float))
+        back = jax.grad(lambda s, g: weights @ sparse(s, g)[0], (0, 1))(system, guess)
+        pulled = sum(map(jnp.vdot, jax.tree.leaves(back), jax.tree.leaves((direction, along))))
+        return push(sparse), push(dense), pulled, weights, sparse(system, guess)[1] & dense(system, guess)[1]
+
+    (found, dfound), (expected, dexpected), pulled, weights, ok = evaluate(structured, guess)
+    assert ok
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
+    np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.4])
+def test_rough_guesses(size):
+    """A tree of 300 rods, every coordinate off by some tenths: a minimum at which every change is along the rods."""
+    system, rng = planar_tree(300), np.random.default_rng(1)
+    assert system.elimination is not None
+    guess = mb.State(system.guess.q + size * jnp.asarray(rng.normal(size=system.nq)), system.guess.u)
+    state = mb.assemble(system, guess)
+    assert np.max(np.abs(system.position_residual(0.0, state.q))) <= 1e-12
+    gradient = (state.q - guess.q) / system.coordinate_scale() ** 2
+    A = system.jacobian(0.0, state.q, state.u)
+    across = gradient - A.T @ jnp.linalg.lstsq(A.T, gradient)[0]
+    assert np.max(np.abs(across)) <= 1e-8 * np.max(np.abs(gradient))
