@@ -1,0 +1,302 @@
+"""Sparse elimination of joints against dense matrices: mechanisms of the library, bodies of many joints, and random
+graphs with loops, redundant or not.
+"""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.formulations.formulation import pivoted_jacobian
+from jaxmb.manifold import Partition, Projection
+from jaxmb.parts.spatial.kinematics import SPACE
+from jaxmb.states.independence import Part, subsets
+from jaxmb.system.block_cut_tree import components
+from jaxmb.system.joint_graph import joint_order
+from jaxmb.system.layout import Layout
+
+
+def by_blocks(system):
+    """The system with sparse elimination of the independent rows, also where a dense matrix is faster."""
+    rows = {row: k for k, row in enumerate(system.rows)}
+    return dataclasses.replace(
+        system, elimination=joint_order(system, tuple(sorted(rows[own.name, own.row] for own in system.implied)))
+    )
+
+
+def compare(system, q, u, *, atol=1e-10):
+    """Accelerations, constraint forces and projections at a state, with sparse and dense matrices."""
+
+    @jax.jit
+    def evaluate(q, u):
+        out = []
+        for own in (by_blocks(system), system):
+            udot, multipliers = accelerations(own, Multipliers(), 0.0, q, u)
+            jacobian = own.structured_jacobian(0.0, q, u) if own.elimination else pivoted_jacobian(own, 0.0, q, u)
+            projector = jacobian.projector(own.inertia(0.0, q, u))
+            displacement = projector.cancel(jacobian.product(jnp.cos(jnp.arange(own.nu, dtype=float))))
+            force = own.constraint_force(0.0, q, u, multipliers)
+            out.append((udot, force, displacement, jacobian.product(u), jacobian.dense().matrix))
+        return out
+
+    for found, expected in zip(*evaluate(q, u), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol * (1.0 + np.max(np.abs(expected))))
+
+
+SCENES = [
+    "andrews",
+    "bennett",
+    "bricard",
+    "double_wishbone",
+    "flyball",
+    "four_bar",
+    "heavy_top",
+    "n_four_bar",
+    "parallelogram",
+    "rod_chain",
+    "rolling_disk",
+    "slider_crank",
+    "spatial_loop",
+    "spatial_slider_crank",
+    "swash_plate",
+    "tracked_vehicle",
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SCENES)
+def test_mechanisms_of_the_library(name):
+    mechanism = mb.mechanisms.get(name)
+    system, rng = mechanism.system, np.random.default_rng(0)
+    start = mechanism.state
+    guess = mb.State(start.q + 0.01 * jnp.asarray(rng.normal(size=system.nq)), start.u)
+    state = mb.assemble(system, guess)
+    # The masses of the governor differ by 10⁶.
+    compare(system, state.q, state.u, atol=1e-8 if name == "flyball" else 1e-10)
+
+
+def star(branches, links, *, ground=False):
+    """Chains of rods on pins at the rim of one body."""
+    bodies = [planar.Body("hub", mass=3.0, inertia=2.0)]
+    joints = [planar.Revolute("axle", "ground", "hub", point=(0.0, 0.0))] if ground else []
+    for b in range(branches):
+        angle = 2 * np.pi * b / branches + 0.1
+        along = np.array([np.cos(angle), np.sin(angle)])
+        for k in range(links):
+            bodies.append(
+                planar.Body(f"r{b}{k}", mass=1.0 + 0.1 * k, inertia=0.1, position=tuple((1.5 + k) * along), angle=angle)
+            )
+            above = f"r{b}{k - 1}" if k else "hub"
+            joints.append(planar.Revolute(f"p{b}{k}", above, f"r{b}{k}", point=tuple((1.0 + k) * along)))
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def two_stars():
+    """Two bodies of many joints that a chain connects, in space, with a loop on one of them."""
+    bodies, joints = [], []
+    for side, x in (("left", 0.0), ("right", 4.0)):
+        bodies.append(spatial.Body(side, mass=5.0, inertia=(1.0, 2.0, 3.0), position=(x, 0.0, 0.0)))
+        for k in range(7):
+            angle = 2 * np.pi * k / 7
+            at = np.array([x, np.cos(angle), np.sin(angle)])
+            name = f"{side}{k}"
+            bodies.append(
+                spatial.Body(name, mass=1.0, inertia=(0.1, 0.12, 0.15), position=tuple(1.5 * at - [x / 2, 0, 0]))
+            )
+            joints.append(spatial.Revolute(f"h{name}", side, name, point=tuple(at), axis=(1.0, 0.0, 0.0)))
+    bodies.append(spatial.Body("between", mass=1.0, inertia=(0.1, 0.12, 0.15), position=(2.0, 0.0, 0.0)))
+    joints += [
+        spatial.Spherical("a", "left", "between", point=(1.0, 0.0, 0.0)),
+        spatial.Spherical("b", "between", "right", point=(3.0, 0.0, 0.0)),
+        spatial.Distance("tie", "left0", "left1"),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.parametrize(
+    ("build", "hubs"),
+    [
+        (lambda: star(9, 2), 1),
+        (lambda: star(8, 1, ground=True), 1),
+        pytest.param(two_stars, 2, marks=pytest.mark.long),
+    ],
+)
+def test_bodies_of_many_joints(build, hubs):
+    system = build()
+    order = joint_order(system)
+    assert order.hubs.size == hubs
+    # No more blocks than the graph has edges: nothing couples all joints of a body with each other.
+    assert order.nodes.blocks <= order.nodes.nodes + 2 * len(order.kept) + 10
+    rng = np.random.default_rng(0)
+    state = mb.assemble(system, mb.State(system.guess.q, jnp.asarray(rng.normal(size=system.nu))))
+    compare(system, state.q, state.u)
+
+
+def test_motion_and_its_derivatives():
+    """A star that moves as by partitioning, with forward, reverse and central differences."""
+    system = star(8, 2, ground=True)
+    assert system.elimination is not None
+    state = mb.assemble(system, mb.State(system.guess.q, jnp.asarray(np.random.default_rng(0).normal(size=system.nu))))
+
+    def tip(h, manifold, rtol, **options):
+        own = mb.with_parameters(system, {"r30.mass": 1.0 + h, "p31.point_a": jnp.array([0.5 + 0.1 * h, 0.0])})
+        start = mb.manifold.project(own, 0.0, state)
+        y = mb.simulate(own, start, t1=0.5, rtol=rtol, atol=rtol, manifold=manifold, throw=False, **options).ys
+        return jnp.sum(jnp.cos(y.q[-1])) + jnp.sum(y.u[-1]) * 0.1
+
+    mode = diffrax.ForwardMode()
+    forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: tip(h, None, rtol, adjoint=mode), (h,), (1.0,)))
+    value, push = forward(0.0, 1e-10)
+    np.testing.assert_allclose(value, jax.jit(lambda: tip(0.0, Partition(), 1e-10))(), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda h: tip(h, None, 1e-10)))(0.0), push, rtol=1e-8)
+    h = 1e-3
+    at = lambda h: forward(h, 1e-12)[0]
+    difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(push, difference, rtol=1e-6)
+
+
+# Random graphs
+
+
+def random_parts(rng, bodies, loops):
+    """A random tree of hinges in space with more hinges that close loops, as rows on velocities: the row of a hinge
+    depends on the relative motion of its bodies alone.
+    """
+    ends = [(int(rng.integers(-1, k)) % (bodies + 1), k) for k in range(bodies)]
+    ends += [tuple(rng.choice(bodies + 1, 2, replace=False).tolist()) for _ in range(loops)]
+    position = np.append(rng.normal(size=(bodies, 3)), np.zeros((1, 3)), axis=0)
+    parts, blocks, first = [], [], 0
+    for own in ends:
+        point, axis = rng.normal(size=3), rng.normal(size=3)
+        across = np.linalg.svd(axis[None])[2][1:]
+        rows = np.concatenate([np.hstack([np.eye(3), np.zeros((3, 3))]), np.hstack([np.zeros((2, 3)), across])])
+        block = np.zeros((5, 2, 6))
+        for side, (body, sign) in enumerate(zip(own, (-1.0, 1.0), strict=True)):
+            # Velocity of a point of the body, and its angular velocity.
+            x, y, z = point - position[body]
+            lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+            block[:, side] = sign * rows @ np.block([[np.eye(3), lever], [np.zeros((3, 3)), np.eye(3)]])
+            if body == bodies:
+                block[:, side] *= np.nan
+        parts.append(Part(own, first, 5))
+        blocks.append(block)
+        first += 5
+    return parts, blocks
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_ranks_of_random_graphs(seed):
+    """The sum of the ranks of components is that of the whole; kept rows are independent and imply the others."""
+    rng = np.random.default_rng(seed)
+    bodies, loops = int(rng.integers(1, 12)), int(rng.integers(0, 4))
+    parts, blocks = random_parts(rng, bodies, loops)
+    layout = Layout(SPACE, (True,) * bodies)
+    whole = np.zeros((5 * len(parts), 6 * bodies))
+    for part, block in zip(parts, blocks, strict=True):
+        for side, body in enumerate(part.bodies):
+            if body < bodies:
+                whole[part.first : part.first + 5, 6 * body : 6 * body + 6] += block[:, side]
+    found = subsets(parts, blocks, layout, np.ones(6 * bodies), np.zeros(5 * len(parts), int), frozenset())
+    kept = np.concatenate([own.kept for own in found])
+    rank = np.linalg.matrix_rank(whole, tol=1e-9)
+    assert kept.size == rank == np.linalg.matrix_rank(whole[kept], tol=1e-9)
+    assert sorted(np.concatenate([own.rows for own in found])) == list(range(5 * len(parts)))
+
+
+def test_components_of_a_graph():
+    """Two loops that share a body, one of them with the ground, and a bridge."""
+    joints = [(6, 0), (0, 1), (1, 6), (1, 2), (2, 3), (3, 1), (3, 4), (5,)]
+    found = {(own.joints, own.top) for own in components(joints, 6)}
+    assert found == {((0, 1, 2), 6), ((3, 4, 5), 1), ((6,), 3), ((7,), 5)}
+
+
+def random_scene(seed):
+    """A tree of bodies on pins or hinges with loops: pins at random points that hold at the given poses."""
+    rng = np.random.default_rng(seed)
+    in_space = bool(seed % 2)
+    n = int(rng.integers(3, 9))
+    d = 3 if in_space else 2
+    positions = rng.normal(size=(n, d))
+    module = spatial if in_space else planar
+    inertia = (0.3, 0.4, 0.5) if in_space else 0.3
+    turned = [
+        ({"orientation": (p := rng.normal(size=4)) / np.linalg.norm(p)} if in_space else {"angle": rng.normal()})
+        for _ in range(n)
+    ]
+    bodies = [
+        module.Body(f"b{k}", mass=rng.uniform(0.5, 2.0), inertia=inertia, position=positions[k], **turned[k])
+        for k in range(n)
+    ]
+    name = lambda k: "ground" if k < 0 else f"b{k}"
+    joints = []
+    for k in range(n):
+        above = int(rng.integers(-1, k)) if k else -1
+        point = rng.normal(size=d)
+        kinds = [spatial.Spherical, spatial.Revolute] if in_space else [planar.Revolute]
+        kind = kinds[rng.integers(len(kinds))]
+        axis = rng.normal(size=3)
+        axes = {"axis": axis / np.linalg.norm(axis)} if kind is spatial.Revolute else {}
+        joints.append(kind(f"j{k}", name(above), name(k), point=point, **axes))
+    for k in range(int(rng.integers(0, 3))):
+        a, b = rng.choice(n, 2, replace=False)
+        joints.append(module.Distance(f"loop{k}", name(a), name(b), point_a=rng.normal(size=d)))
+    if rng.random() < 0.4:
+        # A rod that is there twice.
+        joints.append(
+            dataclasses.replace(joints[-1], name="twin")
+            if joints[-1].name[0] == "l"
+            else module.Distance("own", name(0), name(n - 1), point_a=rng.normal(size=d))
+        )
+    gravity = mb.Gravity((0.0, 0.0, -9.81) if in_space else (0.0, -9.81))
+    return mb.Scene(bodies, joints=joints, forces=[gravity])
+
+
+def check_random(seed):
+    system = random_scene(seed).compile()
+    rng = np.random.default_rng(seed)
+    guess = mb.State(system.guess.q, jnp.asarray(rng.normal(size=system.nu)))
+    state = mb.assemble(system, guess)
+    compare(system, state.q, state.u, atol=1e-9)
+    own = by_blocks(system)
+    y = mb.State(state.q + 1e-3 * jnp.asarray(rng.normal(size=system.nq)), state.u)
+    y = jax.jit(lambda y: mb.manifold.project(own, 0.0, mb.State(own.normalize(y.q), y.u)))(y)
+    assert np.max(np.abs(system.coordinate_residual(0.0, y.q))) <= 1e-12
+    assert np.max(np.abs(system.velocity_residual(0.0, y.q, y.u))) <= 1e-11
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_scenes(seed):
+    check_random(seed)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("part", range(20))
+def test_two_hundred_random_scenes(part):
+    for seed in range(10 * part, 10 * part + 10):
+        check_random(seed)
+
+
+@pytest.mark.long
+def test_redundant_loops_of_many_bodies_move_as_by_partitioning():
+    """A row of parallelograms: every third rocker is implied."""
+    bodies, joints = [], []
+    for k in range(20):
+        for j in range(3):
+            bodies.append(planar.Body(f"r{k}{j}", mass=1.0, inertia=0.1, position=(3 * k + j, 0.5), angle=np.pi / 2))
+            joints.append(planar.Revolute(f"f{k}{j}", "ground", f"r{k}{j}", point=(3 * k + j, 0.0)))
+            joints.append(planar.Revolute(f"h{k}{j}", f"r{k}{j}", f"c{k}", point=(3 * k + j, 1.0)))
+        bodies.append(planar.Body(f"c{k}", mass=1.0, inertia=0.1, position=(3 * k + 1.0, 1.0)))
+    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+    assert len(system.implied) == 20
+    assert system.elimination is not None
+    rates = {f"r{k}0.angle": 0.1 * k for k in range(20)}
+    state = mb.assemble(system, rates=rates)
+    ends = [mb.simulate(system, state, t1=0.5, rtol=1e-9, manifold=m).ys for m in (None, Projection(), Partition())]
+    for end in ends[:2]:
+        np.testing.assert_allclose(end.q, ends[2].q, rtol=0, atol=1e-7)
