@@ -83,29 +83,14 @@ class Layout:
             row += parts * rows
         return source[:, :columns]
 
-    def force_source(self, groups: list[np.ndarray]) -> np.ndarray:
-        """Which wrench entries add up to each generalized force: shape (nu, largest count), padded with the index of a
-        zero.
-
-        Indices are into the groups' wrenches (parts, k, velocity size), raveled one after the other and followed by a
-        zero.
-        """
-        flat = np.concatenate([self.velocity_index[bodies].ravel() for bodies in groups])
-        entries = np.argsort(flat, kind="stable")
-        column = flat[entries]
-        first = np.searchsorted(column, np.arange(self.nu + 1))
-        source = np.full((self.nu, np.max(np.diff(first), initial=0)), len(flat))
-        own = slice(first[-1])
-        source[column[own], np.arange(first[-1]) - first[column[own]]] = entries[own]
-        return source
-
     def reaction_source(
         self, joints: list[tuple[tuple[str, ...], tuple[tuple[int, ...], ...]]], names: tuple[str, ...]
     ) -> np.ndarray:
         """Which wrench entries add up to the reactions of some joints: shape (names, largest count, k, velocity size).
 
         **Arguments:** `joints`: for each group of constraints the names of its parts and their bodies (parts, k);
-        `names`: of these joints, all between the same number of bodies. Indices are as in `force_source`.
+        `names`: of these joints, all between the same number of bodies. Indices are into the groups' wrenches (parts,
+        k, velocity size), raveled one after the other and followed by a zero.
         """
         size, start = self.space.velocity_size, 0
         found: dict[str, list[np.ndarray]] = {name: [] for name in names}

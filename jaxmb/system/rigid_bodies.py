@@ -12,6 +12,7 @@ from ..linalg.block_jacobian import block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, rotate
+from ..linalg.sums import placed_sums
 from .bodies import AbstractBodySystem
 from .layout import Layout
 
@@ -145,8 +146,12 @@ class RigidBodySystem(AbstractBodySystem):
         """The generalized force of wrenches (parts, k, velocity size) on these bodies (parts, k), group by group."""
         if not wrenches:
             return jnp.zeros(self.nu, dtype)
-        source = self.layout.force_source(bodies)
-        return jnp.sum(unchecked_take(_join([*wrenches, jnp.zeros(1, dtype)], dtype), source), axis=1)
+        size = self.layout.space.velocity_size
+        entries = jnp.concatenate([own.reshape(-1, size) for own in wrenches])
+        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.bodies)(entries).reshape(
+            -1
+        )
+        return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
 
     def _own_wrenches(self, u):
         """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
