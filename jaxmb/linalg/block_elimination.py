@@ -8,6 +8,8 @@ Sources: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIA
 "Symmetric quasidefinite matrices", SIAM J. Optim. 5(1), 1995.
 """
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -22,13 +24,13 @@ from .elimination_order import NodeOrder
 class BlockFactor(eqx.Module):
     """A factored matrix; numbers without derivatives.
 
-    **Fields:** for each stage, step and lane the `inverses` (steps, w, b, b) of the pivots, and the `multiples`
-    (steps, w, d, b, b) of the pivots' rows that are subtracted from later ones; `rest`: the inverse of the dense matrix
+    **Fields:** for each stage, step and lane the `inverses` (steps, b, b, w) of the pivots, and the `multiples`
+    (steps, b, b, d, w) of the pivots' rows that are subtracted from later ones; `rest`: the inverse of the dense matrix
     of the nodes that are left; the `order`.
     """
 
-    inverses: tuple[Float[Array, "s w b b"], ...]
-    multiples: tuple[Float[Array, "s w d b b"], ...]
+    inverses: tuple[Float[Array, "s b b w"], ...]
+    multiples: tuple[Float[Array, "s b b d w"], ...]
     rest: Float[Array, "k k"]
     order: NodeOrder = eqx.field(static=True)
 
@@ -39,23 +41,22 @@ class BlockFactor(eqx.Module):
         for stage, multiples in zip(order.stages, self.multiples, strict=True):
             x = lax.scan(_forward, x, (stage.nodes, stage.later, multiples))[0]
         if order.rest.size:
-            size = x.shape[1]
             rest = self.rest @ unchecked_take(x, order.rest).reshape(-1)
-            x = x.at[order.rest].set(rest.reshape(-1, size), mode="promise_in_bounds", unique_indices=True)
+            x = x.at[order.rest].set(rest.reshape(-1, x.shape[1]), mode="promise_in_bounds", unique_indices=True)
         for stage, inverses, multiples in reversed(list(zip(order.stages, self.inverses, self.multiples, strict=True))):
-            own = _apply(inverses, unchecked_take(x, stage.nodes))
+            own = jnp.moveaxis(unchecked_take(x, stage.nodes), 2, 1)
+            own = _sum([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
             x = lax.scan(_backward, x, (stage.nodes, stage.later, own, multiples), reverse=True)[0]
         return x[:-1]
 
     def pivots(self) -> Float[Array, "n b"]:
         """For each row the reciprocal of the diagonal entry of its pivot's inverse."""
-        size = (
-            self.rest.shape[0] // max(self.order.rest.size, 1) if self.order.rest.size else self.inverses[0].shape[-1]
-        )
-        out = jnp.ones((self.order.nodes + 1, size), self.rest.dtype)
-        for stage, inverses in zip(self.order.stages, self.inverses, strict=True):
-            out = out.at[stage.nodes].set(1 / jnp.diagonal(inverses, axis1=2, axis2=3), mode="promise_in_bounds")
-        return out.at[self.order.rest].set(1 / jnp.diag(self.rest).reshape(-1, size))[:-1]
+        order = self.order
+        size = self.inverses[0].shape[1] if self.inverses else self.rest.shape[0] // order.rest.size
+        out = jnp.ones((order.nodes + 1, size), self.rest.dtype)
+        for stage, inverses in zip(order.stages, self.inverses, strict=True):
+            out = out.at[stage.nodes].set(1 / jnp.diagonal(inverses, axis1=1, axis2=2), mode="promise_in_bounds")
+        return out.at[order.rest].set(1 / jnp.diag(self.rest).reshape(-1, size))[:-1]
 
 
 def eliminate_blocks(blocks: Float[Array, "blocks b b"], order: NodeOrder) -> BlockFactor:
@@ -71,33 +72,37 @@ def eliminate_blocks(blocks: Float[Array, "blocks b b"], order: NodeOrder) -> Bl
     return BlockFactor(tuple(inverses), tuple(multiples), _dense_inverse(blocks, order), order)
 
 
+# In a step the lanes are the last axis, so that each operation is one on long vectors. The barriers keep XLA from
+# computing an operand of a product anew for each of its entries.
+
+
 def _eliminate(blocks, step):
     diagonal, columns, targets = step
-    inverse = _inverse(unchecked_take(blocks, diagonal))
-    column = unchecked_take(blocks, columns)
-    multiple = jnp.sum(column[..., :, :, None] * inverse[:, None, None, :, :], axis=-2)
-    d = columns.shape[1]
-    first, second = np.tril_indices(d)
-    change = jnp.sum(multiple[:, first, :, None, :] * column[:, second, None, :, :], axis=-1)
-    blocks = blocks.at[targets].add(-change, mode="promise_in_bounds")
+    inverse = lax.optimization_barrier(_inverse(jnp.moveaxis(unchecked_take(blocks, diagonal), 0, 2)))
+    column = jnp.transpose(unchecked_take(blocks, columns), (2, 3, 1, 0))
+    size = inverse.shape[0]
+    multiple = _sum([column[:, j, None] * inverse[None, j, :, None] for j in range(size)])
+    first, second = np.tril_indices(columns.shape[1])
+    multiple, column = lax.optimization_barrier((multiple, column))
+    left, right = lax.optimization_barrier((multiple[:, :, first], column[:, :, second]))
+    change = lax.optimization_barrier(_sum([left[:, j, None] * right[None, :, j] for j in range(size)]))
+    blocks = blocks.at[targets].add(-jnp.transpose(change, (3, 2, 0, 1)), mode="promise_in_bounds")
     return blocks, (inverse, multiple)
 
 
 def _forward(x, step):
     nodes, later, multiples = step
-    own = unchecked_take(x, nodes)
-    change = jnp.sum(multiples * own[:, None, None, :], axis=-1)
-    return x.at[later].add(-change, mode="promise_in_bounds"), None
+    own = unchecked_take(x, nodes).T
+    change = _sum([multiples[:, j] * own[None, j, None] for j in range(own.shape[0])])
+    return x.at[later].add(-change.T, mode="promise_in_bounds"), None
 
 
 def _backward(x, step):
     nodes, later, own, multiples = step
-    ahead = jnp.sum(multiples * unchecked_take(x, later)[..., :, None], axis=(1, 2))
-    return x.at[nodes].set(own - ahead, mode="promise_in_bounds"), None
-
-
-def _apply(a, x):
-    return jnp.sum(a * x[..., None, :], axis=-1)
+    ahead = unchecked_take(x, later).T
+    size, d = ahead.shape[:2]
+    ahead = _sum([own, *(-multiples[i, :, k] * ahead[None, i, k] for i in range(size) for k in range(d))])
+    return x.at[nodes].set(ahead.T, mode="promise_in_bounds"), None
 
 
 def _dense_inverse(blocks, order):
@@ -110,19 +115,18 @@ def _dense_inverse(blocks, order):
 
 
 def _inverse(a):
-    """Inverses of small symmetric blocks, by Gauss–Jordan elimination on the diagonal."""
-    r = a.shape[-1]
-    if r == 1:
-        return 1 / a
-    if r == 2:
-        p, q, s = a[..., 0, 0], a[..., 1, 0], a[..., 1, 1]
-        rows = [jnp.stack([s, -q], axis=-1), jnp.stack([-q, p], axis=-1)]
-        return jnp.stack(rows, axis=-2) / (p * s - q * q)[..., None, None]
+    """Inverses of small symmetric blocks (b, b, w), by Gauss–Jordan elimination on the diagonal."""
+    r = a.shape[0]
+    rows = [[a[i, j] for j in range(r)] for i in range(r)]
     for k in range(r):
-        pivot = 1 / a[..., k, k]
-        here = np.arange(r) == k
-        row = jnp.where(here, 1.0, a[..., k, :]) * pivot[..., None]
-        column = jnp.where(here, 0.0, a[..., :, k])
-        kept = jnp.where(here, 0.0, a)
-        a = jnp.where(here[:, None], row[..., None, :], kept - column[..., :, None] * row[..., None, :])
-    return a
+        pivot = 1 / rows[k][k]
+        row = [pivot if j == k else rows[k][j] * pivot for j in range(r)]
+        swept = lambda i, k=k, row=row, rows=rows: [
+            -rows[i][k] * row[j] if j == k else rows[i][j] - rows[i][k] * row[j] for j in range(r)
+        ]
+        rows = [row if i == k else swept(i) for i in range(r)]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _sum(terms):
+    return functools.reduce(jnp.add, terms)

@@ -10,17 +10,19 @@ a symmetric quasi-definite matrix. No other body couples to another through M.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from .arrays import unchecked_take
 from .block_elimination import BlockFactor, eliminate_blocks
-from .blocks import matrix_products
+from .blocks import matrix_products, transpose_vector_products, vector_products
 from .elimination_order import NodeOrder
 from .inertia import AbstractInertia
 from .jacobian import AbstractJacobian, DenseJacobian
@@ -87,14 +89,15 @@ class BlockJacobian(AbstractJacobian):
     def on_joints(self, v: Float[Array, "n"]) -> Float[Array, "j r"]:
         """`A v`, joint by joint."""
         own = unchecked_take(_of_bodies(self.order, v), self.order.bodies)
-        return jnp.sum(self.blocks * own[:, :, None, :], axis=(1, 3))
+        along = vector_products(self.blocks, own)
+        return functools.reduce(jnp.add, [along[:, k] for k in range(along.shape[1])])
 
     def transpose_product(self, multipliers):
         return self.on_velocities(self._joint_rows(multipliers))
 
     def on_velocities(self, multipliers: Float[Array, "j r"]) -> Float[Array, "n"]:
         """`Aᵀ λ` from multipliers joint by joint."""
-        wrenches = jnp.sum(self.blocks * multipliers[:, None, :, None], axis=2)
+        wrenches = transpose_vector_products(self.blocks, multipliers[:, None, :])
         of_bodies = self.order.on_bodies(wrenches.reshape(-1, wrenches.shape[2]))
         return unchecked_take(of_bodies.reshape(-1), self.order.velocity_place)
 
@@ -144,10 +147,12 @@ class BlockGram(AbstractPositiveDefinite):
         unit[order.velocity_index, np.arange(v)] = 1.0
         root = _of_bodies(order, self.inertia.root().solve(jnp.asarray(unit[:-1], blocks.dtype)))
         scaled = scaled.reshape(joints * k, r, v)
-        scaled = matrix_products(scaled, unchecked_take(root, order.bodies.reshape(-1)).swapaxes(1, 2))
-        products = matrix_products(
-            unchecked_take(scaled, order.first), unchecked_take(scaled, order.second).swapaxes(1, 2)
-        )
+        root = unchecked_take(root, order.bodies.reshape(-1)).swapaxes(1, 2)
+        # Barriers keep XLA from computing the factors anew for each entry of a product.
+        scaled = lax.optimization_barrier(matrix_products(scaled, root))
+        first, second = (unchecked_take(scaled, own) for own in (order.first, order.second))
+        first, second = lax.optimization_barrier((first, second))
+        products = lax.optimization_barrier(matrix_products(first, second.swapaxes(1, 2)))
         stored = order.products(products)
         hubs = order.hubs.size
         size = max(r, v) if hubs else r
