@@ -9,7 +9,8 @@ class Multipliers(AbstractFormulation):
     """`(A M⁻¹ Aᵀ) λ = γ − A M⁻¹ F` on the independent rows, then `u̇ = M⁻¹ (F + Aᵀ λ)`.
 
     Needs a mass matrix that is cheap to solve with; cheapest where constraints are few and degrees of freedom many. The
-    elimination follows the structure of A: for a long chain of joints time and memory are proportional to its length.
+    elimination follows the graph of joints: for chains, trees and local loops time and memory are proportional to the
+    number of joints.
     """
 
     partitions: ClassVar[bool] = False

@@ -19,11 +19,12 @@ elimination in place is faster than LAPACK's blocked elimination up to 40 rows. 
 for n = 4 but takes far too long to compile for n = 12. LAPACK's batched kernels have deadlocked inside loops (jaxlib
 0.10.2), so members of a batch are eliminated one after the other.
 
-**Chains of joints.** The Gram matrix `A M⁻¹ Aᵀ` of a chain of 100 links: dense 198, block-tridiagonal by `lax.scan`
-over the joints 85, by cyclic reduction 13, by native code 1.9. A whole step of `Adams` on a chain of 5, 10, 20 and 35
-rods takes 28, 46, 23 and 33 by blocks with a projection, and 39, 32, 111 and 1076 by coordinate partitioning. Blocks
-are used from 30 rows on (`system/joint_graph.py`).
+**Many joints.** The Gram matrix `A M⁻¹ Aᵀ` couples joints that share a body. It is eliminated in an order that the
+graph determines, many joints at once, in one loop over the steps of the order (`elimination_order`,
+`block_elimination`). On one core, the factor of the matrix of a chain of 100 joints of two rows takes 40 and a solution
+30, of 1000 joints 400 and 75; the program is of the same size for any number.
 
 **Small blocks.** A batched dot of 2 × 2 or 3 × 3 blocks is a library call, whereas XLA fuses a sum of products with the
-surrounding operations (`blocks`, `rotations`).
+surrounding operations (`blocks`, `rotations`). Written term by term it takes a third to a fifth of the time of a
+reduction. But a product of products must not be fused: each entry would compute its operands anew.
 """

@@ -38,9 +38,11 @@ class Projection(AbstractManifold):
     size of the local error.
 
     With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` serves
-    positions, velocities and accelerations. The elimination follows the structure of A: for a long chain of joints a
-    step takes time and memory in proportion to its length. No row may be redundant, and constraints must be ideal and
-    linear in velocities. `Hermite` needs independent coordinates, which a projection does not single out.
+    positions, velocities and accelerations. The elimination follows the graph of joints: for chains, trees and local
+    loops a step takes time and memory in proportion to the number of joints. Constraints must be ideal and linear in
+    velocities. Rows that others imply are left out where a scene is large enough for sparse elimination, the same ones
+    throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs independent coordinates, which a
+    projection does not single out.
 
     **Arguments:** `newton_tol`: with `Adams`, size of the last Newton correction of positions relative to the system's
     size, default tied to the tolerance of integration; one more correction is made with the factor of the state it led

@@ -99,9 +99,9 @@ def simulate(
     - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
         `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
-        `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a planar scene
-        with 30 or more constraint rows whose joints form a chain the default is `Projection()` as well, whose cost
-        grows with the number of joints and not with its cube.
+        `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a scene of 30 or
+        more constraint rows, 150 where some are redundant, the default is `Projection()` as well, whose cost grows
+        with the number of joints and not with its cube, unless joints have friction or a servo.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
