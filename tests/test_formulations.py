@@ -214,6 +214,9 @@ def test_roots_of_mass_matrices():
 FEW = {
     "rod_chain": {"n": 5},
     "hanging_chain": {"n": 3},
+    "tree": {"n": 4},
+    "cable": {"n": 3},
+    "net": {"n": 3, "m": 2},
     "n_four_bar": {"n": 1},
     "swash_plate": {"pistons": 1},
     "tracked_vehicle": {"n_wheels": 2},

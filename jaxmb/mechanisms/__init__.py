@@ -9,6 +9,7 @@ from .appell_hamel import appell_hamel as appell_hamel
 from .benenti import benenti as benenti
 from .bennett import bennett as bennett
 from .bricard import bricard as bricard
+from .cable import cable as cable
 from .car_axis import car_axis as car_axis
 from .chaplygin_sleigh import chaplygin_sleigh as chaplygin_sleigh
 from .constant_speed_particle import constant_speed_particle as constant_speed_particle
@@ -22,6 +23,7 @@ from .knife_edge import knife_edge as knife_edge
 from .longitudinal_train import longitudinal_train as longitudinal_train
 from .mechanism import Mechanism as Mechanism, References as References
 from .n_four_bar import n_four_bar as n_four_bar
+from .net import net as net
 from .nonholonomic_cart import nonholonomic_cart as nonholonomic_cart
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
@@ -39,6 +41,7 @@ from .three_platform_snake import three_platform_snake as three_platform_snake
 from .tracked_vehicle import tracked_vehicle as tracked_vehicle
 from .tracking_chain import tracking_chain as tracking_chain
 from .train import train as train
+from .tree import tree as tree
 
 _LIBRARY = {
     function.__name__: function
@@ -48,6 +51,7 @@ _LIBRARY = {
         train,
         longitudinal_train,
         hanging_chain,
+        tree,
         four_bar,
         stiff_four_bar,
         slider_crank,
@@ -60,6 +64,8 @@ _LIBRARY = {
         chaplygin_sleigh,
         free_body,
         heavy_top,
+        cable,
+        net,
         spatial_slider_crank,
         spatial_loop,
         bricard,

@@ -1,0 +1,86 @@
+"""Trees, cables and nets of any size: against equations of their own, and what they keep."""
+
+import numpy as np
+import pytest
+from oracles import large
+
+import jaxmb as mb
+from jaxmb.mechanisms.observe import point_motion
+
+TIMES = np.array([0.2, 0.4, 0.6, 0.8])
+
+
+def tree(*, n):
+    """The values of an oracle, how to observe the same in a motion, and the drift of the oracle."""
+    labels = ["tip_x", "tip_y", *(f"{what}{k}" for what in ("th", "w") for k in range(1, n + 1))]
+    return large.tree(TIMES, n=n), lambda found, sol: [found[label] for label in labels], 0.0
+
+
+def cable(*, n):
+    ends, drift = large.cable(TIMES, n=n)
+    start = np.zeros((len(TIMES), 1, 3))
+    joints = np.concatenate([start, ends], axis=1)
+    middle = (joints[:, n // 2] + joints[:, (n + 1) // 2]) / 2
+
+    def observe(found, sol):
+        own = [point_motion(sol, f"rod{k}", (0.5 / n, 0.0, 0.0))[0] for k in range(1, n + 1)]
+        return [*(found[label] for label in "xyz"), *np.concatenate(own, axis=1).T]
+
+    return np.concatenate([middle, ends.reshape(len(TIMES), -1)], axis=1), observe, drift
+
+
+def net(*, n, m):
+    places, drift = large.net(TIMES, n=n, m=m)
+
+    def observe(found, sol):
+        knots = [sol[f"knot{i}_{j}"].position for i in range(1, n + 1) for j in range(1, m + 1)]
+        return [*(found[label] for label in "xyz"), *np.concatenate(knots, axis=1).T]
+
+    return np.concatenate([places[:, -1, -1], places.reshape(len(TIMES), -1)], axis=1), observe, drift
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "case, size, free",
+    [
+        (tree, {"n": 7}, 7),
+        (cable, {"n": 5}, 12),
+        (net, {"n": 3, "m": 3}, 13),
+        # Of 30 rows and more, by sparse elimination.
+        (tree, {"n": 20}, 20),
+        (cable, {"n": 12}, 33),
+        (net, {"n": 5, "m": 4}, 27),
+    ],
+)
+def test_motions_are_those_of_other_equations(case, size, free):
+    expected, observe, drift = case(**size)
+    assert drift <= 1e-12
+    mechanism = mb.mechanisms.get(case.__name__, **size)
+    system, state = mechanism.system, mechanism.state
+    assert system.velocity_rank == system.velocity_rows == system.nu - free
+    sol = mb.simulate(system, state, t1=TIMES[-1], rtol=1e-9, saveat=TIMES)
+    found = np.stack(observe(mechanism.observe(sol), sol), axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+    start = system.potential_energy(0.0, state.q)
+    released = np.max(np.abs(sol.potential_energy - start))
+    np.testing.assert_allclose(sol.energy, start, rtol=0, atol=1e-9 * released)
+    assert np.all(sol.constraint_violation.position <= 1e-12)
+    assert np.all(sol.constraint_violation.velocity <= 1e-12)
+
+
+@pytest.mark.parametrize(
+    "name, parameters, message",
+    [
+        ("tree", {"n": 0}, "n ≥ 1 rods"),
+        ("tree", {"branching": 0}, "a branching ≥ 1"),
+        ("cable", {"n": 1}, "n ≥ 2 rods"),
+        ("cable", {"span": 0.0}, "between zero and its length of 1.0 m"),
+        ("cable", {"span": 1.0}, "between zero and its length of 1.0 m"),
+        ("net", {"n": 1}, "n ≥ 2 and m ≥ 2 knots"),
+        ("net", {"m": 1}, "n ≥ 2 and m ≥ 2 knots"),
+        ("net", {"spacing": 0.0}, "length must be positive"),
+    ],
+)
+def test_what_cannot_be_built_is_refused(name, parameters, message):
+    with pytest.raises(ValueError, match=message):
+        mb.mechanisms.get(name, **parameters)
