@@ -136,10 +136,7 @@ class BlockGram(AbstractPositiveDefinite):
         forces = self.jacobian.on_velocities(jnp.where(kept, x, 0.0))
         return jnp.where(kept, self.jacobian.on_joints(self.inertia.solve(forces)), x)
 
-    def eliminate(self, shift: float = 0.0):
-        """Eliminate; with a `shift`, a share of the largest entry is added to the diagonal, so that implied rows have a
-        pivot.
-        """
+    def eliminate(self, shift=0.0):
         order, blocks = self.jacobian.order, self.jacobian.blocks
         joints, k, r, v = blocks.shape
         scaled = jnp.where(order.kept[:, None, :, None], blocks, 0.0)

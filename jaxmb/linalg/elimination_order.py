@@ -81,18 +81,16 @@ def order_nodes(
     **Arguments:** `neighbours` of each node, without itself; `size` of a block; `after`: the nodes that must be
     eliminated before each node.
     """
-    best = None
+    tries = []
     for cap in _CAPS:
-        tried = _eliminate([set(own) for own in neighbours], size, cap, after)
-        if best is None or tried[0] < best[0]:
-            best = tried
-        if cap >= tried[3]:
+        tries.append(_eliminate([set(own) for own in neighbours], size, cap, after))
+        if cap >= tries[-1][3]:
             break
-    cost, levels, rest, _ = best
+    cost, levels, rest, _ = min(tries, key=lambda tried: tried[0])
     return _laid_out(neighbours, levels, rest, size, cost)
 
 
-def _eliminate(graph, size, cap, after):
+def _eliminate(graph: list[set[int]], size: int, cap: int, after: Sequence[Iterable[int]] | None) -> Any:
     """Levels of independent nodes with their later neighbours, the rest, and the estimated cost."""
     n = len(graph)
     waiting = [0] * n

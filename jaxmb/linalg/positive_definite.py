@@ -24,8 +24,10 @@ class AbstractPositiveDefinite(eqx.Module):
         """`T x`."""
 
     @abc.abstractmethod
-    def eliminate(self) -> "AbstractPositiveFactor":
-        """Eliminate once, for any number of right-hand sides."""
+    def eliminate(self, shift: float = 0.0) -> "AbstractPositiveFactor":
+        """Eliminate once, for any number of right-hand sides. With a `shift`, this share of the largest entry is added
+        to the diagonal, so that implied rows have a pivot.
+        """
 
 
 class AbstractPositiveFactor(eqx.Module):
@@ -60,8 +62,11 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
     def product(self, x):
         return self.matrix @ x
 
-    def eliminate(self):
+    def eliminate(self, shift=0.0):
         matrix = lax.stop_gradient(self.matrix)
+        if shift:
+            own = shift * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
+            matrix = matrix + own * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
         inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
         return DensePositiveFactor(self, inverse)
 

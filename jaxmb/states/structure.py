@@ -167,8 +167,8 @@ def _motions_as_one(system, q):
         out[2, :-1, :2] = np.stack([-poses[:, 1], poses[:, 0]], axis=1)
         out[2, :-1, 2] = 1.0
         return out
-    for k, axis in enumerate(np.eye(3, dtype=q.dtype)):
-        out[3 + k, :-1, :3] = np.cross(axis, poses[:, :3])
+    for k, axis in enumerate(jnp.eye(3, dtype=q.dtype)):
+        out[3 + k, :-1, :3] = np.cross(np.asarray(axis), poses[:, :3])
         out[3 + k, :-1, 3:] = jax.vmap(lambda p, axis=axis: unrotate(p, axis))(poses[:, 3:])
     return out
 

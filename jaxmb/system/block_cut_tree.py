@@ -3,7 +3,7 @@
 Source: J. Hopcroft and R. Tarjan, "Efficient algorithms for graph manipulation", Comm. ACM 16(6), 1973.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 
@@ -17,7 +17,7 @@ class Component(NamedTuple):
     top: int
 
 
-def components(joints: Sequence[Sequence[int]], ground: int) -> list[Component]:
+def components(joints: Sequence[Collection[int]], ground: int) -> list[Component]:
     """The biconnected components, each below its top.
 
     **Arguments:** `joints`: the bodies of each, the ground among them; `ground`: its number, one more than those of the

@@ -118,14 +118,14 @@ def _joint_order(
     for body, own in of_body.items():
         if body in node_of_hub:
             for joint, block in own:
-                pair = (node_of_hub[body], joint)
+                hub = node_of_hub[body]
                 on_hubs.append(block)
-                hub_places.append(stored[pair] if pair in stored else stored[pair[::-1]])
+                hub_places.append(stored[hub, joint] if (hub, joint) in stored else stored[joint, hub])
             continue
         for i, (a, block_a) in enumerate(own):
             for b, block_b in own[: i + 1]:
                 straight = (a, b) in stored
-                targets.append(stored[(a, b) if straight else (b, a)])
+                targets.append(stored[a, b] if straight else stored[b, a])
                 first.append(block_a if straight else block_b)
                 second.append(block_b if straight else block_a)
     index = lambda values: np.array(values, np.int32)
