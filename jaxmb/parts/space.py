@@ -67,6 +67,10 @@ class AbstractSpace(abc.ABC):
         """Rate of the pose, `N(pose) velocity`."""
 
     @abc.abstractmethod
+    def moves(self, pose: Pose) -> Float[Array, "v p"]:
+        """Rates of a prepared pose along each unit velocity."""
+
+    @abc.abstractmethod
     def pull_back(self, pose: Pose, gradient: Pose) -> Wrench:
         """Wrench `Nᵀ g` that does the work of a gradient with respect to the pose."""
 

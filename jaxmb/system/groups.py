@@ -193,19 +193,19 @@ class ConstraintGroup(AbstractConstraintGroup):
         """Derivatives along `n` motions of every body, one at a time."""
 
         def single(at, x, moves):
-            k, n, size = moves.shape
-            residual = lambda x: at(t).residual(self._space, x, t)
+            def along_one(body):
+                residual = lambda own: at(t).residual(self._space, x.at[body].set(own), t)
+                push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
+                return jax.vmap(push, out_axes=-1)(moves[body])
+
             # One body moves, the others rest.
-            one = jnp.eye(k, dtype=x.dtype)[:, None, :, None] * moves[:, :, None, :]
-            push = lambda dx: jax.jvp(residual, (x,), (dx,))[1]
-            return jax.vmap(push, out_axes=-1)(one.reshape(k * n, k, size)).reshape(-1, k, n)
+            return jnp.stack([along_one(body) for body in range(len(moves))], axis=1)
 
         return self._map(single, poses, moves)
 
     def jacobian(self, t, poses, velocities):
         del velocities
-        unit = jnp.eye(self._space.velocity_size, dtype=poses.dtype)
-        moves = jax.vmap(lambda x: jax.vmap(lambda v: self._space.rates(x, v))(unit))(poses)
+        moves = jax.vmap(self._space.moves)(poses)
         return self.along(t, poses, moves)
 
     def velocity(self, t, poses, velocities):

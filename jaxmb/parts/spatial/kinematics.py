@@ -3,10 +3,34 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from ...linalg import rotations as rot
-from ...linalg.arrays import namespace
+from ...linalg.arrays import namespace, unchecked_take
 from ..space import AbstractSpace
+
+
+def _places_of_moves():
+    """Where the rates of a prepared pose along unit velocities stand among 0, 1, the halves of its Euler parameters and
+    the entries of its matrix, and their negatives: each is one of these.
+    """
+    stored = {"half": 2, "matrix": 10}
+    place = np.zeros((6, 16), int)
+    place[np.arange(3), np.arange(3)] = 1
+    for k in range(3):
+        unit = np.eye(3)[k]
+        for j in range(4):
+            changed = 2 * rot.rates(np.eye(4)[j], unit)
+            for i in np.flatnonzero(changed):
+                place[3 + k, 3 + i] = stored["half"] + j + (0 if changed[i] > 0 else 4)
+        for j in range(9):
+            changed = (np.eye(9)[j].reshape(3, 3) @ rot.skew(unit)).reshape(-1)
+            for i in np.flatnonzero(changed):
+                place[3 + k, 7 + i] = stored["matrix"] + j + (0 if changed[i] > 0 else 9)
+    return place
+
+
+_MOVES = _places_of_moves()
 
 
 class SpatialSpace(AbstractSpace):
@@ -47,6 +71,11 @@ class SpatialSpace(AbstractSpace):
             return rates
         return jnp.concatenate([rates, rot.matrix_rates(_matrix(pose), velocity[3:]).reshape(-1)])
 
+    def moves(self, pose):
+        half, matrix = 0.5 * pose[3:7], pose[7:]
+        zero, one = jnp.zeros_like(pose[:1]), jnp.ones_like(pose[:1])
+        return unchecked_take(jnp.concatenate([zero, one, half, -half, matrix, -matrix]), _MOVES)
+
     def pull_back(self, pose, gradient):
         moment = rot.pull_back(pose[3:7], gradient[3:7])
         if _prepared(pose):
@@ -66,12 +95,14 @@ def _matrix(pose):
 
 
 def _turned(pose, v):
-    # Written as a sum of products, which XLA fuses; a batched dot of 3 × 3 blocks is a library call.
-    return (_matrix(pose) * v[None, :]).sum(axis=1)
+    # Written term by term, which XLA fuses; a batched dot of 3 × 3 blocks is a library call.
+    matrix = _matrix(pose)
+    return matrix[:, 0] * v[0] + matrix[:, 1] * v[1] + matrix[:, 2] * v[2]
 
 
 def _turned_back(pose, v):
-    return (_matrix(pose) * v[:, None]).sum(axis=0)
+    matrix = _matrix(pose)
+    return matrix[0] * v[0] + matrix[1] * v[1] + matrix[2] * v[2]
 
 
 SPACE = SpatialSpace()
