@@ -123,8 +123,8 @@ def _check_near(system, t, group, number, near, zero, bodies):
     (kept, _), (others, sizes) = (_unit_rows(near.jacobian(number, rows)) for rows in (group.independent, dropped))
     share, *_ = np.linalg.lstsq(kept.T, others.T, rcond=None)
     off = np.linalg.norm(others - share.T @ kept, axis=1)
-    left = np.where(dropped < system.position_rows, np.abs(near.unmet[np.minimum(dropped, near.unmet.size - 1)]), 0.0)
-    left = left / sizes
+    of_positions = near.unmet[: system.position_rows]
+    left = np.abs(np.pad(of_positions, (0, system.acceleration_rows - system.position_rows))[dropped]) / sizes
     bad = np.maximum(off, left) > zero
     if np.any(bad):
         by = group.independent[np.any(np.abs(share[:, bad]) > zero, axis=1)]

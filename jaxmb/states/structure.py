@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..linalg.inertia import DiagonalInertia
-from ..linalg.rotations import unrotate
+from ..linalg.rotations import cross, unrotate
 from ..system.bodies import Implied
 from ..system.displacement import displaced
 from ..system.equation import Ranks
@@ -49,14 +49,19 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
     others = tuple(range(system.position_rows, system.acceleration_rows))
     of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
-    q = _on_constraints(of_positions)
+    q, residual, at = _analyse(of_positions)
+    if not float(residual) <= tolerance(q.dtype):
+        listed = violated_joints(system, 0.0, q, least=0.0)
+        raise ValueError(
+            f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
+            "points and axes for joints that contradict each other, or give better poses."
+        )
     parts = _parts(system)
-    at = _evaluated(of_positions, 0.0, q)
     check_gradients(system, np.asarray(at.row_norms))
-    blocks, scale = _of_parts(at.blocks), np.asarray(system.velocity_scale())
+    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
-    absolute = absolute_parts(parts, blocks, _motions_as_one(system, np.asarray(q)))
+    absolute = absolute_parts(parts, blocks, np.asarray(at.as_one))
     found = subsets(parts, blocks, system.layout, scale, level, absolute)
     dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
     components = [_shares(parts, blocks, system.layout, own) for own in found if own.dropped.size]
@@ -66,7 +71,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     _check_locked(system, parts, blocks, scale)
     implied = _implied(system, components)
     _check_determined(system, implied)
-    _check_nearby(of_positions, q, parts, found)
+    _check_nearby(of_positions, q, parts, found, scale)
     position, velocity, acceleration = (sum(int(np.sum(level[own.kept] <= k)) for own in found) for k in range(3))
     return dataclasses.replace(
         system,
@@ -74,21 +79,6 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         implied=implied,
         elimination=elimination_order(system, dropped, absolute),
     )
-
-
-def _on_constraints(system):
-    """The configuration on the constraints, from the given poses."""
-    q = system.normalize(system.guess.q)
-    if not system.position_rows:
-        return q
-    q, residual = _met(system)
-    if not float(residual) <= tolerance(q.dtype):
-        listed = violated_joints(system, 0.0, q, least=0.0)
-        raise ValueError(
-            f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
-            "points and axes for joints that contradict each other, or give better poses."
-        )
-    return q
 
 
 def _shares(parts, blocks, layout, own):
@@ -112,29 +102,37 @@ def _of_parts(groups):
     return [own for group in groups for own in np.asarray(group)]
 
 
-@eqx.filter_jit
-def _met(system):
-    """The configuration where constraints are met, and the size of the residuals that remain."""
-    t, none = jnp.zeros((), system.guess.q.dtype), np.zeros(system.nu, bool)
-    return meet_sparse(system, t, system.guess.q, none)
-
-
 class _Evaluation(NamedTuple):
-    """Φ, the blocks of A group by group, and the norms of its rows, their columns scaled."""
+    """Φ; the blocks of A group by group; the scale of its columns, and the norms of its rows with it; velocities of all
+    bodies, and zeros of the ground, in translations and rotations of all bodies as one.
+    """
 
     unmet: Array
     blocks: Any
+    scale: Array
     row_norms: Array
+    as_one: Array
 
 
 @eqx.filter_jit
+def _analyse(system):
+    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
+    q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
+    if system.position_rows:
+        q, residual = meet_sparse(system, t, q, np.zeros(system.nu, bool))
+    else:
+        q, residual = system.normalize(q), jnp.zeros_like(t)
+    return q, residual, _evaluated(system, t, q)
+
+
 def _evaluated(system, t, q):
     """At coordinates on the constraints or near them, and the given velocities."""
-    t, u = jnp.asarray(t, q.dtype), system.guess.u
+    u = system.guess.u
     poses, velocities = system.prepared_poses(q), system.all_velocities(u)
     blocks = [g.jacobian(t, poses, velocities) for g in system.joints]
-    norms = system.structured_jacobian(t, q, u).row_norms(system.velocity_scale())
-    return _Evaluation(system.position_residual(t, q), blocks, norms)
+    scale = system.velocity_scale()
+    norms = system.structured_jacobian(t, q, u).row_norms(scale)
+    return _Evaluation(system.position_residual(t, q), blocks, scale, norms, _motions_as_one(system, q))
 
 
 @eqx.filter_jit
@@ -155,22 +153,14 @@ def _asked(system, q):
 
 
 def _motions_as_one(system, q):
-    """Velocities of all bodies, and zeros of the ground, in translations and rotations of all bodies as one."""
-    space, layout = system.layout.space, system.layout
-    d = space.dimension
-    poses = np.asarray(system.poses(q))
-    size = space.velocity_size
-    out = np.zeros((d + (1 if d == 2 else 3), layout.bodies + 1, size), q.dtype)
-    for k in range(d):
-        out[k, :-1, k] = 1.0
+    poses, d = system.poses(q), system.layout.space.dimension
+    moved = jnp.tile(jnp.eye(d, system.layout.space.velocity_size, dtype=q.dtype)[:, None], (1, len(poses), 1))
     if d == 2:
-        out[2, :-1, :2] = np.stack([-poses[:, 1], poses[:, 0]], axis=1)
-        out[2, :-1, 2] = 1.0
-        return out
-    for k, axis in enumerate(jnp.eye(3, dtype=q.dtype)):
-        out[3 + k, :-1, :3] = np.cross(np.asarray(axis), poses[:, :3])
-        out[3 + k, :-1, 3:] = jax.vmap(lambda p, axis=axis: unrotate(p, axis))(poses[:, 3:])
-    return out
+        turned = jnp.stack([-poses[:, 1], poses[:, 0], jnp.ones_like(poses[:, 0])], axis=1)[None]
+    else:
+        turn = lambda axis: jax.vmap(lambda x: jnp.concatenate([cross(axis, x[:3]), unrotate(x[3:], axis)]))(poses)
+        turned = jax.vmap(turn)(jnp.eye(3, dtype=q.dtype))
+    return jnp.pad(jnp.concatenate([moved, turned]), ((0, 0), (0, 1), (0, 0)))
 
 
 def _check_contradictions(system, q, components):
@@ -285,10 +275,9 @@ def _implied(system, components):
     return tuple(sorted(out, key=lambda item: (item.name, item.row)))
 
 
-def _check_nearby(system, q, parts, found):
+def _check_nearby(system, q, parts, found, scale):
     """Refuse rows that are implied at this configuration, but not near it."""
     groups = [own for own in found if own.dropped.size]
-    scale = np.asarray(system.velocity_scale())
 
     def evaluate(t, moved):
         at = _displaced(system, np.asarray(t, q.dtype), q, moved)

@@ -8,6 +8,7 @@ at it. The rows of joints are independent with one body of a biconnected compone
 pivot is regular.
 """
 
+import dataclasses
 import functools
 import hashlib
 import itertools
@@ -24,8 +25,6 @@ from .rigid_bodies import RigidBodySystem
 
 # A body on which this many joints hang is a node of the elimination.
 _HUB = 6
-
-
 # From this number of rows on block elimination is faster; see jaxmb.linalg for the measurement.
 _LEAST_ROWS = 30
 # The same where rows are implied by others: a chart finds others to leave out on the way, block elimination does not.
@@ -63,16 +62,65 @@ def _joint_order(
 ) -> JointOrder:
     ground, size = layout.bodies, layout.space.velocity_size
     parts = [(own, rows) for bodies, rows in groups for own in bodies]
+    joints = _merged(parts, ground)
+    rows, bodies_of, blocks = _indices(parts, joints, ground, size)
+    total = sum(rows for _, rows in parts)
+    filled = rows < total
+    place = np.empty(total, np.int32)
+    place[rows[filled]] = np.flatnonzero(filled.ravel())
+    kept = filled & ~np.isin(rows, np.array(left_out, int))
+
+    below = _hubs(joints, parts, absolute, ground)
+    hubs = {hub: len(joints) + k for k, hub in enumerate(sorted(below))}
+    of_body: dict[int, list[int]] = {}
+    for joint, (bodies, _) in enumerate(joints):
+        for body in bodies:
+            of_body.setdefault(body, []).append(joint)
+    widest = rows.shape[1]
+    nodes = _nodes(joints, of_body, hubs, below, max(widest, size) if hubs else widest)
+    first, second, products, on_hubs, hub_places = _gram(joints, of_body, hubs, nodes, bodies_of.shape[1])
+    order = JointOrder(
+        key=None,
+        rows=rows,
+        kept=kept,
+        place=place,
+        bodies=bodies_of,
+        blocks=blocks,
+        on_bodies=placed_sums(bodies_of.reshape(-1), ground),
+        velocity_index=layout.velocity_index,
+        velocity_place=layout.velocity_place,
+        first=first,
+        second=second,
+        products=placed_sums(products, nodes.blocks),
+        hubs=np.array(list(hubs), np.int32),
+        on_hubs=on_hubs,
+        hub_places=hub_places,
+        nodes=nodes,
+    )
+    return dataclasses.replace(order, key=_digest(order))
+
+
+def _digest(order):
+    """A key that is equal for equal orders."""
+    digest = hashlib.sha256()
+    for field in dataclasses.fields(order):
+        value = getattr(order, field.name)
+        if isinstance(value, np.ndarray):
+            digest.update(repr(value.shape).encode() + np.ascontiguousarray(value).tobytes())
+        elif value is not None:
+            digest.update(value.key)
+    return digest.digest()
+
+
+def _indices(parts, joints, ground, size):
+    """Rows, bodies and entries of the blocks of each joint, padded to the largest."""
     first_row = [0, *itertools.accumulate(rows for _, rows in parts)]
     first_entry = [0, *itertools.accumulate(rows * len(own) * size for own, rows in parts)]
-    joints = _merged(parts, ground)
-    count = len(joints)
     widest = max(sum(parts[p][1] for p in own) for _, own in joints)
     most = max(len(bodies) for bodies, _ in joints)
-
-    rows = np.full((count, widest), first_row[-1], np.int32)
-    bodies_of = np.full((count, most), ground, np.int32)
-    blocks = np.full((count, most, widest, size), first_entry[-1], np.int32)
+    rows = np.full((len(joints), widest), first_row[-1], np.int32)
+    bodies_of = np.full((len(joints), most), ground, np.int32)
+    blocks = np.full((len(joints), most, widest, size), first_entry[-1], np.int32)
     for joint, (bodies, own) in enumerate(joints):
         bodies_of[joint, : len(bodies)] = bodies
         start = 0
@@ -84,60 +132,46 @@ def _joint_order(
                 if body != ground:
                     blocks[joint, bodies.index(body), start : start + n] = entries[:, k]
             start += n
-    filled = rows < first_row[-1]
-    place = np.empty(first_row[-1], np.int32)
-    place[rows[filled]] = np.flatnonzero(filled.ravel())
-    kept = filled & ~np.isin(rows, np.array(left_out, int))
+    return rows, bodies_of, blocks
 
-    below = _hubs(joints, parts, absolute, ground)
-    hubs = sorted(below)
-    node_of_hub = {hub: count + k for k, hub in enumerate(hubs)}
-    of_body: dict[int, list[tuple[int, int]]] = {}
-    for joint, (bodies, _) in enumerate(joints):
-        for k, body in enumerate(bodies):
-            of_body.setdefault(body, []).append((joint, joint * most + k))
-    neighbours: list[set[int]] = [set() for _ in range(count + len(hubs))]
+
+def _nodes(joints, of_body, hubs, below, size):
+    """The order of elimination of joints and hubs."""
+    neighbours: list[set[int]] = [set() for _ in range(len(joints) + len(hubs))]
     for body, own in of_body.items():
-        if body in node_of_hub:
-            hub = node_of_hub[body]
-            for joint, _ in own:
-                neighbours[hub].add(joint)
-                neighbours[joint].add(hub)
+        if body in hubs:
+            neighbours[hubs[body]].update(own)
+            for joint in own:
+                neighbours[joint].add(hubs[body])
         else:
-            everyone = {joint for joint, _ in own}
-            for joint in everyone:
-                neighbours[joint] |= everyone - {joint}
-    block_size = max(widest, size) if hubs else widest
-    above = [
-        {node_of_hub[hub] for hub in own if joint not in below.get(hub, {joint})}
-        for joint, (own, _) in enumerate(joints)
-    ]
-    nodes = order_nodes(neighbours, block_size, after=[*above, *(below[hub] for hub in hubs)])
+            for joint in own:
+                neighbours[joint].update(other for other in own if other != joint)
+    above = lambda joint, own: [hubs[body] for body in own if body in hubs and joint not in below[body]]
+    after = [above(joint, own) for joint, (own, _) in enumerate(joints)]
+    return order_nodes(neighbours, size, after=[*after, *(below[hub] for hub in hubs)])
+
+
+def _gram(joints, of_body, hubs, nodes, most):
+    """The blocks, by joint and body raveled, whose products make up the matrix, with the places of these among its
+    stored blocks; and the blocks of joints on hubs with their places.
+    """
     stored = {pair: k for k, pair in enumerate(zip(nodes.row.tolist(), nodes.column.tolist(), strict=True))}
-    first, second, targets, on_hubs, hub_places = [], [], [], [], []
+    block = lambda joint, body: joint * most + joints[joint][0].index(body)
+    first, second, products, on_hubs, hub_places = [], [], [], [], []
     for body, own in of_body.items():
-        if body in node_of_hub:
-            for joint, block in own:
-                hub = node_of_hub[body]
-                on_hubs.append(block)
-                hub_places.append(stored[hub, joint] if (hub, joint) in stored else stored[joint, hub])
+        if body in hubs:
+            hub = hubs[body]
+            on_hubs += [block(joint, body) for joint in own]
+            hub_places += [stored[hub, j] if (hub, j) in stored else stored[j, hub] for j in own]
             continue
-        for i, (a, block_a) in enumerate(own):
-            for b, block_b in own[: i + 1]:
-                straight = (a, b) in stored
-                targets.append(stored[a, b] if straight else stored[b, a])
-                first.append(block_a if straight else block_b)
-                second.append(block_b if straight else block_a)
-    index = lambda values: np.array(values, np.int32)
-    arrays = rows, kept, place, bodies_of, blocks
-    on_bodies = placed_sums(bodies_of.reshape(-1), ground)
-    kinematics = layout.velocity_index, layout.velocity_place
-    gram = index(first), index(second), placed_sums(index(targets), nodes.blocks)
-    hub_arrays = index(hubs), index(on_hubs), index(hub_places)
-    digest = hashlib.sha256(nodes.key + on_bodies.key + gram[2].key)
-    for array in (*arrays, *kinematics, *gram[:2], *hub_arrays):
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return JointOrder(digest.digest(), *arrays, on_bodies, *kinematics, *gram, *hub_arrays, nodes)
+        for i, a in enumerate(own):
+            for b in own[: i + 1]:
+                # The later of the two nodes is the row.
+                row, column = (a, b) if (a, b) in stored else (b, a)
+                first.append(block(row, body))
+                second.append(block(column, body))
+                products.append(stored[row, column])
+    return [np.array(values, np.int32) for values in (first, second, products, on_hubs, hub_places)]
 
 
 def _merged(parts, ground):

@@ -3,14 +3,9 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 
-from ...linalg.arrays import namespace, unchecked_take
+from ...linalg.arrays import namespace
 from ..space import AbstractSpace
-
-# Where the rates of a prepared pose along unit velocities stand among 0, 1, the cosine and the negative sine of its
-# angle.
-_MOVES = np.array([[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 1, 3, 2]])
 
 
 class PlanarSpace(AbstractSpace):
@@ -55,7 +50,8 @@ class PlanarSpace(AbstractSpace):
 
     def moves(self, pose):
         zero, one = jnp.zeros_like(pose[:1]), jnp.ones_like(pose[:1])
-        return unchecked_take(jnp.concatenate([zero, one, pose[3:4], -pose[4:5]]), _MOVES)
+        turned = jnp.concatenate([zero, zero, one, -pose[4:5], pose[3:4]])
+        return jnp.concatenate([jnp.eye(2, 5, dtype=pose.dtype), turned[None]])
 
     def pull_back(self, pose, gradient):
         if not _prepared(pose):
