@@ -224,11 +224,6 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         return curved(v) + forces, rows + (1 - independent) * multipliers
 
     def solve(_, b):
-        # Conjugate gradients lose digits by rounding, which one step of refinement restores.
-        x = once(b)
-        return jax.tree.map(jnp.add, x, once(jax.tree.map(jnp.subtract, b, matrix(x))))
-
-    def once(b):
         forces, rows = b
         particular = projector.direction(projector.multipliers(rows))
         v = particular + _null_space_solution(curved, projector, forces - curved(particular))
@@ -245,10 +240,16 @@ def _null_space_solution(curved, projector, force):
     """
 
     def project(force):
-        free = projector.metric.solve(force)
-        return free - projector.direction(projector.multipliers(projector.jacobian.product(free)))
+        # Only its part along the null space is kept of a residual: the constraint forces in it would grow beside it.
+        force = force - constraint_force(force)
+        towards = projector.metric.solve(force)
+        return force, towards - projector.direction(projector.multipliers(projector.jacobian.product(towards)))
 
-    towards = project(force)
+    def constraint_force(force):
+        free = projector.metric.solve(force)
+        return projector.jacobian.transpose_product(projector.multipliers(projector.jacobian.product(free)))
+
+    force, towards = project(force)
     size = jnp.vdot(force, towards)
 
     def correct(carry):
@@ -257,11 +258,10 @@ def _null_space_solution(curved, projector, force):
         curvature = jnp.vdot(along, curve)
         convex = curvature > 0
         length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
-        left = left - length * curve
-        towards = project(left)
+        x = x + length * along
+        left, towards = project(left - length * curve)
         new = jnp.vdot(left, towards)
         along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
-        x = x + length * carry[2]
         return x, left, along, new, k + 1, convex
 
     def proceed(carry):
