@@ -286,7 +286,7 @@ SPATIAL = [
     of_ground_3d(spatial.Universal, "point_b", point=O, axis_a_W=AXIS, axis_b_W=(0.0, 1.0, 0.0)),
     of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
-    of_ground_3d(spatial.Prismatic, "axis_a", point=O, axis=AXIS),
+    of_ground_3d(spatial.Prismatic, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Planar, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Fixed, "point_b", point=O),
     of_ground_3d(spatial.Distance, "length", point_b=(0.1, 0.0, 0.0)),
