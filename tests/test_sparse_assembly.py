@@ -93,7 +93,7 @@ def test_the_closest_state_and_its_derivatives(build, names):
     assert ok
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
     np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
-    np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-9)
+    np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-10)
 
 
 def test_rough_guesses():

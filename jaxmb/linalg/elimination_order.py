@@ -24,6 +24,8 @@ _FLOP = 0.0006
 # Of a dense matrix: each column costs a step of its own elimination.
 _DENSE_STEP = 0.15
 _DENSE_FLOP = 0.0003
+# The largest number of nodes that are left for a dense matrix.
+_LARGEST_REST = 400
 _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 
 
@@ -141,12 +143,9 @@ def _eliminate(graph: list[set[int]], size: int, cap: int, after: Sequence[Itera
     return cost, levels[:count], [node for level in levels[count:] for node, _ in level], highest
 
 
-_LARGEST_REST = 400
-
-
 def _dense_costs(n, size):
     rows = np.arange(n + 1) * size
-    costs = rows * _DENSE_STEP + rows**3 * _DENSE_FLOP * 1.0
+    costs = rows * _DENSE_STEP + rows**3 * _DENSE_FLOP
     costs[_LARGEST_REST + 1 :] = np.inf
     return costs
 

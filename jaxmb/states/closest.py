@@ -21,7 +21,7 @@ from ..system import AbstractSystem
 from .closest_sparse import sparse_configuration, sparse_velocities
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
-MANY_ROWS = 150
+MANY_ROWS = 300
 
 # Largest number of Gauss–Newton steps to the constraints.
 _ITERATIONS = 100

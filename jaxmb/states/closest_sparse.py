@@ -29,7 +29,7 @@ from ..system import AbstractSystem
 from ..system.displacement import displaced
 
 # Rows are independent if every pivot of the elimination (a squared distance between rows of unit norm) exceeds this.
-_INDEPENDENT = 1e-8
+_INDEPENDENT = 1e-5
 # Implied rows get this share of the largest entry of the diagonal as a pivot.
 _SHIFT = 1e-13
 # Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
