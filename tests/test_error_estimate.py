@@ -19,7 +19,7 @@ MORE = {"andrews": 0.03, "bricard": 2.0, "rolling_disk": 1.0, "spherical_four_ba
 def test_estimates_are_of_the_size_of_errors(name):
     mechanism = mb.mechanisms.get(name)
     end = (MACHINES | MORE)[name]
-    times = np.linspace(0, end, 5)[1:]
+    times = np.linspace(0, end, 9)[1:]
     run = lambda rtol, **options: mb.simulate(
         mechanism.system, mechanism.state, t1=end, saveat=times, rtol=rtol, max_steps=20000, **options
     )

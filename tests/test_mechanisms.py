@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_as_users_do
 from oracles import linkages, one_freedom, trains
 from scipy.optimize import curve_fit
 from scipy.special import roots_laguerre
@@ -302,11 +303,12 @@ def test_charts_change_without_a_restart():
 
 def test_steps_do_not_shrink_where_the_chart_changes():
     mechanism = library("pendulum")
-    trajectory = mb.simulate(
-        mechanism.system, mechanism.state, t1=9.99, rtol=RTOL, saveat=diffrax.SaveAt(steps=True, t0=True)
-    )
+    steps = diffrax.SaveAt(steps=True, t0=True)
+    # As users compile: that rounding makes the solver repeat a step, here or there, is another matter.
+    run = jit_as_users_do(lambda state: mb.simulate(mechanism.system, state, t1=9.99, rtol=RTOL, saveat=steps))
+    trajectory = run(mechanism.state)
     assert trajectory.stats["charts"] - 1 >= 10
-    steps = np.diff(trajectory.ts)[30:-1]
+    steps = np.diff(trajectory.ts[np.isfinite(trajectory.ts)])[30:-1]
     assert np.min(steps[1:] / steps[:-1]) > 0.4
     low = int(np.sum(trajectory.stats["orders"][:6]))
     assert low <= 20

@@ -169,7 +169,10 @@ def collision():
         sol = mb.simulate(
             system, mechanism.state, t1=0.3, rtol=rtol, saveat=jnp.linspace(0.0, 0.3, 61), throw=False, **options
         )
-        return -jnp.min(jax.vmap(system.tensions)(sol.ys)[:, 1])
+        tensions = jax.vmap(system.tensions)(sol.ys)[:, 1]
+        # Not `jnp.min`: XLA may compute a number twice, rounded differently, and its derivative divides by the count
+        # of numbers equal to the smallest.
+        return -tensions[jnp.argmin(tensions)]
 
     return peak, {
         f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"]
@@ -179,9 +182,12 @@ def collision():
 
 def test_derivatives_of_the_largest_force_in_a_collision(collision):
     peak, numbers = collision
-    value, reverse = jax.jit(jax.value_and_grad(lambda numbers: peak(numbers, 1e-10)))(numbers)
-    along = lambda numbers: peak(numbers, 1e-10, adjoint=diffrax.ForwardMode())
-    forward = jax.jit(jax.jacfwd(along))(numbers)
+    along = lambda numbers, rtol: peak(numbers, rtol, adjoint=diffrax.ForwardMode())
+    derivatives = jax.jit(jax.jacfwd(along))
+    forward, exact = derivatives(numbers, 1e-10), derivatives(numbers, 1e-12)
+    # Where a step crosses the kink of a draft gear depends on rounding, and so on the program: both agree as far as
+    # the tolerance lets them.
+    value, reverse = jax.jit(jax.value_and_grad(peak))(numbers, 1e-12)
     tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
     assert 1e5 < value < 1e7
     for name, number in numbers.items():
@@ -191,7 +197,7 @@ def test_derivatives_of_the_largest_force_in_a_collision(collision):
         )
         # Richardson's extrapolation: the stop bends the force over a millimetre.
         difference = (4 * central(h) - central(2 * h)) / 3
-        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
+        np.testing.assert_allclose(exact[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
         np.testing.assert_allclose(forward[name], difference, rtol=1e-5, atol=5e-6 * value / number, err_msg=name)
 
 

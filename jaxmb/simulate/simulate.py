@@ -80,7 +80,7 @@ def simulate(
         error of the result, relative to the largest coordinates and velocities, is then mostly below `rtol`; some ten
         times `rtol` over many periods, more where neighbouring motions part quickly, and about the same as that of
         `diffrax.Dopri8()`; `error=True` estimates it. Near rounding the part grows, up to all of it: steps are not
-        asked for less than 4e-14 (`Adams`) or 1e-12 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
+        asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
         largest coordinate (in units of the machine's size, or radians) and the largest velocity so far, so that the
         units do not matter and slow or small motions are as accurate as others. A number is in SI units; it may be a
         vector of one for each coordinate and velocity, (nq + nu,): where stiff springs vibrate too little to matter in

@@ -29,7 +29,7 @@ from .manifold_term import Chart
 # Newton's method ends when the next correction is below this, in units of the tolerance.
 _NEWTON = 0.01
 # The finest relative tolerance of a step, in units of the machine precision.
-_FINEST = 5000
+_FINEST = 50000
 # The target error of a step, in units of the tolerance.
 _TARGET = 0.05
 

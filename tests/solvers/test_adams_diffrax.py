@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from compiling import jit_as_users_do
 
 from jaxmb.solvers import Adams, MultistepController
 
@@ -90,8 +91,8 @@ def test_batch_equals_loop():
         solution = _solve(omega=omega, dt0=0.5, saveat=saved, controller=controller)
         return solution.ys, solution.stats["num_rejected_steps"], solution.solver_state.step_counts
 
-    batch = jax.jit(jax.vmap(run))(omegas)
-    single = jax.jit(run)
+    batch = jit_as_users_do(jax.vmap(run))(omegas)
+    single = jit_as_users_do(run)
     loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(omega) for omega in omegas])
     assert np.all(batch[1] > 0) and len(set(np.sum(batch[2], axis=1).tolist())) > 1
     np.testing.assert_array_equal(batch[1], loop[1])
