@@ -138,17 +138,48 @@ def test_bodies_of_many_joints(build, hubs):
     compare(system, state.q, state.u)
 
 
+def ladder(n=8):
+    """Rectangles on hinges in space, side by side: each implies three of its own rows."""
+    upright = {"mass": 1.0, "inertia": (0.1, 0.02, 0.11)}
+    bodies, joints = [], []
+    for k in range(n + 1):
+        bodies.append(spatial.Body(f"upright{k}", position=(k, 0.0, 0.5), **upright))
+        joints.append(spatial.Revolute(f"foot{k}", "ground", f"upright{k}", point=(k, 0.0, 0.0), axis=(0.0, 1.0, 0.0)))
+    for k in range(n):
+        bodies.append(spatial.Body(f"bar{k}", mass=1.0, inertia=(0.02, 0.1, 0.1), position=(k + 0.5, 0.0, 1.0)))
+        for end in (k, k + 1):
+            at = {"point": (end, 0.0, 1.0), "axis": (0.0, 1.0, 0.0)}
+            joints.append(spatial.Revolute(f"pin{k}_{end}", f"bar{k}", f"upright{end}", **at))
+    spring = spatial.SpringDamper("spring", "ground", "bar0", stiffness=50.0, damping=1.0, free_length=0.5)
+    return mb.Scene(bodies, joints=joints, forces=[spring, mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+def free_ends():
+    """A cable in space."""
+    return mb.mechanisms.get("cable", n=12).system
+
+
 @pytest.mark.long
-def test_motion_and_its_derivatives():
-    """A star that moves as by partitioning, with forward, reverse and central differences."""
-    system = star(8, 2, ground=True)
-    assert system.elimination is not None
+@pytest.mark.parametrize(
+    ("build", "varied", "implied"),
+    [
+        (lambda: star(8, 2, ground=True), {"r30.mass": 1.0, "p31.point_a": np.array([0.1, 0.0])}, 0),
+        (ladder, {"bar3.mass": 1.0, "spring.stiffness": 20.0}, 24),
+        (free_ends, {"rod3.mass": 0.1, "rod7.inertia": np.full(3, 1e-3)}, 0),
+    ],
+    ids=["star", "ladder", "cable"],
+)
+def test_motion_and_its_derivatives(build, varied, implied):
+    """A motion as by partitioning, with forward, reverse and central differences."""
+    system = build()
+    assert system.elimination is not None and system.velocity_rows - system.velocity_rank == implied
     state = mb.assemble(system, mb.State(system.guess.q, jnp.asarray(np.random.default_rng(0).normal(size=system.nu))))
+    start = mb.parameters(system)
 
     def tip(h, manifold, rtol, **options):
-        own = mb.with_parameters(system, {"r30.mass": 1.0 + h, "p31.point_a": jnp.array([0.5 + 0.1 * h, 0.0])})
-        start = mb.manifold.project(own, 0.0, state)
-        y = mb.simulate(own, start, t1=0.5, rtol=rtol, atol=rtol, manifold=manifold, throw=False, **options).ys
+        own = mb.with_parameters(system, {name: start[name] + h * step for name, step in varied.items()})
+        at_start = mb.manifold.project(own, 0.0, state)
+        y = mb.simulate(own, at_start, t1=0.5, rtol=rtol, atol=rtol, manifold=manifold, throw=False, **options).ys
         return jnp.sum(jnp.cos(y.q[-1])) + jnp.sum(y.u[-1]) * 0.1
 
     mode = diffrax.ForwardMode()
@@ -193,7 +224,9 @@ def random_parts(rng, bodies, loops):
 
 @pytest.mark.parametrize("seed", range(200))
 def test_ranks_of_random_graphs(seed):
-    """The sum of the ranks of components is that of the whole; kept rows are independent and imply the others."""
+    """The sum of the ranks of components is that of the whole; kept rows are independent and imply the others. By
+    sparse elimination, and by a dense one.
+    """
     rng = np.random.default_rng(seed)
     bodies, loops = int(rng.integers(1, 12)), int(rng.integers(0, 4))
     parts, blocks = random_parts(rng, bodies, loops)
@@ -203,7 +236,12 @@ def test_ranks_of_random_graphs(seed):
         for side, body in enumerate(part.bodies):
             if body < bodies:
                 whole[part.first : part.first + 5, 6 * body : 6 * body + 6] += block[:, side]
-    found = subsets(parts, blocks, layout, np.ones(6 * bodies), np.zeros(5 * len(parts), int), frozenset())
+    level = np.sort(rng.integers(0, 3, 5 * len(parts)))
+    found, by_dense = (
+        subsets(parts, blocks, layout, np.ones(6 * bodies), level, frozenset(), dense=most) for most in (-1, 100)
+    )
+    for own, expected in zip(found, by_dense, strict=True):
+        np.testing.assert_array_equal(np.bincount(level[own.kept]), np.bincount(level[expected.kept]))
     kept = np.concatenate([own.kept for own in found])
     rank = np.linalg.matrix_rank(whole, tol=1e-9)
     assert kept.size == rank == np.linalg.matrix_rank(whole[kept], tol=1e-9)

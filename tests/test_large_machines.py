@@ -1,11 +1,16 @@
 """Trees, cables and nets of any size: against equations of their own, and what they keep."""
 
+import math
+import re
+
+import jax
 import numpy as np
 import pytest
 from oracles import large
 
 import jaxmb as mb
 from jaxmb.mechanisms.observe import point_motion
+from jaxmb.states import structure
 
 TIMES = np.array([0.2, 0.4, 0.6, 0.8])
 
@@ -66,6 +71,24 @@ def test_motions_are_those_of_other_equations(case, size, free):
     np.testing.assert_allclose(sol.energy, start, rtol=0, atol=1e-9 * released)
     assert np.all(sol.constraint_violation.position <= 1e-12)
     assert np.all(sol.constraint_violation.velocity <= 1e-12)
+
+
+def test_no_dense_matrix_and_programs_of_one_size():
+    """The largest array of any program grows with the number of bodies, and its number of lines does not."""
+    lines = []
+    for n in (150, 600):
+        mechanism = mb.mechanisms.get("tree", n=n)
+        system, state = mechanism.system, mechanism.state
+        programs = (
+            structure._analyse.lower(system),
+            jax.jit(lambda y, system=system: mb.assemble(system, y, throw=False)).lower(state),
+            jax.jit(lambda y, system=system: mb.simulate(system, y, t1=0.1).ys).lower(state),
+        )
+        texts = [program.as_text() for program in programs]
+        sizes = {shape for text in texts for shape in re.findall(r"tensor<((?:\d+x)+)f64>", text)}
+        assert max(math.prod(map(int, shape[:-1].split("x"))) for shape in sizes) < 200 * n
+        lines.append([text.count("\n") for text in texts])
+    assert np.all(np.array(lines[1]) <= 1.2 * np.array(lines[0]))
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,21 @@ the biconnected components of the joint graph, each with one of its bodies held,
 by rows of their own component. A part that binds a body to the world has the ground among its bodies.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..linalg.sparse_pivots import pivot_rows
 from ..system.block_cut_tree import components
 from ..system.layout import Layout
 
 # An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the nearest of true ranks 1e-4.
 _ZERO = 0.5
+# A dense component of so many rows takes 0.1 s, and the time grows with the cube.
+_DENSE = 300
 
 
 class Part(NamedTuple):
@@ -60,6 +64,20 @@ def matrix(
     return out
 
 
+def row_norms(
+    parts: Sequence[Part],
+    blocks: Sequence[Float[np.ndarray, "rows k v"]],
+    layout: Layout,
+    scale: Float[np.ndarray, "nu"],
+) -> Float[np.ndarray, "m"]:
+    """The norm of each row, its columns multiplied by a scale."""
+    of_bodies = np.append(scale, np.zeros(1, scale.dtype))[np.minimum(layout.velocity_index, scale.size)]
+    sizes = [
+        np.sqrt(np.sum((b * of_bodies[list(p.bodies)]) ** 2, axis=(1, 2))) for p, b in zip(parts, blocks, strict=True)
+    ]
+    return np.concatenate(sizes)
+
+
 def subsets(
     parts: Sequence[Part],
     blocks: Sequence[Float[np.ndarray, "rows k v"]],
@@ -67,11 +85,13 @@ def subsets(
     scale: Float[np.ndarray, "nu"],
     level: Int[np.ndarray, "rows"],
     absolute: frozenset[int],
+    dense: int = _DENSE,
 ) -> list[Subset]:
     """The rows of each component, and which of them are independent.
 
     **Arguments:** `blocks` of the parts; `scale` of the columns; `level` of each row: rows of low levels are kept
-    first; `absolute`: parts that do not depend on relative motions alone.
+    first; `absolute`: parts that do not depend on relative motions alone; `dense`: components of more rows than this
+        are eliminated as sparse matrices.
     """
     ground = layout.bodies
     vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(parts)]
@@ -81,8 +101,13 @@ def subsets(
         columns = layout.velocity_index[bodies].ravel() if bodies else np.zeros(0, int)
         columns = np.sort(columns[columns < layout.nu])
         rows = np.concatenate([np.arange(parts[p].first, parts[p].first + parts[p].rows) for p in component.joints])
-        own = matrix(parts, blocks, layout, component.joints, columns) * scale[columns]
-        order, rank = _pivot_rows(own, level[rows])
+        if rows.size > dense:
+            order, rank = _sparse_pivot_rows(
+                parts, blocks, layout, component.joints, set(columns.tolist()), scale, level[rows]
+            )
+        else:
+            own = matrix(parts, blocks, layout, component.joints, columns) * scale[columns]
+            order, rank = _pivot_rows(own, level[rows])
         out.append(Subset(component.joints, rows, columns, rows[order[:rank]], rows[order[rank:]]))
     return out
 
@@ -127,3 +152,22 @@ def _pivot_rows(A, level):
             ratio = np.where(left, work[:, c] / work[r, c], 0.0)
             work = work - ratio[:, None] * work[r]
     return np.array([*kept, *np.flatnonzero(left)], int), len(kept)
+
+
+def _sparse_pivot_rows(parts, blocks, layout, own, columns, scale, level):
+    """`_pivot_rows` of some parts in some columns, without a dense matrix; pivots follow from sparsity."""
+    rows: list[dict[int, float]] = []
+    for p in own:
+        index = layout.velocity_index[list(parts[p].bodies)].ravel()
+        values = blocks[p].reshape(parts[p].rows, -1)
+        for row in values:
+            entries: dict[int, float] = {}
+            for c, value in zip(index.tolist(), row.tolist(), strict=True):
+                if value and c in columns:
+                    entries[c] = entries.get(c, 0.0) + value * float(scale[c])
+            rows.append(entries)
+    eps = float(np.finfo(scale.dtype).eps)
+    sizes = [math.sqrt(sum(x * x for x in entries.values())) for entries in rows]
+    floor = max(eps**0.75 * max(sizes, default=0.0), float(np.finfo(scale.dtype).tiny))
+    unit = [{c: x / max(size, floor) for c, x in entries.items()} for entries, size in zip(rows, sizes, strict=True)]
+    return pivot_rows(unit, level.tolist(), eps**_ZERO)

@@ -24,8 +24,8 @@ from ..system.joint_graph import elimination_order, joint_order
 from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
 from .closest import tolerance
-from .closest_sparse import meet_sparse
-from .independence import Part, absolute_parts, matrix, subsets
+from .closest_sparse import largest_residual, meet_sparse
+from .independence import Part, absolute_parts, matrix, row_norms, subsets
 from .redundancy import Group, Nearby, check_gradients, check_implied
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
@@ -49,16 +49,18 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
     others = tuple(range(system.position_rows, system.acceleration_rows))
     of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
-    q, residual, at = _analyse(of_positions)
+    q, at = _analyse(of_positions)
+    parts = _parts(system)
+    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
+    norms = row_norms(parts, blocks, system.layout, scale)
+    residual = largest_residual(at.unmet, jnp.asarray(norms[: system.position_rows])) if system.position_rows else 0.0
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
         raise ValueError(
             f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
             "points and axes for joints that contradict each other, or give better poses."
         )
-    parts = _parts(system)
-    check_gradients(system, np.asarray(at.row_norms))
-    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
+    check_gradients(system, norms)
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
     absolute = absolute_parts(parts, blocks, np.asarray(at.as_one))
@@ -103,26 +105,23 @@ def _of_parts(groups):
 
 
 class _Evaluation(NamedTuple):
-    """Φ; the blocks of A group by group; the scale of its columns, and the norms of its rows with it; velocities of all
-    bodies, and zeros of the ground, in translations and rotations of all bodies as one.
+    """Φ; the blocks of A group by group; the scale of its columns; velocities of all bodies, and zeros of the ground,
+    in translations and rotations of all bodies as one.
     """
 
     unmet: Array
     blocks: Any
     scale: Array
-    row_norms: Array
     as_one: Array
 
 
 @eqx.filter_jit
 def _analyse(system):
-    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
+    """The configuration where constraints are met, and what is known there."""
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
-    if system.position_rows:
-        q, residual = meet_sparse(system, t, q, np.zeros(system.nu, bool))
-    else:
-        q, residual = system.normalize(q), jnp.zeros_like(t)
-    return q, residual, _evaluated(system, t, q)
+    still = np.zeros(system.nu, bool)
+    q = meet_sparse(system, t, q, still) if system.position_rows else system.normalize(q)
+    return q, _evaluated(system, t, q)
 
 
 def _evaluated(system, t, q):
@@ -130,9 +129,7 @@ def _evaluated(system, t, q):
     u = system.guess.u
     poses, velocities = system.prepared_poses(q), system.all_velocities(u)
     blocks = [g.jacobian(t, poses, velocities) for g in system.joints]
-    scale = system.velocity_scale()
-    norms = system.structured_jacobian(t, q, u).row_norms(scale)
-    return _Evaluation(system.position_residual(t, q), blocks, scale, norms, _motions_as_one(system, q))
+    return _Evaluation(system.position_residual(t, q), blocks, system.velocity_scale(), _motions_as_one(system, q))
 
 
 @eqx.filter_jit

@@ -1,0 +1,117 @@
+"""Independent rows of a sparse matrix, by elimination with few new entries: arithmetic on concrete numbers.
+
+Pivots are chosen for sparsity among entries that are not much smaller than the largest of their column, so that no
+multiple of a row that is subtracted from another one is large.
+
+Source: H. M. Markowitz, "The elimination form of the inverse and its application to linear programming", Management
+Science 3(3), 1957; I. S. Duff, A. M. Erisman and J. K. Reid, "Direct Methods for Sparse Matrices", 2017, ch. 7
+(threshold pivoting).
+"""
+
+import heapq
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+# A pivot is at least this share of the largest entry of its column.
+_THRESHOLD = 0.1
+# Number of short rows among which the pivot is looked for.
+_SEARCHED = 4
+# Entries below this, in rows of unit norm, are rounding errors of an elimination.
+_ROUNDING = 1e-15
+
+
+def pivot_rows(rows: Sequence[dict[int, float]], level: Sequence[int], zero: float) -> tuple[Int[np.ndarray, "m"], int]:
+    """The rows in the order in which they became pivots, then those that depend on them, and the number of the first.
+
+    **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
+    become pivots first; `zero`: size of the entries that are left of a row that depends on others.
+    """
+    elimination = _Elimination(rows)
+    kept: list[int] = []
+    for own in sorted(set(level)):
+        kept += elimination.run([r for r in range(len(rows)) if level[r] == own], zero)
+    others = sorted(set(range(len(rows))) - set(kept))
+    return np.array(kept + others, int), len(kept)
+
+
+class _Elimination:
+    """Rows that are left, by column; and for each column those of the rows that have an entry in it."""
+
+    def __init__(self, rows):
+        self.rows = {r: dict(own) for r, own in enumerate(rows)}
+        self.columns: dict[int, set[int]] = {}
+        for r, own in self.rows.items():
+            for c in own:
+                self.columns.setdefault(c, set()).add(r)
+
+    def run(self, candidates, zero):
+        """Eliminate with pivots in some rows while any of their entries exceeds `zero`; the rows of the pivots."""
+        heap = [(len(self.rows[r]), r) for r in candidates if self._largest(r) > zero]
+        heapq.heapify(heap)
+        own, kept = set(candidates), []
+        while heap:
+            pivot = self._choose(heap, zero)
+            if pivot is None:
+                break
+            row, column = pivot
+            kept.append(row)
+            for changed in self._eliminate(row, column):
+                if changed in own:
+                    heapq.heappush(heap, (len(self.rows[changed]), changed))
+        return kept
+
+    def _largest(self, r):
+        return max(map(abs, self.rows[r].values()), default=0.0)
+
+    def _choose(self, heap, zero):
+        """The pivot of the least Markowitz cost in a few short rows, or that of the largest share of its column where
+        none is large enough; all but its row go back to the heap.
+        """
+        best, largest, searched, seen = None, (0.0, 0, 0), [], set()
+        while heap and not (best and len(searched) >= _SEARCHED):
+            count, r = heapq.heappop(heap)
+            # Entries of the heap from before a change are out of date.
+            if r in seen or r not in self.rows or count != len(self.rows[r]) or self._largest(r) <= zero:
+                continue
+            seen.add(r)
+            searched.append((count, r))
+            for c, value in self.rows[r].items():
+                if abs(value) <= zero:
+                    continue
+                others = self.columns[c]
+                cost = (count - 1) * (len(others) - 1)
+                if best is not None and cost >= best[0]:
+                    continue
+                share = abs(value) / max(abs(self.rows[k][c]) for k in others)
+                largest = max(largest, (share, r, c))
+                if share >= _THRESHOLD:
+                    best = cost, r, c
+        if not searched:
+            return None
+        _, row, column = best or largest
+        for item in searched:
+            if item[1] != row:
+                heapq.heappush(heap, item)
+        return row, column
+
+    def _eliminate(self, row, column):
+        """Subtract multiples of a row from the others that have an entry in the column; the rows that changed."""
+        pivot = self.rows.pop(row)
+        for c in pivot:
+            self.columns[c].discard(row)
+        changed = self.columns.pop(column)
+        value = pivot.pop(column)
+        for r in changed:
+            own = self.rows[r]
+            ratio = own.pop(column) / value
+            for c, entry in pivot.items():
+                new = own.get(c, 0.0) - ratio * entry
+                if abs(new) > _ROUNDING:
+                    own[c] = new
+                    self.columns[c].add(r)
+                elif c in own:
+                    del own[c]
+                    self.columns[c].discard(r)
+        return changed
