@@ -318,6 +318,8 @@ def test_a_random_scene():
 def test_two_hundred_random_scenes(part):
     for seed in range(10 * part, 10 * part + 10):
         check_random(seed)
+    # Each scene has programs of its own, and a process has room for some hundreds of them.
+    jax.clear_caches()
 
 
 @pytest.mark.long

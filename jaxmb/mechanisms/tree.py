@@ -42,12 +42,12 @@ def tree(
     if n < 1 or branching < 1:
         raise ValueError(f"tree needs n ≥ 1 rods and a branching ≥ 1, got n = {n} and branching {branching}.")
     above = [0, *(1 + (k - 2) // branching for k in range(2, n + 1))]
+    hanging = np.bincount(above, minlength=n + 1)
     angles, ends = [_TILT - 0.5 * np.pi], [np.zeros(2)]
     for k in range(1, n + 1):
         direction = np.array([np.cos(angles[k - 1]), np.sin(angles[k - 1])])
         ends.append(ends[above[k - 1]] + length * direction)
-        below = above.count(k)
-        relative = np.linspace(-spread, spread, below) if below > 1 else np.zeros(below)
+        relative = np.linspace(-spread, spread, hanging[k]) if hanging[k] > 1 else np.zeros(hanging[k])
         angles += list(angles[k - 1] + relative)
     rods, pins = [], []
     for k in range(1, n + 1):
