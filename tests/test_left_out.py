@@ -104,8 +104,9 @@ def test_ideal_scene_without_contact_tracks_or_couplers_has_nothing_of_them(monk
     refuse(monkeypatch, planar.DraftGear, "wrenches", "tension", "energy")
     refuse(monkeypatch, planar.Friction, "wrenches", "slip")
     refuse(monkeypatch, partition, "general_acceleration")
-    refuse(monkeypatch, rigid_bodies, "block_jacobian")
     four_bar = mb.mechanisms.four_bar()
+    # The analysis of a scene eliminates blocks, its motion only where it is large.
+    refuse(monkeypatch, rigid_bodies, "block_jacobian")
     assert program(four_bar.system)["tanh"] == 0
 
 

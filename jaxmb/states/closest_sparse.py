@@ -81,8 +81,9 @@ def meet_sparse(
 
 def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
     """The largest residual, each row scaled to unit norm of its gradient times the system's size."""
-    floor = jnp.finfo(residual.dtype).eps ** 0.75 * jnp.max(row_norms) + jnp.finfo(residual.dtype).tiny
-    return jnp.max(jnp.abs(residual) / jnp.maximum(row_norms, floor))
+    largest = jnp.max(row_norms, initial=0.0)
+    floor = jnp.finfo(residual.dtype).eps ** 0.75 * largest + jnp.finfo(residual.dtype).tiny
+    return jnp.max(jnp.abs(residual) / jnp.maximum(row_norms, floor), initial=0.0)
 
 
 def sparse_configuration(

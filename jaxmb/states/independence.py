@@ -64,20 +64,6 @@ def matrix(
     return out
 
 
-def row_norms(
-    parts: Sequence[Part],
-    blocks: Sequence[Float[np.ndarray, "rows k v"]],
-    layout: Layout,
-    scale: Float[np.ndarray, "nu"],
-) -> Float[np.ndarray, "m"]:
-    """The norm of each row, its columns multiplied by a scale."""
-    of_bodies = np.append(scale, np.zeros(1, scale.dtype))[np.minimum(layout.velocity_index, scale.size)]
-    sizes = [
-        np.sqrt(np.sum((b * of_bodies[list(p.bodies)]) ** 2, axis=(1, 2))) for p, b in zip(parts, blocks, strict=True)
-    ]
-    return np.concatenate(sizes)
-
-
 def subsets(
     parts: Sequence[Part],
     blocks: Sequence[Float[np.ndarray, "rows k v"]],

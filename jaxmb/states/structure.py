@@ -25,7 +25,7 @@ from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
 from .closest import tolerance
 from .closest_sparse import largest_residual, meet_sparse
-from .independence import Part, absolute_parts, matrix, row_norms, subsets
+from .independence import Part, absolute_parts, matrix, subsets
 from .redundancy import Group, Nearby, check_gradients, check_implied
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
@@ -49,18 +49,16 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
     others = tuple(range(system.position_rows, system.acceleration_rows))
     of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
-    q, at = _analyse(of_positions)
-    parts = _parts(system)
-    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
-    norms = row_norms(parts, blocks, system.layout, scale)
-    residual = largest_residual(at.unmet, jnp.asarray(norms[: system.position_rows])) if system.position_rows else 0.0
+    q, residual, at = _analyse(of_positions)
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
         raise ValueError(
             f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
             "points and axes for joints that contradict each other, or give better poses."
         )
-    check_gradients(system, norms)
+    parts = _parts(system)
+    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
+    check_gradients(system, np.asarray(at.row_norms))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
     absolute = absolute_parts(parts, blocks, np.asarray(at.as_one))
@@ -105,23 +103,26 @@ def _of_parts(groups):
 
 
 class _Evaluation(NamedTuple):
-    """Φ; the blocks of A group by group; the scale of its columns; velocities of all bodies, and zeros of the ground,
-    in translations and rotations of all bodies as one.
+    """Φ; the blocks of A group by group; the scale of its columns, and the norms of its rows with it; velocities of all
+    bodies, and zeros of the ground, in translations and rotations of all bodies as one.
     """
 
     unmet: Array
     blocks: Any
     scale: Array
+    row_norms: Array
     as_one: Array
 
 
 @eqx.filter_jit
 def _analyse(system):
-    """The configuration where constraints are met, and what is known there."""
+    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
     still = np.zeros(system.nu, bool)
     q = meet_sparse(system, t, q, still) if system.position_rows else system.normalize(q)
-    return q, _evaluated(system, t, q)
+    at = _evaluated(system, t, q)
+    residual = largest_residual(at.unmet, at.row_norms[: system.position_rows])
+    return q, residual, at
 
 
 def _evaluated(system, t, q):
@@ -129,7 +130,18 @@ def _evaluated(system, t, q):
     u = system.guess.u
     poses, velocities = system.prepared_poses(q), system.all_velocities(u)
     blocks = [g.jacobian(t, poses, velocities) for g in system.joints]
-    return _Evaluation(system.position_residual(t, q), blocks, system.velocity_scale(), _motions_as_one(system, q))
+    scale = system.velocity_scale()
+    norms = _row_norms(system, blocks, scale)
+    return _Evaluation(system.position_residual(t, q), blocks, scale, norms, _motions_as_one(system, q))
+
+
+def _row_norms(system, blocks, scale):
+    """The norm of each row of A, its columns multiplied by a scale."""
+    index = np.minimum(system.layout.velocity_index, system.nu)
+    of_bodies = jnp.append(scale, jnp.zeros((), scale.dtype))[index]
+    own = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.joints]
+    sizes = [jnp.sqrt(jnp.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, own, strict=True)]
+    return jnp.concatenate([size.reshape(-1) for size in sizes])
 
 
 @eqx.filter_jit
