@@ -94,6 +94,18 @@ def test_no_dense_matrix_and_programs_of_one_size():
     assert np.all(np.array(lines[1]) <= 1.5 * np.array(lines[0]))
 
 
+@pytest.mark.long
+def test_a_long_row_of_four_bars_is_assembled():
+    """One crank determines all angles, which makes the last pivot of the elimination as small as 1 / n³."""
+    system = mb.mechanisms.get("n_four_bar", n=150).system
+    assert system.velocity_rank == system.velocity_rows == system.nu - 1
+    state = mb.assemble(system, fix={"upright0.angle": 1.3})
+    angles = np.asarray(state.q).reshape(-1, 3)[:151, 2]
+    np.testing.assert_allclose(angles, 1.3, rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match="not independent"):
+        mb.assemble(system, fix={"upright0.angle": 1.3, "upright70.angle": 1.3})
+
+
 @pytest.mark.parametrize(
     "name, parameters, message",
     [

@@ -18,17 +18,18 @@ from jaxtyping import Int
 _THRESHOLD = 0.1
 # Number of short rows among which the pivot is looked for.
 _SEARCHED = 4
-# Entries below this, in rows of unit norm, are rounding errors of an elimination.
-_ROUNDING = 1e-15
 
 
-def pivot_rows(rows: Sequence[dict[int, float]], level: Sequence[int], zero: float) -> tuple[Int[np.ndarray, "m"], int]:
+def pivot_rows(
+    rows: Sequence[dict[int, float]], level: Sequence[int], *, zero: float, rounding: float
+) -> tuple[Int[np.ndarray, "m"], int]:
     """The rows in the order in which they became pivots, then those that depend on them, and the number of the first.
 
     **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
-    become pivots first; `zero`: size of the entries that are left of a row that depends on others.
+    become pivots first; `zero`: the largest entry that may be left of a row that depends on others; `rounding`: entries
+    below this are dropped.
     """
-    elimination = _Elimination(rows)
+    elimination = _Elimination(rows, rounding)
     kept: list[int] = []
     for own in sorted(set(level)):
         kept += elimination.run([r for r in range(len(rows)) if level[r] == own], zero)
@@ -39,7 +40,8 @@ def pivot_rows(rows: Sequence[dict[int, float]], level: Sequence[int], zero: flo
 class _Elimination:
     """Rows that are left, by column; and for each column those of the rows that have an entry in it."""
 
-    def __init__(self, rows):
+    def __init__(self, rows, rounding):
+        self.rounding = rounding
         self.rows = {r: dict(own) for r, own in enumerate(rows)}
         self.columns: dict[int, set[int]] = {}
         for r, own in self.rows.items():
@@ -108,7 +110,7 @@ class _Elimination:
             ratio = own.pop(column) / value
             for c, entry in pivot.items():
                 new = own.get(c, 0.0) - ratio * entry
-                if abs(new) > _ROUNDING:
+                if abs(new) > self.rounding:
                     own[c] = new
                     self.columns[c].add(r)
                 elif c in own:

@@ -156,4 +156,4 @@ def _sparse_pivot_rows(parts, blocks, layout, own, columns, scale, level):
     sizes = [math.sqrt(sum(x * x for x in entries.values())) for entries in rows]
     floor = max(eps**0.75 * max(sizes, default=0.0), float(np.finfo(scale.dtype).tiny))
     unit = [{c: x / max(size, floor) for c, x in entries.items()} for entries, size in zip(rows, sizes, strict=True)]
-    return pivot_rows(unit, level.tolist(), eps**_ZERO)
+    return pivot_rows(unit, level.tolist(), zero=eps**_ZERO, rounding=4 * eps)
