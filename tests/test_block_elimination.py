@@ -60,7 +60,13 @@ def blocks_of(order, neighbours, b, rng):
     return jnp.asarray(stored), whole.reshape(n * b, n * b)
 
 
-@pytest.mark.parametrize(("name", "b"), [*((name, 2) for name in GRAPHS), ("a grid", 1), ("many edges at random", 3)])
+SOON = {*((name, 2) for name in GRAPHS), ("a grid", 1), ("many edges at random", 3)}
+EVERY = [(name, b) for name in GRAPHS for b in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("name", "b"), [pytest.param(*own, marks=[] if own in SOON else [pytest.mark.long]) for own in EVERY]
+)
 def test_solutions_and_pivots(name, b):
     rng = np.random.default_rng(b)
     order = order_nodes(GRAPHS[name], b)

@@ -154,7 +154,7 @@ def ladder(n=10):
     return mb.Scene(bodies, joints=joints, forces=[spring, mb.Gravity((0.0, 0.0, -9.81))]).compile()
 
 
-def free_ends():
+def hanging_cable():
     """A cable in space."""
     return mb.mechanisms.get("cable", n=12).system
 
@@ -165,7 +165,7 @@ def free_ends():
     [
         (lambda: star(8, 2, ground=True), {"r30.mass": 1.0, "p31.point_a": np.array([0.1, 0.0])}, 0),
         (ladder, {"bar3.mass": 1.0, "spring.stiffness": 20.0}, 30),
-        (free_ends, {"rod3.mass": 0.1, "rod7.inertia": 1e-5 * np.eye(3)}, 0),
+        (hanging_cable, {"rod3.mass": 0.1, "rod7.inertia": 1e-5 * np.eye(3)}, 0),
     ],
     ids=["star", "ladder", "cable"],
 )
@@ -309,8 +309,9 @@ def check_random(seed):
     assert np.max(np.abs(system.velocity_residual(0.0, y.q, y.u))) <= 1e-11
 
 
-def test_a_random_scene():
-    check_random(0)
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+def test_random_scenes(seed):
+    check_random(seed)
 
 
 @pytest.mark.long

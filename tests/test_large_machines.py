@@ -102,6 +102,12 @@ def test_a_long_row_of_four_bars_is_assembled():
     state = mb.assemble(system, fix={"upright0.angle": 1.3})
     angles = np.asarray(state.q).reshape(-1, 3)[:151, 2]
     np.testing.assert_allclose(angles, 1.3, rtol=0, atol=1e-9)
+    # All uprights turn as the first one does.
+    own = jax.jit(lambda angle: mb.assemble(system, fix={"upright0.angle": angle}, throw=False).q[2::3][:151])
+    forward = jax.jit(lambda angle: jax.jvp(own, (angle,), (1.0,)))(1.3)[1]
+    np.testing.assert_allclose(forward, 1.0, rtol=0, atol=1e-8)
+    reverse = jax.jit(jax.grad(lambda angle: np.cos(np.arange(151)) @ own(angle)))(1.3)
+    np.testing.assert_allclose(reverse, np.cos(np.arange(151)) @ forward, rtol=1e-9)
     with pytest.raises(ValueError, match="not independent"):
         mb.assemble(system, fix={"upright0.angle": 1.3, "upright70.angle": 1.3})
 

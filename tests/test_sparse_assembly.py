@@ -96,11 +96,12 @@ def test_the_closest_state_and_its_derivatives(build, names):
     np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-10)
 
 
-def test_rough_guesses():
-    """A tree of 300 rods, every coordinate off by 0.4: a minimum at which every change is along the rods."""
+@pytest.mark.parametrize("size", [0.05, 0.4])
+def test_rough_guesses(size):
+    """A tree of 300 rods, every coordinate off by some tenths: a minimum at which every change is along the rods."""
     system, rng = planar_tree(300), np.random.default_rng(1)
     assert system.elimination is not None
-    rough, along = 0.4 * jnp.asarray(rng.normal(size=(2, system.nq)))
+    rough, along = size * jnp.asarray(rng.normal(size=(2, system.nq)))
     start = mb.State(system.guess.q + rough, system.guess.u)
     at = jax.jit(lambda h: mb.assemble(system, mb.State(start.q + h * along, start.u), throw=False).q)
     q = at(0.0)
