@@ -227,12 +227,22 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         rows = independent * order.product(jnp.where(free, v, 0.0))
         return curved(v) + forces, rows + (1 - independent) * multipliers
 
+    def displacement(rows):
+        return projector.direction(projector.multipliers(rows))
+
+    def constraint_multipliers(forces):
+        return projector.multipliers(projector.jacobian.product(projector.metric.solve(forces)))
+
     def solve(_, b):
         forces, rows = b
-        particular = projector.direction(projector.multipliers(rows))
+        particular = displacement(rows)
         v = particular + _null_space_solution(curved, projector, forces - curved(particular))
-        left = projector.jacobian.product(projector.metric.solve(forces - curved(v)))
-        return jnp.where(free, v, forces), projector.multipliers(left) + (1 - independent) * rows
+        # Both are refined once: the last pivots of long loops are small.
+        v = v + displacement(rows - projector.jacobian.product(v))
+        left = forces - curved(v)
+        multipliers = constraint_multipliers(left)
+        multipliers += constraint_multipliers(left - projector.jacobian.transpose_product(multipliers))
+        return jnp.where(free, v, forces), multipliers + (1 - independent) * rows
 
     right = jnp.where(free, gradient, 0.0), independent * unmet
     return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[0]
