@@ -11,12 +11,14 @@ VectorLike: TypeAlias = ArrayLike | Sequence[Any]
 
 
 class State(eqx.Module):
-    """Configuration and velocity of a system.
+    """Configuration and velocity of a system, and the internal states of its parts.
 
-    **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. What they hold is the system's
-    affair: for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m],
-    Euler parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame).
+    **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. Their meaning depends on the
+    system: for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m],
+    Euler parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame). `z`: internal
+    states of first order, shape `(nz,)`, such as the torque of a motor with lag; None where no part has any.
     """
 
     q: Float[Array, "... nq"]
     u: Float[Array, "... nu"]
+    z: Float[Array, "... nz"] | None = None

@@ -131,7 +131,7 @@ class Scene(eqx.Module):
             implied=(),
             elimination=None,
         )
-        return with_structure(system)
+        return with_structure(system.with_initial_states())
 
 
 def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[str, AbstractFrame], given: Any):

@@ -70,7 +70,7 @@ class Trajectory(eqx.Module):
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
-    `BodyMotion`, and `trajectory["hip"]` that of a joint or frame, a `PartMotion`; of a system in generalized
+    `BodyMotion`, and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in generalized
     coordinates it is that of a coordinate, shape (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
@@ -198,7 +198,7 @@ class Trajectory(eqx.Module):
     @eqx.filter_jit
     @_of_each_member
     def _solved(self):
-        return jax.vmap(lambda t, y: accelerations(self.system, self.formulation, t, y.q, y.u))(self.ts, self.ys)
+        return jax.vmap(lambda t, y: accelerations(self.system.at(y), self.formulation, t, y.q, y.u))(self.ts, self.ys)
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
@@ -259,6 +259,8 @@ class Trajectory(eqx.Module):
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
+        if self.ys.z is not None:
+            out["z"] = np.asarray(self.ys.z)
         free = {name for name, quantity in self.system.quantities().items() if not quantity.of_forces}
         out |= {name: np.asarray(value) for name, value in self._measured(free).items()}
         out["energy"] = np.asarray(self.energy)

@@ -1,5 +1,7 @@
 """Jumps of prescribed rates: the velocities after them, and a search for them."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,7 +33,7 @@ def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
         per_impulse = inertia.solve(jacobian[rows].T)
         residual = system.velocity_residual(t, y.q, u)[rows]
         u = u - per_impulse @ solve_positive(jacobian[rows] @ per_impulse, residual)
-    return State(y.q, u)
+    return dataclasses.replace(y, u=u)
 
 
 def find_jump(

@@ -1,6 +1,7 @@
 """A manifold policy: how the state stays on the constraints while it is integrated."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -70,7 +71,7 @@ class AbstractManifold(eqx.Module):
 def normalize_state(system: AbstractSystem, t: Scalar, y: State) -> State:
     """The state with its coordinates' own invariants satisfied."""
     del t
-    return State(system.normalize(y.q), y.u)
+    return dataclasses.replace(y, q=system.normalize(y.q))
 
 
 def all_rows_formulation(system: AbstractSystem) -> AbstractFormulation:

@@ -6,6 +6,7 @@ of the velocities, by the projector of the Jacobian's structure.
 Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -58,7 +59,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
             rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)
             ahead = jacobian[rows] * square[None, :]
             u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
-    return State(q, u)
+    return dataclasses.replace(y, q=q, u=u)
 
 
 def independent_rows(jacobian: Array, scale: Array, rank: int) -> Any:
@@ -117,7 +118,7 @@ def project_in_metric(
     at = State(q, y.u)
     here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
     u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
-    return State(q, u), here, iterations, failed
+    return dataclasses.replace(y, q=q, u=u), here, iterations, failed
 
 
 def _position_rows(system, t, q):

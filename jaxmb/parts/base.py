@@ -259,6 +259,26 @@ class AbstractPotentialForce(AbstractForce):
         """Potential energy [J]."""
 
 
+class AbstractDynamicForce(AbstractForce):
+    """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
+
+    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches` and `state_rates` find
+    its current value. A `State` holds those of all parts in `z`; by name they are `"motor.torque"`.
+    """
+
+    @abc.abstractmethod
+    def state_rates(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
+    ) -> dict[str, Array]:
+        """The rate of every internal state [its unit/s], by the name of the field."""
+
+    def state_sizes(self) -> dict[str, Any]:
+        """Hook: the typical sizes of internal states by the name of the field, for error control where a state is zero;
+        default one in its unit.
+        """
+        return {}
+
+
 class AbstractNonIdeal(AbstractPart):
     """A non-ideal constraint force: it does virtual work.
 

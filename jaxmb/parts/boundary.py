@@ -9,11 +9,13 @@ import numpy as np
 
 from .base import (
     AbstractConstraint,
+    AbstractDynamicForce,
     AbstractForce,
     AbstractNonIdeal,
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
+from .fields import entry, internal_states
 from .space import AbstractSpace
 
 
@@ -29,6 +31,8 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     poses = np.tile(space.prepare(ground), (bodies, 1))
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
+    if internal_states(part) and not isinstance(part, AbstractDynamicForce):
+        raise ValueError(f"{part.label} has internal states; derive it from AbstractDynamicForce, which has their rates.")
     if isinstance(part, AbstractConstraint):
         check_returns(part.label, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
     elif isinstance(part, AbstractVelocityConstraint):
@@ -42,6 +46,8 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
         check_returns(
             part.label, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t
         )
+        if isinstance(part, AbstractDynamicForce):
+            _check_state_rates(part, space, poses, velocities, t)
         if isinstance(part, AbstractPotentialForce):
             if part.conservative:
                 check_returns(part.label, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
@@ -49,6 +55,19 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
             raise ValueError(
                 f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce."
             )
+
+
+def _check_state_rates(part: AbstractDynamicForce, space: AbstractSpace, *given: Any) -> None:
+    """The same for the rates of internal states, each of which must have a rate of its shape."""
+    states = internal_states(part)
+    rates = lambda *given: part.state_rates(space, *given)
+    found = jax.eval_shape(rates, *given)
+    if not isinstance(found, dict) or set(found) != set(states):
+        names = ", ".join(states) or "none"
+        raise ValueError(f"{part.label}: state_rates must return a dictionary of the internal states, {names}.")
+    for name, keys in states.items():
+        shape = np.shape(entry(part, keys))
+        check_returns(part.label, f"state_rates[{name!r}]", shape, lambda *own, name=name: rates(*own)[name], *given)
 
 
 def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:

@@ -87,6 +87,8 @@ def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarr
         shape = tuple(dimension if size == "d" else size for size in declared.shape)
         if value.shape != shape:
             raise ValueError(f"{label}: {shown} must have shape {shape}, got {value.shape}.")
+    if declared.kind == "internal":
+        return  # In a compiled scene its values are in the state.
     if not np.isfinite(value).all():
         raise ValueError(f"{label}: {shown} must be finite, got {value.tolist()}.")
     sign = declared.sign

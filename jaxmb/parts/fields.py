@@ -46,8 +46,8 @@ class Declaration:
 
     - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
         several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
-        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess,
-        which is not a parameter.
+        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
+        `"internal"` for an internal state; these two are not parameters.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
@@ -77,7 +77,7 @@ class Declaration:
 
     @property
     def is_number(self) -> bool:
-        return self.kind in ("number", "state")
+        return self.kind in ("number", "state", "internal")
 
 
 @functools.cache
@@ -275,6 +275,15 @@ def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
     return _field(Declaration("state", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
 
 
+def internal_state(*, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0) -> Any:
+    """An internal state, a number that changes by an equation of first order; see `AbstractDynamicForce`.
+
+    The kernels of the part see the current value in this field; the value that is given here is that of the initial
+    guess. It is not a parameter.
+    """
+    return _field(Declaration("internal", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
+
+
 def numbers() -> Any:
     """Parameters of a user function by name, `"part.key"`."""
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
@@ -340,6 +349,15 @@ def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple
             yield from inner_parts(inner, keys)
 
 
+def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
+    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by the field's name."""
+    found = {}
+    for prefix, own in (((), part), *inner_parts(part)):
+        states = [name for name, declared in declarations(type(own)).items() if declared.kind == "internal"]
+        found |= {name: (*prefix, name) for name in states}
+    return found
+
+
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
     """For every parameter of a part, without those of other parts that it holds: its path of keys, the same path
     without the names of dictionaries, as in the parameter's name, and its declaration, which for an entry of a
@@ -348,7 +366,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declara
     declared = declarations(type(part))
     for field in field_names(type(part)):
         own = declared.get(field, _ANY_NUMBER)
-        if own.kind not in ("state", "part", "parts"):
+        if own.kind not in ("state", "internal", "part", "parts"):
             yield from _paths(getattr(part, field), (field,), (field,), own)
 
 

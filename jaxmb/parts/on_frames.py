@@ -8,6 +8,7 @@ from ..linalg.arrays import namespace
 from . import fields
 from .base import (
     AbstractConstraint,
+    AbstractDynamicForce,
     AbstractForce,
     AbstractLink,
     AbstractPart,
@@ -37,6 +38,8 @@ def _on(part: AbstractLink, frames: dict[str, AbstractFrame]) -> AbstractLink:
         return ConstraintOnFrames(part=part, frames=frames)
     if isinstance(part, AbstractVelocityConstraint):
         return VelocityConstraintOnFrames(part=part, frames=frames)
+    if isinstance(part, AbstractDynamicForce):
+        return DynamicForceOnFrames(part=part, frames=frames)
     if isinstance(part, AbstractForce):
         return ForceOnFrames(part=part, frames=frames)
     raise ValueError(f"{part.label} has friction of its own parts and cannot be on frames; name its bodies.")
@@ -128,17 +131,31 @@ class VelocityConstraintOnFrames(AbstractOnFrames, AbstractVelocityConstraint):
         return self.part.residual(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
 
 
-class ForceOnFrames(AbstractOnFrames, AbstractPotentialForce):
+class AbstractForceOnFrames(AbstractOnFrames, AbstractForce):
     """A force law on frames."""
-
-    @property
-    def conservative(self):
-        return self.part.conservative
 
     def wrenches(self, space, poses, velocities, t):
         own = self.part.wrenches(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
         to_body = lambda k, x, w: self.frames[str(k)].wrench(space, x, w) if str(k) in self.frames else w
         return jnp.stack([to_body(k, x, w) for k, (x, w) in enumerate(zip(poses, own, strict=True))])
+
+
+class DynamicForceOnFrames(AbstractForceOnFrames, AbstractDynamicForce):
+    """A force law with internal states on frames."""
+
+    def state_rates(self, space, poses, velocities, t):
+        return self.part.state_rates(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
+
+    def state_sizes(self):
+        return self.part.state_sizes()
+
+
+class ForceOnFrames(AbstractForceOnFrames, AbstractPotentialForce):
+    """A force law on frames without internal states."""
+
+    @property
+    def conservative(self):
+        return self.part.conservative
 
     def energy(self, space, poses, t):
         return self.part.energy(space, self._poses(space, poses), t)

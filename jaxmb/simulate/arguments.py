@@ -71,7 +71,8 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     dtype = state.q.dtype
     least = 10 * float(jnp.finfo(dtype).eps)
     relative = real_array("rtol", rtol, dtype)
-    absolute = None if atol is None else real_array("atol", atol, dtype, ((), (state.q.size + state.u.size,)))
+    size = sum(x.size for x in jax.tree.leaves(state))
+    absolute = None if atol is None else real_array("atol", atol, dtype, ((), (size,)))
     for name, value in (("rtol", relative), ("atol", absolute)):
         if value is not None and not is_traced(value) and (np.any(value < 0) or np.any(value >= 1)):
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
@@ -133,15 +134,20 @@ def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
 
 
 def checked_state(system: AbstractSystem, state: Any) -> State:
-    cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u)"
-    # A concrete class: a state is nothing but its two fields.
+    cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u) or, with internal states, State(q, u, z)"
+    # A concrete class: a state is nothing but its fields.
     check_kind("state", state, State, "a jaxmb.State", cure)
-    for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu)):
+    if (state.z is None) != (system.nz == 0):
+        has = f"has {system.nz} internal states" if system.nz else "has no internal states"
+        raise ValueError(f"The system {has} and the state {'none' if state.z is None else 'some, in z'}; {cure}.")
+    of_states = [] if state.z is None else [("z", state.z, system.nz)]
+    for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu), *of_states):
         if np.result_type(getattr(value, "dtype", type(value))).kind not in "fiub":
             raise ValueError(f"state.{name} must be an array of real numbers, got {value!r}; {cure}.")
         if np.shape(value) != (size,):
             raise ValueError(
-                f"The state must have {system.nq} coordinates and {system.nu} velocities, got state.{name} of shape "
+                f"The state must have {system.nq} coordinates and {system.nu} velocities"
+                f"{f' and {system.nz} internal states' if system.nz else ''}, got state.{name} of shape "
                 f"{np.shape(value)}."
             )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)

@@ -3,6 +3,7 @@
 import warnings
 from typing import Any
 
+import jax
 import numpy as np
 
 from .._results import RESULTS
@@ -41,10 +42,11 @@ def warn_of_jumps(system, q, t0, t1) -> None:
 def reason_of_failure(system, result, t1, t, y) -> str:
     """Why a simulation ended at a state, in one line, with what is not finite there or just beyond."""
     text = RESULTS[result]
-    if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate([y.q, y.u]))):
+    if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate(jax.tree.leaves(y)))):
         return text
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, t, y)
+    system = system.at(y)
     rates = system.rates(t, y.q, y.u)
     for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
         wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)

@@ -15,7 +15,7 @@ from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
-from ..manifold import AbstractManifold, default_manifold
+from ..manifold import AbstractManifold, default_manifold, with_internal_states
 from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from ..solvers._one_step import OneStepController
 from ..states.consistency import consistent
@@ -83,7 +83,7 @@ def simulate(
         asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
         largest coordinate (in units of the machine's size, or radians) and the largest velocity so far, so that the
         units do not matter and slow or small motions are as accurate as others. A number is in SI units; it may be a
-        vector of one for each coordinate and velocity, (nq + nu,): where stiff springs vibrate too little to matter in
+        vector of one for each coordinate, velocity and internal state, (nq + nu + nz,): where stiff springs vibrate too little to matter in
         positions, a coarser one for velocities saves most of the steps of `Hermite`.
 
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
@@ -166,7 +166,7 @@ def simulate(
         adaptive: Any = stepsize_controller
         stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=restarts)
     if adjoint is None:
-        size = 16 * state.q.dtype.itemsize * (system.nq + system.nu)
+        size = 16 * state.q.dtype.itemsize * (system.nq + system.nu + system.nz)
         kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
     saved = checked_saveat(saveat, options["t0"], options["t1"])
@@ -184,6 +184,10 @@ def simulate(
     changes = {} if direction is None else parameter_changes(system, direction)
     valid = system.parameters_in_range()
 
+    def prepare(system, solver, policy, method):
+        term, prepared = policy.prepare(system, method, solver, relative)
+        return with_internal_states(term), prepared
+
     def motion(solver):
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
         jumping = restarts is not None and system.velocity_rows > 0
@@ -194,12 +198,12 @@ def simulate(
                 f"{system.positive_definite_mass}."
             )
         method = policy.default_formulation(system) if formulation is None else formulation
-        term, prepared = policy.prepare(system, method, solver, relative)
+        term, prepared = prepare(system, solver, policy, method)
         start = consistent(system, options["t0"], state) if policy.restores else state
         along = None
         if direction is not None:
             moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in changes.items()})
-            changed = lambda step: policy.prepare(moved(step), method, solver, relative)[0]
+            changed = lambda step: prepare(moved(step), solver, policy, method)[0]
             along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
         own = options | {"y0": start}
         try:

@@ -22,6 +22,8 @@ from .outcome import has_failed
 def integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid):
     start, first = options["y0"], options["saveat"].subs[0]
     finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
+    if start.z is not None:
+        finite = finite & jnp.all(jnp.isfinite(start.z))
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
     options = options | {"t1": at_once(options["t1"])}
@@ -116,16 +118,26 @@ def _tangent_control(system, options, direction) -> TangentControl:
     state, span = options["y0"], jnp.abs(options["t1"] - options["t0"])
     coordinates, velocities = system.coordinate_scale(), system.velocity_scale()
     rate = jnp.maximum(jnp.max(jnp.abs(state.u) / velocities, initial=0.0), 1 / jnp.where(span > 0, span, 1.0))
-    units = jnp.concatenate([coordinates, velocities * rate]).astype(state.q.dtype)
-    blocks = (0, system.nq), (system.nq, system.nq + system.nu)
+    units = [coordinates, velocities * rate, *([system.state_scale()] if system.nz else [])]
+    units = jnp.concatenate(units).astype(state.q.dtype)
+    blocks = tuple(zip((0, *_group_ends(system)[:-1]), _group_ends(system), strict=True))
     return lax.stop_gradient(TangentControl(units, blocks, direction))
 
 
 def running_scales(system, state, options) -> RunningScales:
-    """Natural units of coordinates and velocities; where nothing moves yet, one unit in the whole time."""
-    units = jnp.concatenate([system.coordinate_scale(), system.velocity_scale()]).astype(state.q.dtype)
+    """Natural units of coordinates, velocities and internal states; where nothing moves yet, one unit in the whole
+    time.
+    """
+    units = [system.coordinate_scale(), system.velocity_scale(), *([system.state_scale()] if system.nz else [])]
+    units = jnp.concatenate(units).astype(state.q.dtype)
     span = jnp.abs(options["t1"] - options["t0"])
-    return lax.stop_gradient(RunningScales(units, system.nq, 1 / jnp.where(span > 0, span, 1.0)))
+    return lax.stop_gradient(RunningScales(units, _group_ends(system), 1 / jnp.where(span > 0, span, 1.0)))
+
+
+def _group_ends(system) -> tuple[int, ...]:
+    """Where groups of components that have one size end: coordinates, velocities, and each kind of internal state."""
+    first = system.nq + system.nu
+    return (system.nq, first, *(first + end for end in system.state_ends))
 
 
 def _corrected(system, ts, saved, correction):

@@ -63,7 +63,7 @@ class AdamsState(eqx.Module):
     step_counts: Int[Array, " length"]
     chart: Chart | None
     stiffness: Stiffness | None
-    sizes: Float[Array, "2"] | None
+    sizes: Float[Array, " groups"] | None
     tangents: tuple[Tangent, ...] | None
 
 

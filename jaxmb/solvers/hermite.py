@@ -59,7 +59,7 @@ class HermiteState(eqx.Module):
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
-    sizes: Float[Array, "2"] | None
+    sizes: Float[Array, " groups"] | None
     tangents: tuple[Tangent, ...] | None
 
 

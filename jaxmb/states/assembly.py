@@ -19,7 +19,7 @@ from ..system import AbstractSystem
 from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
-from .held_coordinates import holding, split_names
+from .held_coordinates import holding, internal_states, split_names
 
 
 def assemble(
@@ -38,7 +38,8 @@ def assemble(
     - `system`: a compiled scene, or another system.
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
-        of a joint's own.
+        of a joint's own; and values of internal states, `{"motor.torque": 2.0}`. Other internal states are those of the
+        guess.
     - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`, also of a joint's own coordinates; in
         space `"body.angular_velocity"` (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of
         coordinates, or `u0`, `u1`, ….
@@ -55,6 +56,7 @@ def assemble(
     check_system("assemble", system)
     guess = checked_guess("assemble", system, guess)
     t = checked_time("assemble", t, guess.q.dtype)
+    z, fix = internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     rates, rates_of_joints = split_names("rate", system, system.rate_names(), rates)
     u, fixed_rates = prescribe("rate", system.rate_names(), rates, guess.u)
@@ -73,13 +75,13 @@ def assemble(
     if throw and not is_traced((ok, ok_rates)):
         if not ok_rates:
             raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
-        return State(q, u)
+        return State(q, u, z)
     ok = ok & ok_rates
     if throw:
         q = eqx.error_if(
             q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are violated."
         )
-    state = State(q, u)
+    state = State(q, u, z)
     return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
 
 

@@ -1,5 +1,6 @@
 """Whether a state satisfies the constraints of its system, before a motion starts from it."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -58,7 +59,7 @@ def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
 
 @eqx.filter_jit
 def _violated(system, t, y) -> Any:
-    y = State(system.normalize(y.q), y.u)
+    y = dataclasses.replace(y, q=system.normalize(y.q))
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
     return jax.tree.map(lambda of_rows: of_rows > tol, violations(system, t, y, row_sizes(system, t, y)))
 

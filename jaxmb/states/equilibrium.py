@@ -25,7 +25,7 @@ from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
 from .closest import tolerance
-from .held_coordinates import holding, split_names
+from .held_coordinates import holding, internal_states, split_names
 
 _ITERATIONS = 200
 
@@ -55,14 +55,15 @@ def equilibrium(
     - `system`: a compiled scene, or another system; its forces must be able to balance at zero velocity.
     - `guess`: where to start, default the poses given with the bodies; assembled first.
     - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription may exert a force.
+        Internal states have the values that it gives, or those of the guess, and must rest at them.
     - `t`: the time, for forces and drivers that depend on it [s].
     - `throw`: whether a failed search is an error. With `False` the state is NaN instead, so that one member of a
         batch does not spoil the others.
 
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
-    **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, or
-    if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a run-time error without
+    **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
+    internal states change, or if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a run-time error without
     the names.
     """
     check_system("equilibrium", system)
@@ -72,8 +73,9 @@ def equilibrium(
         )
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)
+    z, fix = internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
-    system = holding(system, of_joints, {}, time)
+    system = holding(system if z is None else system.with_states(z), of_joints, {}, time)
     start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
@@ -86,14 +88,17 @@ def equilibrium(
     q, unbalanced, ok = _balanced(system, time, start, held)
     if concrete and throw and not bool(ok):
         raise ValueError(_not_found(system, unbalanced))
+    steady = True if z is None else _steady(system, time, q, u)
+    if concrete and throw and not np.all(steady):
+        raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
     if throw and concrete:
-        return State(q, u)
-    ok = ok & still & assembled
+        return State(q, u, z)
+    ok = ok & still & assembled & jnp.all(jnp.asarray(steady))
     if throw:
         q = eqx.error_if(
             q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see the unbalanced coordinates."
         )
-    return State(q if throw else not_a_number_where(jnp.logical_not(ok), q, (system, guess, fix, time)), u)
+    return State(q if throw else not_a_number_where(jnp.logical_not(ok), q, (system, guess, fix, time)), u, z)
 
 
 @eqx.filter_jit
@@ -101,6 +106,22 @@ def _still(system, t, q, u):
     """Whether all prescribed motions are at rest."""
     speeds = jnp.concatenate([system.velocity_residual(t, q, u), system.rates(t, q, u)])
     return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(q.dtype)
+
+
+@eqx.filter_jit
+def _steady(system, t, q, u):
+    """Which internal states do not change."""
+    return jnp.abs(system.state_rates(t, q, u)) <= tolerance(q.dtype) ** 0.5 * system.state_scale()
+
+
+def _changing(system, t, q, u, steady):
+    rates = np.asarray(system.state_rates(t, q, u))
+    names = {name: rates[index] for name, index in system.state_names().items() if not np.all(steady[index])}
+    listed = ", ".join(f"{name} ({np.max(np.abs(rate)):.3g} per second)" for name, rate in names.items())
+    return (
+        f"In the equilibrium internal states change: {listed}. They are those of the guess; give values at which they "
+        "rest with fix, such as a motor's torque after its lag."
+    )
 
 
 class _Balance(eqx.Module):

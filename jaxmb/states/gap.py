@@ -15,7 +15,7 @@ from ..system import AbstractSystem
 from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, split_names
+from .held_coordinates import holding, internal_states, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200
@@ -55,6 +55,7 @@ def assembly_gap(
     check_system("assembly_gap", system)
     guess = checked_guess("assembly_gap", system, guess)
     t = checked_time("assembly_gap", t, guess.q.dtype)
+    _, fix = internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     system = holding(system, of_joints, {}, t)
     q, fixed = prescribe("coordinate", system.coordinate_names(), fix, guess.q)

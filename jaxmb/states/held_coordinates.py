@@ -4,11 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._types import Scalar, VectorLike
+from ..linalg.arrays import is_traced
 from ..parts.names import unknown
 from ..system import AbstractSystem
 from ..system.arguments import real_array
+from ..system.coordinates import prescribe
 
 
 def split_names(
@@ -25,11 +29,28 @@ def split_names(
     for name, value in values.items():
         if name not in own:
             if name not in known:
-                raise unknown(what, name, (*own, *known))
+                raise unknown(what, name, (*own, *known, *system.state_names()))
             of_joints[name] = jnp.asarray(
                 real_array(f"{what.capitalize()} {name!r}", value, dtype, (known[name].shape,))
             )
     return {name: value for name, value in values.items() if name in own}, of_joints
+
+
+def internal_states(
+    system: AbstractSystem, z: Float[Array, "nz"] | None, values: Mapping[str, VectorLike] | None
+) -> tuple[Float[Array, "nz"] | None, Mapping[str, VectorLike] | None]:
+    """Internal states with some of them prescribed by name, and the prescribed values of all else.
+
+    **Raises:** `ValueError` for values of the wrong shape and for those that are not finite.
+    """
+    names = system.state_names()
+    if z is None or not isinstance(values, Mapping):
+        return z, values
+    own = {name: value for name, value in values.items() if name in names}
+    z, _ = prescribe("internal state", names, own, z)
+    if not is_traced(z) and not np.all(np.isfinite(z)):
+        raise ValueError(f"The guess or the fixed internal states are not finite: {np.asarray(z)}.")
+    return z, {name: value for name, value in values.items() if name not in own}
 
 
 def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:

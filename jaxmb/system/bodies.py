@@ -2,12 +2,13 @@
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
@@ -33,6 +34,16 @@ from .groups import (
     VelocityConstraintGroup,
 )
 from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
+from .internal_states import (
+    StateField,
+    initial_states,
+    state_fields,
+    state_names,
+    state_quantities,
+    state_rates,
+    state_scale,
+    with_states,
+)
 from .layout import Layout
 from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
@@ -148,6 +159,43 @@ class AbstractBodySystem(AbstractSystem):
     def rate_names(self):
         return rate_names(self.layout, self.body_names)
 
+    # Internal states
+
+    @property
+    def _state_fields(self) -> tuple[StateField, ...]:
+        return state_fields(self.forces)
+
+    @property
+    def state_ends(self) -> tuple[int, ...]:
+        return tuple(own.stop for own in self._state_fields)
+
+    def state_names(self):
+        return state_names(self._state_fields)
+
+    def with_states(self, z):
+        return dataclasses.replace(self, forces=with_states(self.forces, self._state_fields, z))
+
+    def state_rates(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return state_rates(self.forces, self._state_fields, t, poses, velocities)
+
+    def state_scale(self):
+        return lax.stop_gradient(state_scale(self.forces, self._state_fields, self.length.dtype))
+
+    def with_initial_states(self) -> Self:
+        """The system with the internal states that its parts were given in its guess, and none in its parts."""
+        fields = self._state_fields
+        if not fields:
+            return self
+        z = jax.device_put(initial_states(self.forces, fields))
+        return dataclasses.replace(
+            self,
+            guess=dataclasses.replace(self.guess, z=z),
+            forces=jax.device_put(with_states(self.forces, fields, None)),
+        )
+
+    # Parameters and names
+
     def parameter_paths(self):
         return parameter_paths(self._gravity_name, self._groups, self.servos)
 
@@ -215,7 +263,7 @@ class AbstractBodySystem(AbstractSystem):
         return body_motion(self.layout, self.body_names.index(name), ys)
 
     def quantities(self):
-        out = body_quantities(self.layout, self.body_names)
+        out = body_quantities(self.layout, self.body_names) | state_quantities(self._state_fields)
         d = self.layout.space.dimension
         for name in self.joint_names():
             for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
@@ -260,7 +308,8 @@ class AbstractBodySystem(AbstractSystem):
     @eqx.filter_jit
     def applied_wrenches(self, name, ts, ys):
         def single(t, y):
-            return applied_wrenches(self.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
+            own = self.at(y)
+            return applied_wrenches(own.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
 
         return jax.vmap(single)(ts, ys)
 

@@ -77,6 +77,8 @@ def describe_scene(
     if normalizations:
         with_them = f"{system.nq}, with {normalizations} normalisations; rank of all {system.coordinate_rows} rows"
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
+    if system.nz:
+        facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
     kind = lambda g: g.group.part.kind
     tables = {
         "bodies": [(kind, shorten(names), "") for kind, names in bodies.items() if names],

@@ -53,7 +53,8 @@ class AbstractSystem(eqx.Module):
 
     Ranks are found once, on concrete numbers, and are static, so that index sets have static shapes.
 
-    - `nq`, `nu`: numbers of coordinates and of velocities.
+    - `nq`, `nu`: numbers of coordinates and of velocities; `state_ends`: for each kind of internal state, in the order
+        of z, the index after the last one of this kind.
     - `position_rows`, `position_rank`: rows of Φ and the number of independent ones.
     - `coordinate_rank`: the same with the coordinates' own invariants.
     - `velocity_rows`, `velocity_rank`: rows of ψ and the number of independent ones.
@@ -73,6 +74,7 @@ class AbstractSystem(eqx.Module):
 
     nq: AbstractVar[int]
     nu: AbstractVar[int]
+    state_ends: AbstractVar[tuple[int, ...]]
     position_rows: AbstractVar[int]
     coordinate_rows: AbstractVar[int]
     velocity_rows: AbstractVar[int]
@@ -98,6 +100,25 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def rate_names(self) -> dict[str, list[int]]:
         """Indices in u by name; one name may denote several rates."""
+
+    # Internal states z, for which ż = h(t, q, u, z). Forces depend on them, constraints do not, so the equations above
+    # hold as they are for a system that has its states.
+
+    @abc.abstractmethod
+    def state_names(self) -> dict[str, list[int]]:
+        """Indices in z by name; one name may denote several internal states."""
+
+    @abc.abstractmethod
+    def with_states(self, z: Float[Array, "nz"]) -> Self:
+        """The same system with values of its internal states, which its forces and `state_rates` need."""
+
+    @abc.abstractmethod
+    def state_rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nz"]:
+        """ż, of a system that has its internal states."""
+
+    @abc.abstractmethod
+    def state_scale(self) -> Float[Array, "nz"]:
+        """Typical size of each internal state; without derivative."""
 
     @abc.abstractmethod
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
@@ -290,6 +311,15 @@ class AbstractSystem(eqx.Module):
         """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
         space.
         """
+
+    def at(self, y: State) -> Self:
+        """The same system with the internal states of a state, if there are any."""
+        return self if y.z is None else self.with_states(y.z)
+
+    @property
+    def nz(self) -> int:
+        """The number of internal states."""
+        return self.state_ends[-1] if self.state_ends else 0
 
     @property
     def position_rank(self) -> int:

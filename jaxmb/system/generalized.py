@@ -23,6 +23,25 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def has_bodies(self) -> bool:
         return False
 
+    # There are no parts that could have internal states.
+
+    @property
+    def state_ends(self) -> tuple[int, ...]:
+        return ()
+
+    def state_names(self):
+        return {}
+
+    def with_states(self, z):
+        del z
+        return self
+
+    def state_rates(self, t, q, u):
+        return jnp.zeros(0, q.dtype)
+
+    def state_scale(self):
+        return jnp.zeros(0)
+
     def held_velocities(self, held):
         return held if self.rates_are_velocities else None
 

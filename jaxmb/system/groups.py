@@ -282,6 +282,13 @@ class ForceGroup(eqx.Module):
         single = lambda at, poses, v: at(t).wrenches(self.group.layout.space, poses, v, t)
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
+    def state_rates(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> dict[str, Float[Array, "parts *shape"]]:
+        """Rates of the parts' internal states, by the name of the field."""
+        single = lambda at, poses, v: at(t).state_rates(self.group.layout.space, poses, v, t)
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
