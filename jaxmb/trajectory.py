@@ -69,9 +69,9 @@ class Trajectory(eqx.Module):
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
-    … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a
-    `BodyMotion`, and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in generalized
-    coordinates it is that of a coordinate, shape (times,).
+    … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a `BodyMotion`,
+    and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in
+    generalized coordinates it is that of a coordinate, shape (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
     that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.

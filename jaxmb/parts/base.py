@@ -267,9 +267,7 @@ class AbstractDynamicForce(AbstractForce):
     """
 
     @abc.abstractmethod
-    def state_rates(
-        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
-    ) -> dict[str, Array]:
+    def state_rates(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> dict[str, Array]:
         """The rate of every internal state [its unit/s], by the name of the field."""
 
     def state_sizes(self) -> dict[str, Any]:

@@ -32,7 +32,9 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
     of_bodies = velocities.shape
     if internal_states(part) and not isinstance(part, AbstractDynamicForce):
-        raise ValueError(f"{part.label} has internal states; derive it from AbstractDynamicForce, which has their rates.")
+        raise ValueError(
+            f"{part.label} has internal states; derive it from AbstractDynamicForce, which has their rates."
+        )
     if isinstance(part, AbstractConstraint):
         check_returns(part.label, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
     elif isinstance(part, AbstractVelocityConstraint):

@@ -146,14 +146,18 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
             scales.append(control.scale(self.tolerances.rtol, tangent, end.after))
         return tuple(out), scales
 
-    def _first_sizes(self, flat: Float[Array, " n"], f: Float[Array, " n"], before: Any) -> Float[Array, " groups"] | None:
+    def _first_sizes(
+        self, flat: Float[Array, " n"], f: Float[Array, " n"], before: Any
+    ) -> Float[Array, " groups"] | None:
         """The sizes that the absolute tolerance is relative to, at a start."""
         scales = self.tolerances.scales
         if scales is None:
             return None
         return scales.start(flat, f) if before is None else before.sizes
 
-    def _grown(self, sizes: Float[Array, " groups"] | None, after: Float[Array, " n"]) -> Float[Array, " groups"] | None:
+    def _grown(
+        self, sizes: Float[Array, " groups"] | None, after: Float[Array, " n"]
+    ) -> Float[Array, " groups"] | None:
         """The same after a step."""
         scales = self.tolerances.scales
         return None if scales is None or sizes is None else scales.grown(sizes, after)

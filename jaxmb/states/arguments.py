@@ -17,6 +17,13 @@ def check_system(function: str, system: Any) -> None:
     check_kind(f"{function}: system", system, AbstractSystem, "a compiled scene or another system", cure)
 
 
+def check_no_states(function: str, system: AbstractSystem) -> None:
+    """Raise a `ValueError` for a system with internal states, where they are not supported."""
+    if system.nz:
+        names = ", ".join(system.state_names())
+        raise ValueError(f"{function} does not support internal states; the system has {names}.")
+
+
 def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
     """The guess as arrays, or the system's own where none is given."""
     if guess is None:

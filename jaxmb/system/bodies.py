@@ -33,7 +33,6 @@ from .groups import (
     ServoGroup,
     VelocityConstraintGroup,
 )
-from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
 from .internal_states import (
     StateField,
     initial_states,
@@ -44,6 +43,7 @@ from .internal_states import (
     state_scale,
     with_states,
 )
+from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
 from .layout import Layout
 from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters

@@ -117,4 +117,3 @@ def state_quantities(fields: Sequence[StateField]) -> dict[str, Quantity]:
         value = lambda ts, ys, _, index=tuple(index), shape=shape: ys.z[:, np.array(index)].reshape(-1, *shape)
         out[name] = Quantity(shape, value)
     return out
-

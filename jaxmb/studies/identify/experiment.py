@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -158,7 +159,7 @@ class Trial(eqx.Module):
         ok = (trajectory.result == RESULTS.successful) & jnp.isfinite(joined.objective)
         fails = lambda x: jnp.where(ok, x, jnp.inf)
         joined = Rows(fails(joined.residuals), joined.present, fails(joined.scores), fails(joined.objective))
-        end = State(trajectory.ys.q[-1], trajectory.ys.u[-1])
+        end = jax.tree.map(lambda y: y[-1], trajectory.ys)
         return Seen(joined, readings, end, trajectory.result)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
+from ...states.arguments import check_no_states
 from ...system import AbstractSystem
 from ...trajectory import Trajectory
 from ..minimise import Minimum, descend, minimise_together
@@ -115,6 +116,7 @@ def identify(
     if segments != 1:
         if method != "lm" or len(points) > 1:
             raise ValueError("Multiple shooting, segments > 1, has one start and method='lm'.")
+        check_no_states("identify with segments", system)
         shot = shoot(problem, points[0], segments, tol, limit)
         return identification(
             problem,

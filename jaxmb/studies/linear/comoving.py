@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from ..._types import State
@@ -29,7 +30,9 @@ _TERMS = 20
 
 
 class AbstractCarrier(eqx.Module):
-    """The field S of a displacement: an affine function of coordinates and velocities."""
+    """The field S of a displacement: an affine function of coordinates and velocities. It leaves internal states as they
+    are.
+    """
 
     @abc.abstractmethod
     def field(self, state: State) -> State:
@@ -67,7 +70,12 @@ class AbstractCarrier(eqx.Module):
         first = time * jnp.concatenate([rate, constant[:, None]], axis=1)
         orders = jnp.arange(2, _TERMS, dtype=unit.dtype)
         (moved, _), _ = lax.scan(add, (start + first, first), orders)
-        return Displacement(rate, constant, moved[:, :n], moved[:, n])
+        turn, shift = moved[:, :n], moved[:, n]
+        if like.z is not None:
+            none, same = jnp.zeros((like.z.size,) * 2, unit.dtype), jnp.eye(like.z.size, dtype=unit.dtype)
+            rate, turn = block_diag(rate, none), block_diag(turn, same)
+            constant, shift = (jnp.pad(x, (0, like.z.size)) for x in (constant, shift))
+        return Displacement(rate, constant, turn, shift)
 
 
 class Displacement(NamedTuple):

@@ -16,7 +16,7 @@ from ...linalg.eigen import eigen
 from ...linalg.failure import not_a_number_where
 from ...parts.names import unknown
 from ...simulate import simulate
-from ...states.arguments import check_system, checked_guess, checked_time
+from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem
 from ...system.arguments import real_array
@@ -100,6 +100,7 @@ def floquet(
     result is NaN instead.
     """
     check_system("floquet", system)
+    check_no_states("floquet", system)
     state = checked_guess("floquet", system, state)
     t = jnp.asarray(checked_time("floquet", t, state.q.dtype))
     length: Any = real_array("floquet: period", period, state.q.dtype)

@@ -9,6 +9,7 @@ About a steady motion perturbations are seen from a frame that is carried along 
 constant. That they are is found out by comparing them with those a little later.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from ..._types import Scalar, State
 from ...formulations import Partitioned, accelerations
 from ...system import AbstractSystem, Solved, parameters, with_parameters
 from .comoving import carriers
-from .perturbations import Perturbations, StateNames, perturbations
+from .perturbations import Perturbations, StateNames, joined, parted, perturbations
 from .quantities import measured
 
 # Accelerations that remain may be this fraction of those that the applied forces alone would cause, and this fraction
@@ -32,13 +33,15 @@ _SAME = 1e-6
 
 
 def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
-    """q̇ and u̇ of a state, and the multipliers.
+    """q̇, u̇ and ż of a state, and the multipliers.
 
     In independent accelerations: with multipliers, derivatives along the motion of light and heavy bodies together lose
     as many digits as their masses differ by.
     """
+    system = system.at(state)
     udot, multipliers = accelerations(system, Partitioned(), t, state.q, state.u)
-    return State(system.rates(t, state.q, state.u), udot), multipliers
+    zdot = system.state_rates(t, state.q, state.u) if system.nz else None
+    return State(system.rates(t, state.q, state.u), udot, zdot), multipliers
 
 
 class LinearEquations(NamedTuple):
@@ -90,7 +93,7 @@ def linear_equations(
 
     # The state itself, and where each displacement carries it, with the same perturbations.
     moves = jax.vmap(lambda carrier: carrier.displacement(state, later))(carriers(system, state, field, system.length))
-    at = jnp.concatenate([state.q, state.u])
+    at = joined(state)
     points = jnp.concatenate([at[None], jax.vmap(lambda move: move.turn @ at + move.shift)(moves)])
     bases = jnp.concatenate([own.basis[None], jax.vmap(lambda move: move.turn @ own.basis)(moves)])
     times = jnp.concatenate([t[None], jnp.broadcast_to(t + later, (len(points) - 1,))])
@@ -99,13 +102,13 @@ def linear_equations(
     here = jax.tree.map(lambda x: x[0], found)
 
     # What is left in the frame of each displacement, in units of the states' sizes and the fastest rate.
-    sizes = jnp.concatenate([system.coordinate_scale(), system.velocity_scale()])
-    kq = own.coordinates
+    scales = State(system.coordinate_scale(), system.velocity_scale(), system.state_scale() if system.nz else None)
+    sizes, kq, last = joined(scales), own.coordinates, own.basis.shape[1] - system.nz
     widths = jnp.max(jnp.abs(own.basis) / sizes[:, None], axis=0)
-    entries = jnp.abs(here.by_states[system.nq :]) / (system.velocity_scale()[:, None] * widths[None, :])
-    omega = rate + jnp.max(entries[:, kq:], initial=0.0) + jnp.sqrt(jnp.max(entries[:, :kq], initial=0.0))
+    entries = jnp.abs(parted(system, here.by_states).u) / (scales.u[:, None] * widths[None, :])
+    omega = rate + jnp.max(entries[:, kq:last], initial=0.0) + jnp.sqrt(jnp.max(entries[:, :kq], initial=0.0))
     omega = jnp.where(omega > 0, omega, 1.0)
-    units = jnp.concatenate([system.coordinate_scale(), omega * system.velocity_scale()])
+    units = joined(dataclasses.replace(scales, u=omega * scales.u))
     widths = jnp.max(jnp.abs(own.basis) / units[:, None], axis=0)
     single = jnp.finfo(at.dtype).eps > 1e-10
     unbalanced, rounding, same = (3e-4, 1e-5, 1e-3) if single else (_UNBALANCED, _ROUNDING, _SAME)
@@ -150,7 +153,7 @@ def linear_equations(
 
 def _local(system, t, x, basis, inputs, outputs):
     """Values and derivatives at a state, by one forward derivative."""
-    nq, k = system.nq, basis.shape[1]
+    k = basis.shape[1]
     names = tuple(dict.fromkeys(name for name, _ in inputs))
     known = parameters(system) if names else {}
 
@@ -160,10 +163,9 @@ def _local(system, t, x, basis, inputs, outputs):
             value = values[name]
             values[name] = jnp.ravel(value).at[place].add(change.astype(value.dtype)).reshape(value.shape)
         changed = with_parameters(system, values) if names else system
-        there = x + basis @ changes[:k]
-        state = State(there[:nq], there[nq:])
+        state = parted(system, x + basis @ changes[:k])
         field, multipliers = vector_field(changed, t, state)
-        rates = jnp.concatenate([field.q, field.u])
+        rates = joined(field)
         seen = measured(changed, outputs, t, state, Solved(field.u, multipliers))
         rows = jnp.zeros(0, x.dtype)
         if names:
@@ -192,5 +194,5 @@ def _applied(system, t, state):
     """The largest acceleration that applied forces would cause without constraints, in the same units."""
     if not system.positive_definite_mass:
         return jnp.zeros((), state.q.dtype)
-    free = system.inertia(t, state.q, state.u).solve(system.force(t, state.q, state.u))
+    free = system.inertia(t, state.q, state.u).solve(system.at(state).force(t, state.q, state.u))
     return jnp.max(jnp.abs(free) / system.velocity_scale())

@@ -21,13 +21,14 @@ _NO_EFFECT = 1e-10
 class Mode(eqx.Module):
     """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
 
-    **Fields:** `eigenvalue` λ [1/s]; `q` and `u`, the shape in all coordinates and velocities, complex, (nq,) and
-    (nu,); the displacement that is largest in units of the system's size is one; `system`, `state`, `t`.
+    **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`, the shape in all coordinates, velocities and internal states,
+    complex, (nq,), (nu,) and (nz,); the displacement that is largest in units of the system's size is one; `system`, `state`, `t`.
     """
 
     eigenvalue: Complex[Array, ""]
     q: Complex[Array, "nq"]
     u: Complex[Array, "nu"]
+    z: Complex[Array, "nz"]
     system: AbstractSystem
     state: State
     t: Array
@@ -40,7 +41,8 @@ class Mode(eqx.Module):
         dtype, given = self.state.q.dtype, (("phase", phase), ("amplitude", amplitude))
         phase, amplitude = (jnp.asarray(real_array(f"Mode.at: {name}", x, dtype)) for name, x in given)
         shown = lambda shape: amplitude * (jnp.cos(phase) * shape.real - jnp.sin(phase) * shape.imag)
-        moved = State(self.state.q + shown(self.q), self.state.u + shown(self.u))
+        z = None if self.state.z is None else self.state.z + shown(self.z)
+        moved = State(self.state.q + shown(self.q), self.state.u + shown(self.u), z)
         return project_normalized(self.system, self.t, moved)
 
 
@@ -50,8 +52,9 @@ class Linearisation(eqx.Module):
     **Fields:**
 
     - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.
-    - `states`, `inputs`, `outputs`: their names. The first `coordinates` states are coordinates, the others rates.
-    - `basis` (nq + nu, k): the changes of all coordinates and velocities with the states; `system`, `state`, `t`.
+    - `states`, `inputs`, `outputs`: their names. The first `coordinates` states are coordinates, then come rates, and
+        internal states.
+    - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with the states; `system`, `state`, `t`.
     """
 
     A: Float[Array, "k k"]
@@ -106,8 +109,8 @@ class Linearisation(eqx.Module):
             raise ValueError(f"There are {count} modes, numbered from 0, got {k!r}.")
         values, vectors = _spectrum(self)
         shape = self.basis.astype(vectors.dtype) @ vectors[:, k]
-        nq = self.system.nq
-        return Mode(values[k], shape[:nq], shape[nq:], self.system, self.state, self.t)
+        ends = [self.system.nq, self.system.nq + self.system.nu]
+        return Mode(values[k], *jnp.split(shape, ends), self.system, self.state, self.t)
 
     def frequency_response(self, omega: ArrayLike) -> Complex[Array, "frequencies o i"]:
         """`C (iω − A)⁻¹ B + D` at angular frequencies [rad/s], shape (frequencies, outputs, inputs).
@@ -145,13 +148,15 @@ def _widths(linear):
     """The sizes of the changes of the whole state by each state, in units of the system's size and radians, and these
     times the fastest rate.
     """
-    R, nq, kq = jnp.abs(linear.basis), linear.system.nq, linear.coordinates
-    by_coordinates = jnp.max(R[:nq, :kq] / linear.system.coordinate_scale()[:, None], axis=0)
-    by_rates = jnp.max(R[nq:, kq:] / linear.system.velocity_scale()[:, None], axis=0)
-    scaled = jnp.abs(linear.A[kq:]) * by_rates[:, None]
-    stiffness, damping = scaled[:, :kq] / by_coordinates[None, :], scaled[:, kq:] / by_rates[None, :]
+    system, R, kq = linear.system, jnp.abs(linear.basis), linear.coordinates
+    nq, last = system.nq, len(linear.states) - system.nz
+    by_coordinates = jnp.max(R[:nq, :kq] / system.coordinate_scale()[:, None], axis=0)
+    by_rates = jnp.max(R[nq : nq + system.nu, kq:last] / system.velocity_scale()[:, None], axis=0)
+    scaled = jnp.abs(linear.A[kq:last]) * by_rates[:, None]
+    stiffness, damping = scaled[:, :kq] / by_coordinates[None, :], scaled[:, kq:last] / by_rates[None, :]
     omega = jnp.max(damping, initial=0.0) + jnp.sqrt(jnp.max(stiffness, initial=0.0))
-    return jnp.concatenate([by_coordinates, by_rates / jnp.where(omega > 0, omega, 1.0)])
+    by_states = 1 / system.state_scale().astype(R.dtype)
+    return jnp.concatenate([by_coordinates, by_rates / jnp.where(omega > 0, omega, 1.0), by_states])
 
 
 def _effective(linear):

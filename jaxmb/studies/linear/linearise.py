@@ -1,5 +1,6 @@
 """The linear equations of small motions about an equilibrium or a steady motion, with named states."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -36,8 +37,8 @@ def linearise(
     """Linearise the equations of motion about an equilibrium or a steady motion, in independent coordinates.
 
     `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. There
-    are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, so no
-    eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as the place of a vehicle
+    are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, and
+    internal states, so no eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as the place of a vehicle
     on level ground.
 
     In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then
@@ -72,7 +73,7 @@ def linearise(
     shapes = {name: value.shape for name, value in parameters(system).items()} if len(tuple(inputs)) else {}
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
-    state = consistent(system, t, State(system.normalize(state.q), state.u))
+    state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
     found = linear_equations(system, t, state, names, chosen, observed)
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
     matrices = found.A, found.B, found.C, found.D
@@ -102,7 +103,14 @@ def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations
     else:
         lists = displacement_names(system), rate_candidates(system, names)
         chosen = tuple([known[int(k)] for k in picked] for known, picked in zip(lists, found.picked, strict=True))
-    return (*names.coordinates, *chosen[0], *own, *chosen[1])
+    internal = {k: name for name, index in system.state_names().items() for k in index if len(index) == 1}
+    internal |= {
+        k: f"{name}[{place}]"
+        for name, index in system.state_names().items()
+        for place, k in enumerate(index)
+        if len(index) > 1
+    }
+    return (*names.coordinates, *chosen[0], *own, *chosen[1], *(internal[k] for k in range(system.nz)))
 
 
 def _rate_label(system, name):
@@ -151,10 +159,16 @@ def _refusal(system, t, state, names, found: LinearEquations, labels):
 def remaining(system: AbstractSystem, residual) -> str:
     """The accelerations that remain where there should be none, for messages."""
     left = np.asarray(residual)
-    rates, accelerations = left[: system.nq], left[system.nq :]
+    rates, accelerations, of_states = np.split(left, [system.nq, system.nq + system.nu])
     labels = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
     worst = [k for k in np.argsort(-np.abs(accelerations))[:4] if abs(accelerations[k]) > 1e-6 * np.abs(left).max()]
     listed = ", ".join(f"{labels[k]} ({accelerations[k]:.3g})" for k in worst)
+    states = {name: np.abs(of_states[index]).max() for name, index in system.state_names().items()}
+    changing = [f"{name} ({rate:.3g} per second)" for name, rate in states.items() if rate > 1e-6 * np.abs(left).max()]
+    if changing:
+        return f"internal states change, {', '.join(changing)}" + (
+            f"; and accelerations remain along {listed}" * bool(listed)
+        )
     if listed:
         return f"accelerations remain along {listed}, in m/s² and rad/s²"
     return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from those of a uniform motion"

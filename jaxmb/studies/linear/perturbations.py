@@ -5,6 +5,7 @@ velocities; dependent velocities change with the coordinates too, since ψ(t, q,
 read small changes, `z = S δx`, and `δx = R z` with `R = T (S T)⁻¹`.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Scalar, State
@@ -38,8 +40,8 @@ class StateNames(NamedTuple):
 class Perturbations(eqx.Module):
     """Independent perturbations z of a state.
 
-    **Fields:** `basis` (n × k): `δx = basis z` of x = (q, u); `reading` (k × n): `z = reading δx`; `coordinates`, the
-    number of states that are coordinates, which come first; `picked`: of the states that the user did not name, the
+    **Fields:** `basis` (n × k): `δx = basis z` of x = (q, u) and internal states; `reading` (k × n): `z = reading δx`;
+    `coordinates`, the number of states that are coordinates, which come first; internal states come last; `picked`: of the states that the user did not name, the
     coordinates as indices in `displacement_names`, the rates as indices in `rate_candidates`; `regular`: whether the
     constraints have their ranks, and the named coordinates and rates are independent.
     """
@@ -49,6 +51,17 @@ class Perturbations(eqx.Module):
     coordinates: int = eqx.field(static=True)
     picked: tuple[Int[Array, "c"], Int[Array, "r"]]
     regular: Bool[Array, "3"]
+
+
+def joined(state: State) -> Float[Array, "n"]:
+    """Coordinates, velocities and internal states in one vector."""
+    return jnp.concatenate(jax.tree.leaves(state))
+
+
+def parted(system: AbstractSystem, x: Array) -> State:
+    """The state of a vector, or of a matrix with one column for each of several."""
+    q, u, z = jnp.split(x, [system.nq, system.nq + system.nu])
+    return State(q, u, z if system.nz else None)
 
 
 def counts(system: AbstractSystem) -> tuple[int, int]:
@@ -186,6 +199,9 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
     tangent = jnp.block([[along, jnp.zeros((nq, ku), along.dtype)], [following, alone]])
     reading = jnp.concatenate([rows_q, rows_u])
     basis = tangent @ jnp.linalg.inv(reading @ tangent)
+    if system.nz:
+        own = jnp.eye(system.nz, dtype=basis.dtype)
+        basis, reading = block_diag(basis, own), block_diag(reading, own)
     return Perturbations(basis, reading, kq, (picked, picked_rates), jnp.stack([regular, coordinates_ok, rates_ok]))
 
 
@@ -212,9 +228,9 @@ def _gradients(functions: Sequence[Callable[[State], Array]], state: State) -> F
 
 def _rate(system, t, function, state):
     """The time derivative of a function of the coordinates."""
-    rest = jnp.zeros_like(state.u)
-    dq = system.rates(t, state.q, state.u)
-    return jax.jvp(function, (state,), (State(dq, rest),))[1]
+    rest = jax.tree.map(jnp.zeros_like, state)
+    moving = dataclasses.replace(rest, q=system.rates(t, state.q, state.u))
+    return jax.jvp(function, (state,), (moving,))[1]
 
 
 def _quantity(system, t, name, kind, others):

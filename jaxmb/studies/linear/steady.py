@@ -18,7 +18,7 @@ from ...linalg.newton import newton, root
 from ...linalg.rotations import unrotate
 from ...linalg.shortest import pseudoinverse
 from ...parts.names import unknown
-from ...states.arguments import check_system, checked_guess, checked_time
+from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...system import AbstractSystem
 from ...system.arguments import real_array
 from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
@@ -67,6 +67,7 @@ def steady_motion(
     Under `jit` the result is NaN instead.
     """
     check_system("steady_motion", system)
+    check_no_states("steady_motion", system)
     guess = checked_guess("steady_motion", system, guess)
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
     chosen, values = _conditions(system, t, guess, {} if fix is None else fix, {} if rates is None else rates)
