@@ -16,6 +16,8 @@ from ._results import RESULTS as RESULTS
 from ._types import State as State
 from .linalg import rotations as rotations
 from .parts import contact as contact, terrain as terrain
+from .parts.actuators import Actuator as Actuator
+from .parts.controller import Controller as Controller
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
     Constraint as Constraint,

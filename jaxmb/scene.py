@@ -21,6 +21,7 @@ from .parts.base import (
     rows_of,
 )
 from .parts.boundary import check_kernels
+from .parts.controller import Controller
 from .parts.fields import anonymous, declarations, inner_parts
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
@@ -46,8 +47,8 @@ from .system.groups import (
 )
 from .system.layout import Layout
 
-# Parts that act on a joint, given by its name.
-_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart)
+# Parts that act on joints, given by their names.
+_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart, Controller)
 
 
 class Scene(eqx.Module):
@@ -152,6 +153,10 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             joint, own, on = joints[part.joint_name]
             resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
             parts.append((on_frames(resolved, on), own))
+        elif isinstance(part, Controller):
+            _call(part, "check", space.dimension)
+            sources = {name: _source(name, joints, scene.frames, frames, index) for name in part.sources}
+            parts.append(part.on(sources, dict(enumerate((*(body.name for body in scene.bodies), GROUND))), space))
         elif isinstance(part, AbstractLink):
             own = tuple(index[name] for name in part.bodies)
             moving = [k for k in own if k < len(scene.bodies)]
@@ -169,6 +174,14 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             part.check(space.dimension)
             gravity = part
     return parts, laws, gravity
+
+
+def _source(name, joints, named, frames, index):
+    """A joint, a frame, or None for a body, with the numbers of its bodies."""
+    if name in joints:
+        joint, own, on = joints[name]
+        return on_frames(joint, on), own
+    return (frames[name] if any(name == frame.name for frame in named) else None), (index[name],)
 
 
 def _check_program(servo, space, bodies):
@@ -224,7 +237,11 @@ def _check_names(scene: Scene):
     is_joint = lambda part: isinstance(part, kinds) and not isinstance(part, AbstractCoordinatePart)
     joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
     for part in (*scene.joints, *scene.forces):
-        if isinstance(part, _OF_JOINTS):
+        if isinstance(part, Controller):
+            for source in part.sources:
+                if source not in joints and (source not in known or source == GROUND):
+                    raise ValueError(f"{part.label}: {unknown('joint, body or frame', source, [*joints, *known])}")
+        elif isinstance(part, _OF_JOINTS):
             joint = part.joint if isinstance(part, AbstractNonIdeal) else part.joint_name
             if joint not in joints:
                 raise ValueError(f"{part.label}: {unknown('joint', joint, joints)}")

@@ -32,7 +32,7 @@ def check_kinds(part: Any, label: str) -> None:
         elif declared.kind == "choice":
             if value not in declared.of:
                 raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")
-        elif declared.kind == "numbers":
+        elif declared.kind in ("numbers", "internals"):
             if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
                 raise ValueError(f"{label}: {field} must be a dictionary of numbers, got {value!r}.")
             for key, number in value.items():

@@ -16,7 +16,7 @@ from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
 from .smooth import dry_friction, ramp, step
-from .terrain import AbstractTerrain
+from .terrain import AbstractTerrain, distance, outward
 
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]
@@ -248,12 +248,10 @@ class Contact(AbstractContact):
     """
 
     def distance(self, centre):
-        slope = jax.grad(self.terrain.height)(centre[:-1])
-        return (centre[-1] - self.terrain.height(centre[:-1])) / jnp.sqrt(1 + jnp.dot(slope, slope))
+        return distance(self.terrain, centre)
 
     def outward(self, centre):
-        slope = jax.grad(self.terrain.height)(centre[:-1])
-        return jnp.ones_like(centre).at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
+        return outward(self.terrain, centre)
 
     def onset(self, depth):
         return step(depth)

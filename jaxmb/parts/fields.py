@@ -47,7 +47,7 @@ class Declaration:
     - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
         several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
         another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
-        `"internal"` for an internal state; these two are not parameters.
+        `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
@@ -284,6 +284,11 @@ def internal_state(*, shape: tuple[Size, ...] | None = (), unit: str = "", defau
     return _field(Declaration("internal", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
 
 
+def internal_states_by_name() -> Any:
+    """Internal states of a user function by name, `"part.key"`, with their initial values."""
+    return _field(Declaration("internals"), converter=_NUMBERS, default_factory=dict, kw_only=True)
+
+
 def numbers() -> Any:
     """Parameters of a user function by name, `"part.key"`."""
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
@@ -353,8 +358,11 @@ def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
     """The paths of keys to the internal states of a part, or of the part that it puts on frames, by the field's name."""
     found = {}
     for prefix, own in (((), part), *inner_parts(part)):
-        states = [name for name, declared in declarations(type(own)).items() if declared.kind == "internal"]
-        found |= {name: (*prefix, name) for name in states}
+        for name, declared in declarations(type(own)).items():
+            if declared.kind == "internal":
+                found[name] = (*prefix, name)
+            elif declared.kind == "internals":
+                found |= {key: (*prefix, name, key) for key in getattr(own, name)}
     return found
 
 
@@ -366,7 +374,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declara
     declared = declarations(type(part))
     for field in field_names(type(part)):
         own = declared.get(field, _ANY_NUMBER)
-        if own.kind not in ("state", "internal", "part", "parts"):
+        if own.kind not in ("state", "internal", "internals", "part", "parts"):
             yield from _paths(getattr(part, field), (field,), (field,), own)
 
 

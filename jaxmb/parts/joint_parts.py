@@ -4,6 +4,7 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -64,6 +65,11 @@ class AbstractCoordinatePart(AbstractLink):
     def measured(self, space, poses) -> Float[Array, "n"]:
         """The coordinate, raveled."""
         return self.joint.coordinates(space, poses)[self.within].reshape(-1)
+
+    def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+        """The coordinate and its rate, raveled."""
+        rates = jax.vmap(space.rates)(poses, velocities)
+        return jax.jvp(lambda x: self.measured(space, x), (poses,), (rates,))
 
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of angles that are known up to full turns the smallest such difference."""

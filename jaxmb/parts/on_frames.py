@@ -131,8 +131,15 @@ class VelocityConstraintOnFrames(AbstractOnFrames, AbstractVelocityConstraint):
         return self.part.residual(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
 
 
-class AbstractForceOnFrames(AbstractOnFrames, AbstractForce):
+class AbstractForceOnFrames(AbstractOnFrames, AbstractPotentialForce):
     """A force law on frames."""
+
+    @property
+    def conservative(self):
+        return self.part.conservative
+
+    def energy(self, space, poses, t):
+        return self.part.energy(space, self._poses(space, poses), t)
 
     def wrenches(self, space, poses, velocities, t):
         own = self.part.wrenches(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
@@ -150,12 +157,5 @@ class DynamicForceOnFrames(AbstractForceOnFrames, AbstractDynamicForce):
         return self.part.state_sizes()
 
 
-class ForceOnFrames(AbstractForceOnFrames, AbstractPotentialForce):
+class ForceOnFrames(AbstractForceOnFrames):
     """A force law on frames without internal states."""
-
-    @property
-    def conservative(self):
-        return self.part.conservative
-
-    def energy(self, space, poses, t):
-        return self.part.energy(space, self._poses(space, poses), t)

@@ -7,6 +7,7 @@ where z is up. A profile along x is constant along y, so it serves in both.
 import abc
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -30,6 +31,20 @@ class AbstractTerrain(AbstractLaw):
     @abc.abstractmethod
     def height(self, place: Place) -> Float[Array, ""]:
         """Height [m] above the world's origin at a place [m], continuously differentiable."""
+
+
+def distance(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, ""]:
+    """Distance [m] of a point above the ground, along the normal; exact on even ground, elsewhere to first order in its
+    curvature.
+    """
+    slope = jax.grad(terrain.height)(point[:-1])
+    return (point[-1] - terrain.height(point[:-1])) / jnp.sqrt(1 + jnp.dot(slope, slope))
+
+
+def outward(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, "d"]:
+    """Unit outward normal of the ground below a point."""
+    slope = jax.grad(terrain.height)(point[:-1])
+    return jnp.ones_like(point).at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
 
 
 class Flat(AbstractTerrain):

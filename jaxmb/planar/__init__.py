@@ -32,3 +32,4 @@ from ..parts.planar.joints import (
 )
 from ..parts.planar.knife_edge import KnifeEdge as KnifeEdge
 from ..parts.planar.track import Track as Track
+from ..parts.planar.tyre import Tyre as Tyre

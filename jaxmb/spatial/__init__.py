@@ -34,3 +34,4 @@ from ..parts.spatial.joints import (
     Universal as Universal,
 )
 from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere
+from ..parts.spatial.tyre import Tyre as Tyre

@@ -1,0 +1,183 @@
+"""Forces on joints that a user's function computes from named measurements."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import fields
+from .base import AbstractConstraint, AbstractDynamicForce
+from .forces import generalized_force
+from .frames import AbstractFrame
+from .names import unknown
+
+# What is seen of a body or a frame, and in which space if not in both.
+_OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
+
+
+def _pairs(measures: Any) -> Any:
+    return tuple(measures.items()) if isinstance(measures, Mapping) else measures
+
+
+class Controller(AbstractDynamicForce):
+    """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
+    parameters) -> forces, rates`.
+
+    **Arguments:**
+
+    - `function`: of the time [s] and dictionaries of the measurements, the internal states and the parameters. It
+        returns the force [N m, N] on the coordinate that the controller `acts_on`, or a dictionary with the force on
+        each; and the rates of the internal states by name, `{}` if there are none.
+    - `measures`: measured quantities by the name that the function knows them by: a joint's coordinate
+        `"hinge.angle"` or its rate `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m,
+        m/s] (world axes), `angular_velocity` [rad/s] (in space in the axes of the body or frame), in the plane
+        `angle`, in space `orientation`.
+    - `acts_on`: a coordinate, `"slide.displacement"`, or several.
+    - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
+    - `parameters`: numbers by name; they become parameters of the system, `"pid.gain"`.
+
+    Angles of joints in space are known up to full turns, and jump at half a turn.
+
+        def pid(t, measured, states, p):
+            error = p["target"] - measured["angle"]
+            torque = p["kp"] * error + p["ki"] * states["integral"] - p["kd"] * measured["rate"]
+            return torque, {"integral": error}
+
+        Controller("pid", pid, {"angle": "hinge.angle", "rate": "hinge.angle_rate"}, "hinge.angle",
+                   states={"integral": 0.0}, parameters={"kp": 50.0, "ki": 20.0, "kd": 5.0, "target": 0.3})
+    """
+
+    name: str = fields.name()
+    function: Callable[..., Any] = fields.function()
+    measures: Any = eqx.field(static=True, converter=_pairs)
+    acts_on: Any = eqx.field(static=True, converter=lambda names: (names,) if isinstance(names, str) else tuple(names))
+    states: fields.Numbers = fields.internal_states_by_name()
+    parameters: fields.Numbers = fields.numbers()
+    # Filled in by the scene: joints and frames by name, and the places of their bodies among all bodies.
+    held: Any = fields.parts()
+    bodies: Any = eqx.field(static=True, default=(), kw_only=True)
+    places: Any = eqx.field(static=True, default=(), kw_only=True)
+
+    def __check_init__(self):
+        names = [name for pair in self.measures for name in pair] if isinstance(self.measures, tuple) else [None]
+        if not all(isinstance(name, str) for name in names):
+            raise ValueError(
+                f"{self.label}: measures must be names by the function's own, {{'angle': 'hinge.angle'}}, got "
+                f"{self.measures!r}."
+            )
+        for name in (*dict(self.measures).values(), *self.acts_on):
+            if not isinstance(name, str) or name.count(".") != 1:
+                raise ValueError(f"{self.label}: a quantity is named 'part.quantity', got {name!r}.")
+        if not self.acts_on:
+            raise ValueError(f"{self.label}: acts_on names at least one coordinate of a joint.")
+        taken = set(self.states) & set(self.parameters)
+        if taken:
+            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The names of the joints, bodies and frames that are measured or acted on."""
+        return tuple(dict.fromkeys(name.split(".")[0] for name in (*dict(self.measures).values(), *self.acts_on)))
+
+    def on(self, sources: Mapping[str, tuple[Any, tuple[int, ...]]], bodies: Mapping[int, str], space: Any) -> Any:
+        """The controller on its sources: each a joint, a frame or None for a body, with the numbers of its bodies.
+
+        **Returns:** the controller, and the numbers of its bodies.
+
+        **Raises:** `ValueError` for quantities that a source does not have.
+        """
+        numbers = tuple(dict.fromkeys(k for _, own in sources.values() for k in own))
+        places = tuple((name, tuple(numbers.index(k) for k in own)) for name, (_, own) in sources.items())
+        held = {name: part for name, (part, _) in sources.items() if part is not None}
+        part = self.with_fields(held=held, bodies=tuple(bodies[k] for k in numbers), places=places)
+        part._check_names(space)
+        return part, numbers
+
+    def _check_names(self, space):
+        for name in (*dict(self.measures).values(), *self.acts_on):
+            source, quantity = name.split(".")
+            known = self._known(source, space)
+            acted = name in self.acts_on
+            allowed = known if acted or not self._is_joint(source) else [*known, *(f"{own}_rate" for own in known)]
+            if acted and not self._is_joint(source):
+                raise ValueError(f"{self.label}: it acts on coordinates of joints, and {source!r} is none.")
+            if quantity not in allowed:
+                listed = [f"{source}.{own}" for own in allowed]
+                raise ValueError(f"{self.label}: {unknown('quantity', name, listed)}")
+
+    def _is_joint(self, source):
+        return isinstance(self.held.get(source), AbstractConstraint)
+
+    def _known(self, source, space):
+        if self._is_joint(source):
+            poses = jnp.tile(space.prepare(np.asarray(space.ground)), (len(dict(self.places)[source]), 1))
+            return list(jax.eval_shape(lambda x: self.held[source].coordinates(space, x), poses))
+        return [name for name, dimension in _OF_BODIES.items() if dimension in (None, space.dimension)]
+
+    def wrenches(self, space, poses, velocities, t):
+        forces, _ = self._evaluated(space, poses, velocities, t)
+        return generalized_force(
+            space, lambda x: self._acted(space, x), poses, velocities, lambda value, rate: self._row(space, poses, forces)
+        )
+
+    def state_rates(self, space, poses, velocities, t):
+        return self._evaluated(space, poses, velocities, t)[1]
+
+    def _evaluated(self, space, poses, velocities, t):
+        measured = {label: self._measured(space, poses, velocities, name) for label, name in self.measures}
+        out = self.function(t, measured, self.states, self.parameters)
+        if not isinstance(out, tuple) or len(out) != 2 or not isinstance(out[1], dict):
+            raise ValueError(f"the function of {self.label} must return the forces and a dictionary of rates.")
+        forces, rates = out
+        if set(rates) != set(self.states):
+            names = ", ".join(self.states) or "none"
+            raise ValueError(f"the function of {self.label} must return the rates of its states, {names}.")
+        return forces, {name: jnp.asarray(rate, poses.dtype) for name, rate in rates.items()}
+
+    def _row(self, space, poses, forces):
+        """The forces on all coordinates, raveled one after the other."""
+        forces = forces if isinstance(forces, dict) else {self.acts_on[0]: forces}
+        if set(forces) != set(self.acts_on):
+            raise ValueError(f"the function of {self.label} must return the force on {' and '.join(self.acts_on)}.")
+        rows = []
+        for name in self.acts_on:
+            shape, force = self._coordinate(space, poses, name).shape, jnp.asarray(forces[name], poses.dtype)
+            if force.shape != shape:
+                raise ValueError(
+                    f"the function of {self.label} must return a force of shape {shape} on {name!r}, got {force.shape}."
+                )
+            rows.append(force.reshape(-1))
+        return jnp.concatenate(rows)
+
+    def _acted(self, space, poses):
+        return jnp.concatenate([self._coordinate(space, poses, name).reshape(-1) for name in self.acts_on])
+
+    def _coordinate(self, space, poses, name):
+        source, quantity = name.split(".")
+        return self.held[source].coordinates(space, poses[np.array(dict(self.places)[source])])[quantity]
+
+    def _measured(self, space, poses, velocities, name):
+        source, quantity = name.split(".")
+        if not self._is_joint(source):
+            return self._of_body(space, poses, velocities, source, quantity)
+        base = quantity.removesuffix("_rate")
+        if base == quantity:
+            return self._coordinate(space, poses, name)
+        rates = jax.vmap(space.rates)(poses, velocities)
+        return jax.jvp(lambda x: self._coordinate(space, x, f"{source}.{base}"), (poses,), (rates,))[1]
+
+    def _of_body(self, space, poses, velocities, source, quantity):
+        (k,), frame, d = dict(self.places)[source], self.held.get(source), space.dimension
+        pose, velocity = poses[k], velocities[k]
+        if isinstance(frame, AbstractFrame):
+            pose, velocity = frame.pose(space, pose), frame.velocity(space, pose, velocity)
+        return {
+            "position": pose[:d],
+            "velocity": velocity[:d],
+            "angular_velocity": velocity[2] if d == 2 else velocity[3:],
+            "angle": pose[2],
+            "orientation": pose[3:7],
+        }[quantity]

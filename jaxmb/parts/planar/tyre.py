@@ -1,0 +1,24 @@
+"""A tyre on a wheel that rolls in the plane."""
+
+import jax.numpy as jnp
+
+from ..base import AbstractPlanarPart
+from ..tyre import AbstractTyre
+
+
+class Tyre(AbstractPlanarPart, AbstractTyre):
+    """A tyre with longitudinal slip and relaxation.
+
+    The tread deflects as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest point and the rolling
+    speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slip `d/σ` is `−v_s/V`. The force
+    on the wheel at its lowest point is `μ N tanh(c |d| / (σ μ))` in the direction of d, with the load N: `c N d/σ` for
+    small slips, and friction for large ones. It has no rolling resistance.
+
+    **Arguments:** see `AbstractTyre`.
+    """
+
+    def lowest(self, space, pose, normal_W):
+        return -self.radius * normal_W
+
+    def directions(self, space, pose, normal_W):
+        return jnp.stack([normal_W[1], -normal_W[0]])[None]

@@ -1,0 +1,113 @@
+"""Tyres: compliant wheels whose slip forces build up over a relaxation length.
+
+Source: H. B. Pacejka, "Tyre and Vehicle Dynamics", 3rd ed., Butterworth-Heinemann 2012, chapter 7 (single contact point
+transient models).
+"""
+
+import abc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from . import fields
+from .base import AbstractDynamicForce, AbstractPotentialForce
+from .boundary import check_returns
+from .contact import AbstractNormalLaw
+from .smooth import dry_friction, ramp, step
+from .space import AbstractSpace, Point, Pose
+from .terrain import AbstractTerrain, distance, outward
+
+
+class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
+    """A tyre on a wheel, on one terrain. Subclasses know the directions of the wheel; the laws are those of
+    `planar.Tyre` and `spatial.Tyre`.
+
+    **Fields:**
+
+    - `body`: the wheel, or a frame fixed in it; `radius` [m] > 0; `centre` [m], default the mass centre.
+    - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
+        `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
+        of the depth, `½ (δ + √(δ² + smoothing²))`.
+    - `slip_stiffness` c > 0, of one direction or of all, (d − 1,): force over load and slip, for small slips;
+        `coefficient` μ > 0 of friction.
+    - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
+        are regularised.
+    - `deflection` [m], (d − 1,), an internal state: of the tread in the contact relative to the rim, forwards and, in
+        space, to the left; initially zero.
+    """
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    radius: fields.Number = fields.length(sign="positive")
+    centre: fields.Number = fields.point(body=0, default="mass centre")
+    terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
+    coefficient: fields.Number = fields.parameter(sign="positive")
+    slip_stiffness: fields.Number = fields.parameter(shape=None, sign="positive")
+    relaxation_length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive")
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.1)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    deflection: fields.Number = fields.internal_state(shape=None, unit="m")
+
+    @abc.abstractmethod
+    def lowest(self, space: AbstractSpace, pose: Pose, normal_W: Point) -> Point:
+        """World vector [m] from the wheel's centre to the point of its rim that is lowest over the ground."""
+
+    @abc.abstractmethod
+    def directions(self, space: AbstractSpace, pose: Pose, normal_W: Point) -> Float[Array, "h d"]:
+        """Unit vectors along the ground: forwards and, in space, to the left; world axes."""
+
+    def complete(self, space, poses):
+        count = space.dimension - 1
+        for name in ("slip_stiffness", "relaxation_length", "deflection"):
+            shape = np.shape(getattr(self, name))
+            if shape not in ((), (count,)):
+                raise ValueError(f"{self.label}: {name} must have shape () or ({count},), got {shape}.")
+        place = np.zeros(count, np.asarray(self.radius).dtype)
+        check_returns(self.label, "terrain.height", (), self.terrain.height, place)
+        return self.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
+
+    def wrenches(self, space, poses, velocities, t):
+        pose, velocity = poses[0], velocities[0]
+        depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
+        load = self.normal.force(depth)
+        wrench = space.pull_back(pose, -load * gradient)
+        normal, point, along, slip, _ = self._contact(space, pose, velocity)
+        engaged = step(depth / self.damping_depth)
+        approach = jnp.dot(space.point_velocity(pose, velocity, self.centre), normal)
+        sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
+        # The law of dry friction, with the deflection in the place of slip.
+        friction = dry_friction(self.coefficient * load, -sliding, 1.0)
+        force = friction @ along - self.damping * engaged * approach * normal
+        return (wrench + space.point_force(pose, point, force))[None]
+
+    def energy(self, space, poses, t):
+        return self.normal.energy(self._depth(space, poses[0]))
+
+    def state_rates(self, space, poses, velocities, t):
+        *_, slip, speed = self._contact(space, poses[0], velocities[0])
+        return {"deflection": -slip - speed / self.relaxation_length * self.deflection}
+
+    def state_sizes(self):
+        return {"deflection": 0.1 * jnp.max(self.relaxation_length)}
+
+    def _depth(self, space, pose):
+        centre = space.point(pose, self.centre)
+        rim = centre + self.lowest(space, pose, outward(self.terrain, centre))
+        return ramp(-distance(self.terrain, rim), self.smoothing)
+
+    def _contact(self, space, pose, velocity):
+        """The ground's normal, the wheel's lowest point fixed in the body, the directions along the ground, the slip
+        velocities along them, and the rolling speed, regularised.
+        """
+        centre = space.point(pose, self.centre)
+        normal = outward(self.terrain, centre)
+        point = space.body_point(pose, centre + self.lowest(space, pose, normal))
+        along = self.directions(space, pose, normal)
+        slip = along @ space.point_velocity(pose, velocity, point)
+        rolling = jnp.dot(along[0], space.point_velocity(pose, velocity, self.centre))
+        return normal, point, along, slip, jnp.sqrt(rolling**2 + self.transition_speed**2)
