@@ -86,8 +86,8 @@ class StatefulTerm(AbstractManifoldTerm):
         return State(own.q, own.u, jnp.ones(self.system.nz, bool))
 
     def free(self, chart):
-        first = self.system.nq + self.system.nu
-        return jnp.concatenate([self.term.free(chart), first + jnp.arange(self.system.nz)])
+        own, first = self.term.free(chart), self.system.nq + self.system.nu
+        return jnp.concatenate([own, first + jnp.arange(self.system.nz, dtype=own.dtype)])
 
     def update_chart(self, t, y, chart, args):
         return _at(self.term, y).update_chart(t, _mechanical(y), chart, args)

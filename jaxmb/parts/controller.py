@@ -120,7 +120,11 @@ class Controller(AbstractDynamicForce):
     def wrenches(self, space, poses, velocities, t):
         forces, _ = self._evaluated(space, poses, velocities, t)
         return generalized_force(
-            space, lambda x: self._acted(space, x), poses, velocities, lambda value, rate: self._row(space, poses, forces)
+            space,
+            lambda x: self._acted(space, x),
+            poses,
+            velocities,
+            lambda value, rate: self._row(space, poses, forces),
         )
 
     def state_rates(self, space, poses, velocities, t):

@@ -355,7 +355,7 @@ def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
-    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by the field's name."""
+    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by their names."""
     found = {}
     for prefix, own in (((), part), *inner_parts(part)):
         for name, declared in declarations(type(own)).items():

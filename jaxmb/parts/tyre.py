@@ -76,7 +76,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
         load = self.normal.force(depth)
         wrench = space.pull_back(pose, -load * gradient)
-        normal, point, along, slip, _ = self._contact(space, pose, velocity)
+        normal, point, along, *_ = self._contact(space, pose, velocity)
         engaged = step(depth / self.damping_depth)
         approach = jnp.dot(space.point_velocity(pose, velocity, self.centre), normal)
         sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)

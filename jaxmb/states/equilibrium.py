@@ -63,8 +63,8 @@ def equilibrium(
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
     **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
-    internal states change, or if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a run-time error without
-    the names.
+    internal states change, or if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a
+    run-time error without the names.
     """
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:

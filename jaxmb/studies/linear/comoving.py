@@ -30,9 +30,7 @@ _TERMS = 20
 
 
 class AbstractCarrier(eqx.Module):
-    """The field S of a displacement: an affine function of coordinates and velocities. It leaves internal states as they
-    are.
-    """
+    """The field S of a displacement: an affine function of coordinates and velocities. Internal states stay."""
 
     @abc.abstractmethod
     def field(self, state: State) -> State:

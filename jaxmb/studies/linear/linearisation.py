@@ -22,7 +22,8 @@ class Mode(eqx.Module):
     """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
 
     **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`, the shape in all coordinates, velocities and internal states,
-    complex, (nq,), (nu,) and (nz,); the displacement that is largest in units of the system's size is one; `system`, `state`, `t`.
+    complex, (nq,), (nu,) and (nz,); the displacement that is largest in units of the system's size is one; `system`,
+    `state`, `t`.
     """
 
     eigenvalue: Complex[Array, ""]
@@ -54,7 +55,8 @@ class Linearisation(eqx.Module):
     - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.
     - `states`, `inputs`, `outputs`: their names. The first `coordinates` states are coordinates, then come rates, and
         internal states.
-    - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with the states; `system`, `state`, `t`.
+    - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with the states;
+        `system`, `state`, `t`.
     """
 
     A: Float[Array, "k k"]

@@ -38,8 +38,8 @@ def linearise(
 
     `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. There
     are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, and
-    internal states, so no eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as the place of a vehicle
-    on level ground.
+    internal states, so no eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as
+    the place of a vehicle on level ground.
 
     In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then
     seen from a frame that is carried along with each body, so that A is constant; that it is, is verified a little

@@ -41,9 +41,10 @@ class Perturbations(eqx.Module):
     """Independent perturbations z of a state.
 
     **Fields:** `basis` (n × k): `δx = basis z` of x = (q, u) and internal states; `reading` (k × n): `z = reading δx`;
-    `coordinates`, the number of states that are coordinates, which come first; internal states come last; `picked`: of the states that the user did not name, the
-    coordinates as indices in `displacement_names`, the rates as indices in `rate_candidates`; `regular`: whether the
-    constraints have their ranks, and the named coordinates and rates are independent.
+    `coordinates`, the number of states that are coordinates, which come first; internal states come last; `picked`: of
+    the states that the user did not name, the coordinates as indices in `displacement_names`, the rates as indices in
+    `rate_candidates`; `regular`: whether the constraints have their ranks, and the named coordinates and rates are
+    independent.
     """
 
     basis: Float[Array, "n k"]

@@ -1,0 +1,467 @@
+"""Parts with internal states: motors with lag, controllers with memory, tyres with relaxation."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import driven
+
+import jaxmb as mb
+from jaxmb import contact, manifold, mechanisms, planar, solvers, spatial, terrain
+from jaxmb.manifold import with_internal_states
+from jaxmb.parts import AbstractDynamicForce, AbstractForce, Number, body_name, internal_state, name, parameter
+
+# Of the cart's place and speed, the pole's angle and its rate, and the integral of the place; a stable motion.
+GAINS = {"place": 27.0, "speed": 27.0, "angle": -160.0, "rate": -45.0, "integral": 10.0}
+METHODS = {
+    "Adams": {},
+    "Hermite": {"solver": solvers.Hermite()},
+    "Dopri8": {"solver": diffrax.Dopri8()},
+    "Adams, projection": {"manifold": manifold.Projection()},
+    "Adams, Baumgarte": {"manifold": manifold.Baumgarte(20.0)},
+}
+
+
+def balance(t, measured, states, p):
+    seen = measured | states
+    return sum(p[f"of_{name}"] * seen[name] for name in GAINS), {"integral": measured["place"]}
+
+
+def cart_and_pole(**options):
+    cart = planar.Body("cart", mass=2.0, inertia=1.0)
+    pole = planar.Body("pole", mass=0.5, inertia=planar.rod(0.5, 1.2), position=(0.0, 0.6))
+    joints = [
+        planar.Prismatic("slide", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0)),
+        planar.Revolute("hinge", "cart", "pole", point=(0.0, 0.0)),
+    ]
+    own = {
+        "measures": {
+            "place": "slide.displacement",
+            "speed": "slide.displacement_rate",
+            "angle": "hinge.angle",
+            "rate": "hinge.angle_rate",
+        },
+        "acts_on": "slide.displacement",
+        "states": {"integral": 0.0},
+        "parameters": {f"of_{name}": gain for name, gain in GAINS.items()},
+    }
+    controller = mb.Controller("pid", balance, **own | options)
+    return mb.Scene([cart, pole], joints=joints, forces=[mb.Gravity((0.0, -9.81)), controller]).compile()
+
+
+def leaning(system, angle=0.1, **options):
+    return mb.assemble(system, fix={"hinge.angle": angle, "slide.displacement": 0.0}, **options)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_controlled_pole_moves_as_its_own_equations(method):
+    system, times = cart_and_pole(), np.array([0.7, 2.0])
+    sol = mb.simulate(system, leaning(system), t1=2.0, saveat=times, rtol=1e-10, **METHODS[method])
+    slide, hinge = sol["slide"], sol["hinge"]
+    found = [slide.displacement, slide.displacement_rate, hinge.angle, hinge.angle_rate, sol["pid"].integral]
+    expected = driven.cart_and_pole(times, list(GAINS.values()))
+    np.testing.assert_allclose(np.stack(found, axis=1), expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(sol.ys.z[:, 0], expected[:, 4], rtol=0, atol=1e-8)
+    assert np.max(sol.constraint_violation.position) < (1e-6 if "Baumgarte" in method else 1e-11)
+
+
+def test_error_control_sees_internal_states():
+    """A filter that nothing depends on is followed as accurately as the motion."""
+    system = filtered()
+    coarse = mb.simulate(system, mb.assemble(system), t1=3.0, rtol=1e-8)
+    # ẏ = (cos 20t − y) / 0.1
+    steady = lambda t: (np.cos(20 * t) + 2.0 * np.sin(20 * t)) / 5.0
+    expected = steady(3.0) - steady(0.0) * np.exp(-30.0)
+    np.testing.assert_allclose(coarse["filter"].value[-1], expected, rtol=0, atol=1e-7)
+
+
+class Filter(AbstractDynamicForce):
+    """A signal that is filtered, and pushes nothing."""
+
+    name: str = name()
+    body: str = body_name()
+    lag: Number = parameter(unit="s", sign="positive")
+    value: Number = internal_state()
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros_like(velocities)
+
+    def state_rates(self, space, poses, velocities, t):
+        return {"value": (jnp.cos(20 * t) - self.value) / self.lag}
+
+
+def filtered(part=None):
+    body = planar.Body("body", mass=1.0, inertia=1.0, velocity=(1.0, 0.0))
+    return mb.Scene([body], forces=[part or Filter("filter", "body", lag=0.1)]).compile()
+
+
+def end(system, gains, angle, integral, adjoint=None, rtol=1e-10):
+    changed = mb.with_parameters(system, {"pid.of_angle": gains[0], "pid.of_integral": gains[1]})
+    start = mb.assemble(changed, fix={"hinge.angle": angle, "slide.displacement": 0.0, "pid.integral": integral})
+    sol = mb.simulate(changed, start, t1=1.0, rtol=rtol, adjoint=adjoint, throw=False)
+    return jnp.stack([sol["hinge"].angle[-1], sol["pid"].integral[-1]])
+
+
+def test_derivatives_forward_reverse_and_differences():
+    system = cart_and_pole()
+    x = jnp.array([-160.0, 10.0, 0.1, 0.02])
+    run = lambda x, **options: end(system, x[:2], x[2], x[3], **options)
+    reverse = jax.jit(jax.jacrev(run))(x)
+    forward = jax.jit(jax.jacfwd(lambda x: run(x, adjoint=diffrax.ForwardMode())))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    tight = jax.jit(jax.vmap(lambda x: run(x, rtol=1e-12)))
+    step = 1e-4 * jnp.diag(x)
+    differences = (tight(x + step) - tight(x - step)) / (2e-4 * x)[:, None]
+    np.testing.assert_allclose(reverse.T, differences, rtol=0, atol=1e-6 * np.abs(differences).max(axis=1)[:, None])
+
+
+def test_linear_equations_of_a_controlled_machine():
+    system = cart_and_pole()
+    at_rest = mb.equilibrium(system, fix={"hinge.angle": 0.0, "slide.displacement": 0.0})
+    linear = mb.linearise(system, at_rest, coordinates=["slide.displacement", "hinge.angle"], outputs=["pid.integral"])
+    assert linear.states[-1] == "pid.integral"
+    # M z̈ + K z = force, about the upright pole.
+    inertia = np.array([[2.5, -0.3], [-0.3, 0.24]])
+    accelerations = np.linalg.solve(inertia, [list(GAINS.values()), [0.0, 0.0, 0.3 * 9.81, 0.0, 0.0]])
+    A = np.array([[0, 1, 0, 0, 0], accelerations[0], [0, 0, 0, 1, 0], accelerations[1], [1, 0, 0, 0, 0]])
+    expected = np.linalg.eigvals(A)
+    np.testing.assert_allclose(np.sort_complex(linear.eigenvalues), np.sort_complex(expected), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(linear.C, [[0, 0, 0, 0, 1]])
+    mode = linear.mode(int(np.argmax(np.abs(expected))))
+    assert mode.at(0.3, 0.01).z.shape == (1,)
+
+
+def motor_on_four_bar(**changes):
+    own = {"mode": "speed", "command": 6.0, "gain": 30.0, "lag": 0.05, "limit": 40.0} | changes
+    return with_forces(mechanisms.four_bar, mb.Actuator("motor", "A.angle", **own))
+
+
+def with_forces(mechanism, *forces):
+    """A scene of the library with further forces."""
+    scenes = []
+    record = lambda scene: scenes.append(scene) or compiled(scene)
+    compiled = mb.Scene.compile
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mb.Scene, "compile", record)
+        own = mechanism()
+    (scene,) = scenes
+    return mb.Scene(scene.bodies, joints=scene.joints, forces=[*scene.forces, *forces]).compile(), own.state
+
+
+def test_a_motor_with_lag_drives_a_four_bar():
+    system, start = motor_on_four_bar()
+    times = np.array([0.4, 1.5])
+    start = mb.assemble(system, start)
+    sol = mb.simulate(system, start, t1=1.5, saveat=times, rtol=1e-10)
+    found = np.stack([sol["crank"].angle, sol["crank"].angular_velocity, sol["motor"].force], axis=1)
+    expected = driven.motor_of_four_bar(times, command=6.0, gain=30.0, lag=0.05, limit=40.0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+    # The wrench of the motor is that of its state, and the ground takes the reaction.
+    np.testing.assert_allclose(sol.forces["motor"][:, 1, 2], sol["motor"].force, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(sol.to_dict()["motor.force"], sol.ys.z[:, 0])
+
+
+def test_modes_of_an_actuator():
+    """The force approaches what the mode demands."""
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, angular_velocity=0.5)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    for options, demand in (
+        ({"mode": "force", "command": 2.0}, 2.0),
+        ({"mode": "speed", "command": 2.0, "gain": 3.0}, 3.0 * (2.0 - 0.5)),
+        ({"mode": "position", "command": 0.4, "gain": 3.0, "damping": 0.2}, 3.0 * 0.4 - 0.2 * 0.5),
+        ({"mode": "force", "command": 2.0, "limit": 1.5}, 1.5 * np.tanh(2.0 / 1.5)),
+    ):
+        system = mb.Scene([rod], joints=[pin], forces=[mb.Actuator("m", "pin.angle", lag=0.1, **options)]).compile()
+        state = mb.assemble(system, fix={"m.force": 0.3}, rates={"rod.angle": 0.5})
+        rate = system.with_states(state.z).state_rates(0.0, state.q, state.u)
+        np.testing.assert_allclose(rate, [(demand - 0.3) / 0.1], rtol=1e-12)
+
+
+def car(p=driven.CAR):
+    at = lambda corner: (corner[0], corner[1], corner[2] + 0.49)
+    chassis = spatial.Body("chassis", mass=p["mass"], inertia=np.diag(p["inertia"]), position=at((0.0, 0.0, 0.0)))
+    wheels, axles, tyres = [], [], []
+    for k, corner in enumerate(p["corners"]):
+        inertia = np.diag(p["wheel_inertia"])
+        wheels.append(spatial.Body(f"wheel{k}", mass=p["wheel_mass"], inertia=inertia, position=at(corner)))
+        axles.append(spatial.Revolute(f"axle{k}", "chassis", f"wheel{k}", point=at(corner), axis=(0.0, 1.0, 0.0)))
+        tyre = spatial.Tyre(
+            f"tyre{k}",
+            f"wheel{k}",
+            radius=p["radius"],
+            terrain=terrain.Bump(**p["bump"]),
+            normal=contact.Linear(p["stiffness"]),
+            coefficient=p["coefficient"],
+            slip_stiffness=p["slip_stiffness"],
+            relaxation_length=p["relaxation"],
+            transition_speed=p["transition_speed"],
+            damping=p["damping"],
+            damping_depth=p["damping_depth"],
+            smoothing=p["smoothing"],
+        )
+        tyres.append(tyre)
+    return mb.Scene([chassis, *wheels], joints=axles, forces=[mb.Gravity((0.0, 0.0, -9.81)), *tyres]).compile()
+
+
+def test_a_car_on_four_tyres_passes_a_bump():
+    system, times = car(), np.array([0.5, 1.0])
+    rates = {"chassis.velocity": (6.0, 0.0, 0.0), "chassis.angular_velocity": (0.0, 0.0, 0.1)}
+    state = mb.assemble(system, rates=rates | {f"axle{k}.angle": 20.0 for k in range(4)})
+    sol = mb.simulate(system, state, t1=1.0, saveat=times, rtol=1e-10)
+    expected = driven.car(times, height=0.49, speed=6.0, turn=0.1)
+    chassis = sol["chassis"]
+    found = [chassis.position, chassis.velocity, chassis.orientation, chassis.angular_velocity]
+    found += [sol[f"axle{k}"].angle_rate[:, None] for k in range(4)]
+    found += [sol[f"tyre{k}"].deflection for k in range(4)]
+    np.testing.assert_allclose(np.concatenate(found, axis=1), expected, rtol=0, atol=1e-8)
+
+
+def test_a_tyre_in_the_plane_is_one_in_space():
+    """A wheel that is pulled rolls in the plane as it does in space, where it is held upright."""
+    own = {
+        "radius": 0.3,
+        "terrain": terrain.Sinusoid(amplitude=0.02, wavelength=1.1),
+        "normal": contact.Linear(4e4),
+        "coefficient": 0.8,
+        "slip_stiffness": 15.0,
+        "relaxation_length": 0.2,
+        "damping": 300.0,
+        "smoothing": 5e-3,
+    }
+    flat = planar.Body("wheel", mass=20.0, inertia=0.9, position=(0.0, 0.3), velocity=(3.0, 0.0), angular_velocity=-4.0)
+    pull = planar.PointForce("pull", "wheel", force=(40.0, 0.0))
+    planar_scene = mb.Scene([flat], forces=[mb.Gravity((0.0, -9.81)), pull, planar.Tyre("tyre", "wheel", **own)])
+    solid = spatial.Body(
+        "wheel",
+        mass=20.0,
+        inertia=np.diag([0.5, 0.9, 0.5]),
+        position=(0.0, 0.0, 0.3),
+        velocity=(3.0, 0.0, 0.0),
+        angular_velocity=(0.0, 4.0, 0.0),
+    )
+    pull = spatial.PointForce("pull", "wheel", force=(40.0, 0.0, 0.0))
+    spatial_scene = mb.Scene(
+        [solid], forces=[mb.Gravity((0.0, 0.0, -9.81)), pull, spatial.Tyre("tyre", "wheel", **own)]
+    )
+    a, b = (
+        mb.simulate(system, mb.assemble(system), t1=0.4, rtol=1e-10)
+        for system in (planar_scene.compile(), spatial_scene.compile())
+    )
+    np.testing.assert_allclose(a["wheel"].position, b["wheel"].position[:, [0, 2]], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(-a["wheel"].angular_velocity, b["wheel"].angular_velocity[:, 1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(a["tyre"].deflection[:, 0], b["tyre"].deflection[:, 0], rtol=0, atol=1e-9)
+
+
+def chain_of_motors(n):
+    """Rods in a row, each with a motor on its pin."""
+    rods = [planar.Body(f"rod{k}", mass=1.0, inertia=1 / 12, position=(k + 0.5, 0.0)) for k in range(n)]
+    pins = [
+        planar.Revolute(f"pin{k}", "ground" if k == 0 else f"rod{k - 1}", f"rod{k}", point=(float(k), 0.0))
+        for k in range(n)
+    ]
+    motor = lambda k: mb.Actuator(f"motor{k}", f"pin{k}.angle", command=1.0 + 0.1 * k, lag=0.1, limit=3.0)
+    forces = [mb.Gravity((0.0, -9.81)), *map(motor, range(n))]
+    return mb.Scene(rods, joints=pins, forces=forces).compile()
+
+
+def test_sparse_elimination_serves_machines_with_states():
+    system = chain_of_motors(20)
+    assert system.elimination is not None and system.nz == 20
+    state = mb.assemble(system)
+    sparse = mb.simulate(system, state, t1=0.3, rtol=1e-9)
+    dense = mb.simulate(system, state, t1=0.3, rtol=1e-9, manifold=manifold.Partition())
+    for a, b in zip(jax.tree.leaves(sparse.ys), jax.tree.leaves(dense.ys), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+
+
+def test_program_does_not_grow_with_the_number_of_motors():
+    lines = []
+    for n in (20, 40):
+        system = chain_of_motors(n)
+        run = jax.jit(lambda state, system=system: mb.simulate(system, state, t1=0.3, throw=False).ys.z)
+        lines.append(len(run.lower(mb.assemble(system)).as_text().splitlines()))
+    assert lines[1] < 1.1 * lines[0]
+
+
+def test_frames_carry_parts_with_states():
+    """A tyre on a frame in the wheel is one with another centre."""
+    wheel = planar.Body("wheel", mass=20.0, inertia=0.9, position=(0.0, 0.3), velocity=(3.0, 0.0))
+    own = {
+        "radius": 0.3,
+        "terrain": terrain.Flat(),
+        "normal": contact.Linear(4e4),
+        "coefficient": 0.8,
+        "slip_stiffness": 15.0,
+        "relaxation_length": 0.2,
+    }
+    frame = planar.Frame("hub", "wheel", position=(0.02, 0.01))
+    a = mb.Scene([wheel], forces=[planar.Tyre("tyre", "hub", **own)], frames=[frame]).compile()
+    b = mb.Scene([wheel], forces=[planar.Tyre("tyre", "wheel", centre=(0.02, 0.01), **own)]).compile()
+    assert "tyre.deflection" in a.state_names() and "tyre.deflection" not in mb.parameters(a)
+    q, u = jnp.array([0.1, 0.28, 0.3]), jnp.array([3.0, -0.2, -8.0])
+    a, b = (system.with_states(jnp.array([0.01])) for system in (a, b))
+    np.testing.assert_allclose(a.force(0.0, q, u), b.force(0.0, q, u), rtol=1e-12)
+    np.testing.assert_allclose(a.state_rates(0.0, q, u), b.state_rates(0.0, q, u), rtol=1e-12)
+    np.testing.assert_allclose(a.potential_energy(0.0, q), b.potential_energy(0.0, q), rtol=1e-12)
+
+
+def test_a_controller_sees_frames_bodies_and_joints_on_frames():
+    """What the function is given is what the trajectory shows."""
+    record = lambda t, measured, states, p: ({"hip.angle": 0.0}, measured)
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, centre=(0.4, 0.0), position=(0.0, 0.0))
+    frames = [planar.Frame("tip", "rod", position=(0.9, 0.1), angle=0.3)]
+    pin = planar.Revolute("hip", "ground", "rod", point=(0.0, 0.0))
+    names = ["tip.position", "tip.velocity", "tip.angle", "rod.position", "rod.angular_velocity", "hip.angle_rate"]
+    shapes = {"position": np.zeros(2), "velocity": np.zeros(2)}
+    states = {f"seen{k}": shapes.get(quantity.split(".")[1], 0.0) for k, quantity in enumerate(names)}
+    watcher = mb.Controller("watcher", record, dict(zip(states, names, strict=True)), ["hip.angle"], states=states)
+    system = mb.Scene([rod], joints=[pin], frames=frames, forces=[watcher]).compile()
+    state = mb.assemble(system, fix={"hip.angle": 0.5}, rates={"hip.angle": 1.5})
+    sol = mb.simulate(system, state, t1=0.01, saveat=[0.0])
+    rates = system.with_states(state.z).state_rates(0.0, state.q, state.u)
+    for quantity, index in zip(names, system.state_names().values(), strict=True):
+        np.testing.assert_allclose(rates[np.array(index)], np.ravel(sol.quantity(quantity)[0]), rtol=0, atol=1e-12)
+
+
+def test_events_dense_output_and_batches():
+    system = cart_and_pole()
+    low = diffrax.Event(lambda t, y, args, **_: y.z[0] + 0.01)
+    sol = mb.simulate(
+        system, leaning(system), t1=2.0, rtol=1e-10, event=low, saveat=diffrax.SaveAt(t1=True, dense=True)
+    )
+    np.testing.assert_allclose(sol.ys.z[-1], -0.01, rtol=0, atol=1e-3)
+    expected = driven.cart_and_pole(np.array([0.05]), list(GAINS.values()))
+    np.testing.assert_allclose(sol.at(0.05).z, expected[0, 4:], rtol=0, atol=1e-9)
+
+    def run(integral):
+        state = leaning(system)
+        state = mb.State(state.q, state.u, jnp.stack([integral]))
+        return mb.simulate(system, state, t1=0.5, rtol=1e-9, throw=False).ys
+
+    batch = jax.vmap(run)(jnp.array([0.0, jnp.nan, 0.05]))
+    assert np.all(np.isnan(batch.q[1])) and np.all(np.isnan(batch.z[1]))
+    for k in (0, 2):
+        np.testing.assert_allclose(batch.z[k], run(jnp.array([0.0, 0.0, 0.05])[k]).z, rtol=0, atol=1e-9)
+
+
+def test_an_error_is_estimated_for_internal_states():
+    system = cart_and_pole()
+    sol = mb.simulate(system, leaning(system), t1=2.0, rtol=1e-6, error=True)
+    expected = driven.cart_and_pole(np.array([2.0]), list(GAINS.values()))
+    true = abs(float(sol["pid"].integral[-1]) - expected[0, 4])
+    assert 0.1 < true / float(sol.error.quantity("pid.integral")[-1]) < 10
+
+
+def test_nothing_is_traced_without_internal_states():
+    mechanism = mechanisms.four_bar()
+    system, state = mechanism.system, mechanism.state
+    assert state.z is None and system.nz == 0 and system.at(state) is system
+    policy = manifold.Partition()
+    term, _ = policy.prepare(system, policy.default_formulation(system), solvers.Adams(), 1e-8)
+    assert with_internal_states(term) is term
+    assert len(jax.tree.leaves(mb.simulate(system, state, t1=0.01).ys)) == 2
+
+
+class Forgetful(AbstractForce):
+    """A part that declares a state without a rate."""
+
+    name: str = name()
+    body: str = body_name()
+    value: Number = internal_state()
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros_like(velocities)
+
+
+class Misnamed(Filter):
+    def state_rates(self, space, poses, velocities, t):
+        return {"other": 0.0}
+
+
+class Misshapen(Filter):
+    def state_rates(self, space, poses, velocities, t):
+        return {"value": jnp.zeros(2)}
+
+
+REFUSED = {
+    "no rate": (lambda: filtered(Forgetful("f", "body")), "Forgetful 'f' has internal states; derive it from"),
+    "another rate": (lambda: filtered(Misnamed("f", "body", lag=1.0)), "a dictionary of the internal states, value"),
+    "shape of a rate": (
+        lambda: filtered(Misshapen("f", "body", lag=1.0)),
+        r"state_rates\['value'\] must return shape \(\), got \(2,\)",
+    ),
+    "not finite": (
+        lambda: filtered(Filter("f", "body", lag=1.0, value=np.nan)),
+        "initial values of the internal states f.value must be finite",
+    ),
+    "unknown state": (
+        lambda: mb.assemble(cart_and_pole(), fix={"pid.integrl": 0.1}),
+        "Unknown coordinate 'pid.integrl'; did you mean 'pid.integral'",
+    ),
+    "two values": (
+        lambda: mb.assemble(cart_and_pole(), fix={"pid.integral": [0.1, 0.2]}),
+        r"Internal state 'pid.integral' has 1 components, got shape \(2,\)",
+    ),
+    "a state without z": (
+        lambda: mb.simulate(system := cart_and_pole(), mb.State(system.guess.q, system.guess.u), t1=1.0),
+        "The system has 1 internal states and the state none",
+    ),
+    "a state with z": (
+        lambda: mb.simulate(
+            (own := mechanisms.four_bar()).system, mb.State(own.state.q, own.state.u, np.zeros(2)), t1=1.0
+        ),
+        "The system has no internal states and the state some",
+    ),
+    "an output's shape": (
+        lambda: cart_and_pole_with(lambda t, m, s, p: (jnp.zeros(2), {"integral": 0.0})),
+        r"must return a force of shape \(\) on 'slide.displacement', got \(2,\)",
+    ),
+    "no rates": (
+        lambda: cart_and_pole_with(lambda t, m, s, p: 0.0),
+        "the function of Controller 'pid' must return the forces and a dictionary of rates",
+    ),
+    "other rates": (
+        lambda: cart_and_pole_with(lambda t, m, s, p: (0.0, {})),
+        "must return the rates of its states, integral",
+    ),
+    "unknown quantity": (
+        lambda: cart_and_pole(measures={"angle": "hinge.angel"}),
+        "Controller 'pid': Unknown quantity 'hinge.angel'; did you mean 'hinge.angle'",
+    ),
+    "unknown source": (
+        lambda: cart_and_pole(measures={"angle": "hing.angle"}),
+        "Controller 'pid': Unknown joint, body or frame 'hing'; did you mean 'hinge'",
+    ),
+    "acts on a body": (lambda: cart_and_pole(acts_on="cart.position"), "it acts on coordinates of joints"),
+    "gain of a force": (
+        lambda: motor_on_four_bar(mode="force"),
+        "Actuator 'motor': gain and damping belong to the modes 'speed' and 'position'",
+    ),
+    "shape of a command": (
+        lambda: motor_on_four_bar(command=[1.0, 2.0]),
+        r"command must have the shape of 'A.angle', \(\), got \(2,\)",
+    ),
+    "equilibrium": (
+        lambda: mb.equilibrium(motor_on_four_bar(mode="force", gain=0.0, command=3.0)[0]),
+        "In the equilibrium internal states change: motor.force",
+    ),
+    "floquet": (
+        lambda: mb.floquet(system := cart_and_pole(), system.guess, 1.0),
+        "floquet does not support internal states; the system has pid.integral",
+    ),
+}
+
+
+def cart_and_pole_with(function):
+    cart = planar.Body("cart", mass=2.0, inertia=1.0)
+    slide = planar.Prismatic("slide", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
+    controller = mb.Controller("pid", function, {}, "slide.displacement", states={"integral": 0.0})
+    return mb.Scene([cart], joints=[slide], forces=[controller]).compile()
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_input_is_named(case):
+    call, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message):
+        call()
