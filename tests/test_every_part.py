@@ -115,6 +115,16 @@ GROUND_2D = {
     "damping": 5.0,
     "smoothing": 0.02,
 }
+TYRE_2D = {
+    "terrain": terrain.Slope(0.1, level=-0.1),
+    "normal": contact.Linear(500.0),
+    "radius": 0.25,
+    "coefficient": 0.7,
+    "slip_stiffness": 4.0,
+    "relaxation_length": 0.2,
+    "damping": 5.0,
+    "smoothing": 0.02,
+}
 POINT_MASS_2D = planar.PointMass("PointMass", mass=1.2, position=(0.4, 0.2))
 BODY_2D = body_2d("Body", velocity=(1.0, 0.0))
 
@@ -166,6 +176,7 @@ PLANAR = [
     ),
     track(),
     on_body_2d(planar.Contact, "normal.stiffness", **GROUND_2D),
+    on_body_2d(planar.Tyre, "slip_stiffness", **TYRE_2D),
 ]
 
 
@@ -212,10 +223,28 @@ def of_joint(cls, parameter, *, rests=True, **options):
     return Example(cls(cls.__name__, f"{pin.name}.angle", **options), [own], parameter, (pin,), (hold_2d(own),), rests)
 
 
+def controlled():
+    own = body_2d("Controller body")
+    pin = pin_2d(own)
+
+    def law(t, measured, states, p):
+        error = p["target"] - measured["angle"]
+        return p["gain"] * (error + 2.0 * states["integral"]), {"integral": error}
+
+    measures, on = {"angle": f"{pin.name}.angle"}, f"{pin.name}.angle"
+    parameters = {"gain": 6.0, "target": 0.5}
+    part = mb.Controller("Controller", law, measures, on, states={"integral": 0.1}, parameters=parameters)
+    return Example(part, [own], "gain", (pin,), (hold_2d(own),), rests=False)
+
+
 FUNCTIONS = [
     of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
+    of_joint(
+        mb.Actuator, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False
+    ),
+    controlled(),
     on_body_2d(mb.Constraint, "curvature", function=on_parabola, parameters={"curvature": 0.4}, rheonomic=False),
     on_body_2d(mb.VelocityConstraint, "angle", function=skate, parameters={"angle": 0.1}, homogeneous=True),
     on_body_2d(mb.Force, "drag", function=drag, parameters={"drag": 0.2}),
@@ -314,6 +343,7 @@ SPATIAL = [
         spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
     ),
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
+    on_body_3d(spatial.Tyre, "slip_stiffness", **TYRE_2D),
 ]
 
 SPACES = {"planar": PLANAR, "functions": FUNCTIONS, "spatial": [*SPATIAL, rubbing_3d()]}
@@ -429,7 +459,7 @@ def test_equilibrium(name):
     state = mb.equilibrium(system)
     still = jnp.zeros(system.nu)
     udot, broken = jax.jit(
-        lambda q: (accelerations(system, Multipliers(), 0.0, q, still)[0], system.position_residual(0.0, q))
+        lambda q: (accelerations(system.at(state), Multipliers(), 0.0, q, still)[0], system.position_residual(0.0, q))
     )(state.q)
     # In m/s² and rad/s², where weights accelerate by ten.
     np.testing.assert_allclose(udot, 0.0, atol=1e-8)

@@ -112,7 +112,7 @@ def test_derivatives_forward_reverse_and_differences():
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
     tight = jax.jit(jax.vmap(lambda x: run(x, rtol=1e-12)))
     step = 1e-4 * jnp.diag(x)
-    differences = (tight(x + step) - tight(x - step)) / (2e-4 * x)[:, None]
+    differences = (tight(x[None] + step) - tight(x[None] - step)) / (2e-4 * x)[:, None]
     np.testing.assert_allclose(reverse.T, differences, rtol=0, atol=1e-6 * np.abs(differences).max(axis=1)[:, None])
 
 

@@ -450,6 +450,18 @@ def forces():
             radius=2.0,
             damping=0.5,
         ),
+        "Tyre": spatial.Tyre(
+            "F",
+            "b",
+            terrain=terrain.Slope(0.2),
+            normal=contact.Linear(30.0),
+            radius=2.0,
+            coefficient=0.4,
+            slip_stiffness=5.0,
+            relaxation_length=0.3,
+            damping=0.5,
+            deflection=0.1,
+        ),
     }
 
 
