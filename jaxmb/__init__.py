@@ -16,12 +16,18 @@ from ._results import RESULTS as RESULTS
 from ._types import State as State
 from .linalg import rotations as rotations
 from .parts import contact as contact, terrain as terrain
+from .parts.combinations import FixedTendon as FixedTendon, JointCoupling as JointCoupling, Tendon as Tendon
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
     Constraint as Constraint,
     Force as Force,
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
+)
+from .parts.joint_laws import (
+    JointActuator as JointActuator,
+    JointFriction as JointFriction,
+    JointStop as JointStop,
 )
 from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
 from .parts.series import Series as Series

@@ -17,10 +17,12 @@ from .parts.base import (
     AbstractForce,
     AbstractLink,
     AbstractNonIdeal,
+    AbstractTendon,
     AbstractVelocityConstraint,
     rows_of,
 )
 from .parts.boundary import check_kernels
+from .parts.combinations import AbstractCombination
 from .parts.fields import anonymous, declarations, inner_parts
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
@@ -40,6 +42,7 @@ from .system.groups import (
     ForceGroup,
     FrameGroup,
     NonIdealGroup,
+    TendonGroup,
     VelocityConstraintGroup,
     servo_group,
     stack,
@@ -47,7 +50,7 @@ from .system.groups import (
 from .system.layout import Layout
 
 # Parts that act on a joint, given by its name.
-_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart)
+_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractCombination)
 
 
 class Scene(eqx.Module):
@@ -121,6 +124,7 @@ class Scene(eqx.Module):
                 NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
             ),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
+            tendons=tuple(map(TendonGroup, kind(AbstractTendon, None))),
             frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
             guess=guess,
             length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
@@ -141,8 +145,9 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
     """
     space = layout.space
     gravity, parts, laws, joints = None, [], [], {}
-    # Parts of joints after the joints that they act on.
-    for part in sorted((*scene.joints, *scene.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
+    # Parts of joints after the joints that they act on, and after tendons along joints.
+    level = lambda part: isinstance(part, _OF_JOINTS) * (1 if isinstance(part, AbstractTendon) else 2)
+    for part in sorted((*scene.joints, *scene.forces), key=level):
         if isinstance(part, AbstractNonIdeal):
             joint, own, on = joints[part.joint]
             if any(on) and getattr(part, "point", None) is not None:
@@ -152,6 +157,14 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             joint, own, on = joints[part.joint_name]
             resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
             parts.append((on_frames(resolved, on), own))
+        elif isinstance(part, AbstractCombination):
+            held = [joints[name] for name in part.joint_names]
+            own = tuple(dict.fromkeys(k for _, bodies, _ in held for k in bodies))
+            placed = [tuple(own.index(k) for k in bodies) for _, bodies, _ in held]
+            part = part.of_joints([on_frames(joint, on) for joint, _, on in held], placed)
+            resolved = part.resolve(space, given[list(own)])
+            joints[part.name] = resolved, own, (None,) * len(own)
+            parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
             own = tuple(index[name] for name in part.bodies)
             moving = [k for k in own if k < len(scene.bodies)]
@@ -221,13 +234,16 @@ def _check_names(scene: Scene):
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
-    is_joint = lambda part: isinstance(part, kinds) and not isinstance(part, AbstractCoordinatePart)
+    of_joints = AbstractCoordinatePart | AbstractCombination
+    is_joint = lambda part: isinstance(part, AbstractTendon) or (
+        isinstance(part, kinds) and not isinstance(part, of_joints)
+    )
     joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, _OF_JOINTS):
-            joint = part.joint if isinstance(part, AbstractNonIdeal) else part.joint_name
-            if joint not in joints:
-                raise ValueError(f"{part.label}: {unknown('joint', joint, joints)}")
+            for joint in _joints_of(part):
+                if joint not in joints or joint == part.name:
+                    raise ValueError(f"{part.label}: {unknown('joint', joint, joints)}")
         elif isinstance(part, AbstractLink):
             for name in part.bodies:
                 if name not in known:
@@ -235,6 +251,12 @@ def _check_names(scene: Scene):
             twice = [name for name in part.bodies if part.bodies.count(name) > 1]
             if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
+
+
+def _joints_of(part):
+    if isinstance(part, AbstractNonIdeal):
+        return (part.joint,)
+    return part.joint_names if isinstance(part, AbstractCombination) else (part.joint_name,)
 
 
 def _check_rotation(part, components, own, layout, poses):
