@@ -32,11 +32,12 @@ class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `fused`: what links became; `rotors`: for each rotor its name and its joint's.
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each rotor its name and its joint's.
     """
 
     scene: Scene
     coordinates: dict[str, tuple[str | None, float]]
+    controls: dict[str, str]
     fused: Fused
     rotors: dict[str, str]
     shapes: tuple[Shape, ...]
@@ -56,6 +57,7 @@ class _Builder:
         self.forces: list[Any] = []
         self.frames: list[Any] = []
         self.coordinates: dict[str, tuple[str | None, float]] = {}
+        self.controls: dict[str, str] = {}
         self.rotors: dict[str, str] = {}
         self.names: set[str] = {GROUND}
         self.tendons: dict[str, tuple[str, float]] = {}
@@ -80,7 +82,7 @@ class _Builder:
             scene: Any = None
         else:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
-        return Built(scene, self.coordinates, self.fused, self.rotors, self._shapes())
+        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, self._shapes())
 
     def _named(self, name, kind=""):
         """A name that nothing in the scene has yet."""
@@ -295,9 +297,11 @@ class _Builder:
             gear, shift = actuator.gear, actuator.gear * offset
             shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
             ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
+            name = self._named(actuator.name, "actuator")
+            self.controls[actuator.name] = f"{name}.control"
             self.forces.append(
                 JointActuator(
-                    self._named(actuator.name, "actuator"),
+                    name,
                     coordinate,
                     control=actuator.control,
                     gear=gear,

@@ -76,7 +76,7 @@ def mjcf(source: str | os.PathLike[str], *, ignore: str | Collection[str] = ()) 
         for k in range(model.nkey)
     }
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
-    return ImportedModel(names.model, built.scene, said, coordinates, states, built.shapes, locate)
+    return ImportedModel(names.model, built.scene, said, coordinates, built.controls, states, built.shapes, locate)
 
 
 class _Names:

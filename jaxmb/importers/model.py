@@ -23,6 +23,8 @@ class ImportedModel:
         a flywheel at the origin that is geared to its joint.
     - `notes`: sentences on what is approximated and what is left out.
     - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.
+    - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
+        `simulate(..., inputs=)`.
     - `states`: the named states of the file, such as keyframes of MJCF, for `assemble`.
     - `shapes`: what the links look like, for a picture.
     """
@@ -31,6 +33,7 @@ class ImportedModel:
     scene: Scene
     notes: tuple[str, ...]
     coordinates: Mapping[str, str]
+    controls: Mapping[str, str] = dataclasses.field(default_factory=dict)
     states: Mapping[str, State] = dataclasses.field(default_factory=dict)
     shapes: tuple[Shape, ...] = ()
     locate: Callable[[np.ndarray, np.ndarray], State] | None = dataclasses.field(default=None, repr=False)
