@@ -45,9 +45,7 @@ def mjcf(source: str | os.PathLike[str], *, ignore: str | Collection[str] = ()) 
     "jaxmb[import]"`.
     """
     notes = Notes(checked_ignore(ignore))
-    model, file, spec_notes = compiled(source)
-    for sentence in spec_notes:
-        notes.say(sentence)
+    model, file = compiled(source, notes)
     import mujoco
 
     refuse_unknown(mujoco, model, notes)

@@ -4,13 +4,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+from .notes import Notes
 from .source import file_name, is_text
 
 
-def compiled(source: str | os.PathLike[str]) -> tuple[Any, str, list[str]]:
-    """MuJoCo's model of a file, what messages call the file, and sentences on what was left out.
+def compiled(source: str | os.PathLike[str], notes: Notes) -> tuple[Any, str]:
+    """MuJoCo's model of a file, and what messages call the file.
 
-    Materials and textures, and meshes that are missing, are left out.
+    Materials and textures, and meshes that are missing, are left out, and `notes` say so.
 
     **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that an inertia comes from.
     """
@@ -20,8 +21,8 @@ def compiled(source: str | os.PathLike[str]) -> tuple[Any, str, list[str]]:
         raise ValueError(f"{file} does not exist.")
     try:
         spec = mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
-        said = _without_pictures(mujoco, spec, file)
-        return spec.compile(), file, said
+        _without_pictures(spec, notes)
+        return spec.compile(), file
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
 
@@ -34,38 +35,42 @@ def _mujoco():
     return mujoco
 
 
-def _without_pictures(mujoco: Any, spec: Any, file: str) -> list[str]:
-    said = []
+def _without_pictures(spec: Any, notes: Notes) -> None:
     for kind in ("geoms", "sites", "tendons", "skins", "flexes"):
         for element in getattr(spec, kind, ()):
             if hasattr(element, "material"):
                 element.material = ""
+    left_out = [f"{len(getattr(spec, kind))} {kind}" for kind in ("materials", "textures", "skins") if getattr(spec, kind)]
+    if left_out:
+        notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
     for kind in ("materials", "textures", "skins"):
-        elements = list(getattr(spec, kind))
-        if elements:
-            said.append(f"{kind.capitalize()} are left out: {len(elements)}.")
-        for element in elements:
+        for element in list(getattr(spec, kind)):
             spec.delete(element)
     folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")
-    missing = {mesh.name or Path(mesh.file).stem for mesh in spec.meshes if mesh.file and not (folder / mesh.file).exists()}
+    is_missing = lambda mesh: mesh.file and not (folder / mesh.file).exists()
+    missing = {_named(mesh): mesh for mesh in spec.meshes if is_missing(mesh)}
     if missing:
-        _without_meshes(mujoco, spec, missing, file)
-        said.append(f"Mesh files are missing, so the picture lacks them: {', '.join(sorted(missing))}.")
-    return said
+        notes.say(f"Mesh files are missing, so the picture lacks them: {', '.join(sorted(missing))}.")
+        _without_meshes(spec, missing, notes)
 
 
-def _without_meshes(mujoco, spec, missing, file):
+def _named(mesh):
+    return mesh.name or Path(mesh.file).stem
+
+
+def _without_meshes(spec, missing, notes):
     for geom in list(spec.geoms):
         if geom.meshname not in missing:
             continue
         body = geom.parent
         weighs = not (geom.mass == 0 or geom.density == 0)
         if body.name != "world" and weighs and not body.explicitinertial:
-            raise ValueError(
-                f"the inertia of body {body.name!r} comes from mesh {geom.meshname!r}, whose file is missing; give the "
-                "file, or the body an <inertial>."
+            notes.refuse(
+                "meshes",
+                body.name,
+                f"The mass of body {body.name!r} comes from mesh {geom.meshname!r}, whose file is missing: give the file, "
+                "or the body an <inertial>",
             )
         spec.delete(geom)
-    for mesh in list(spec.meshes):
-        if (mesh.name or Path(mesh.file).stem) in missing:
-            spec.delete(mesh)
+    for mesh in missing.values():
+        spec.delete(mesh)

@@ -8,13 +8,15 @@ from ..parts.names import unknown
 # What can be left out, by name.
 LEAVABLE = (
     "actuators",
+    "armature",
     "collisions",
     "couplings",
     "damping",
     "friction",
+    "joints",
     "limits",
     "loops",
-    "armature",
+    "meshes",
     "springs",
     "tendons",
 )
