@@ -65,8 +65,10 @@ class _Builder:
     def build(self) -> Built:
         machine = self.machine
         for carrier in self.fused.carriers.values():
-            self.names.add(carrier.name)
+            carrier.name = self._named(carrier.name, "link")
             self.bodies.append(_body(carrier))
+            if carrier.moved:
+                self._moved(carrier)
         # Names of joints come before those of other elements.
         for chain in self.fused.chains:
             self._chain(chain)
@@ -91,7 +93,7 @@ class _Builder:
         out = next(each for each in tries if each not in self.names)
         self.names.add(out)
         if name and out != name:
-            self.notes.say(f"{kind.capitalize() or 'Element'} {name!r} is called {out!r}: names are unique in a scene.")
+            self.notes.say("Elements have other names, since names are unique in a scene: {}.", f"{name} → {out}")
         return out
 
     # Joints
@@ -117,6 +119,11 @@ class _Builder:
         self.coordinates |= found.coordinates
         for joint in joints:
             self._passive(joint, a.name, b)
+
+    def _moved(self, link):
+        """A body whose motion is prescribed: that of its joint."""
+        place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": quaternion(link.rotation)}
+        self.joints.append(Fixed(self._named(f"{link.name} motion"), GROUND, link.name, **place))
 
     def _passive(self, joint: Joint, a: str, b: chains.Body):
         """What acts on a joint of itself."""
@@ -184,14 +191,12 @@ class _Builder:
 
     def _friction(self, name, coordinate, force):
         self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
-        self.notes.say(
-            f"The dry friction of {name!r} is {force:.4g} tanh(rate / transition_speed): a joint at rest creeps."
-        )
+        self.notes.say("Dry friction is force · tanh(rate / transition_speed), so that joints at rest creep: {}.", name)
 
     def _stop(self, name, coordinate, limits, offset, inertia, time, *, turns):
         lower, upper = limits
         if turns and upper - lower >= 2 * np.pi:
-            self.notes.say(f"The limits of {name!r} allow more than a full turn and are left out.")
+            self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
             return
         own = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
         self.forces.append(
@@ -205,8 +210,9 @@ class _Builder:
             )
         )
         self.notes.say(
-            f"The limits of {name!r}, {lower:.4g} to {upper:.4g}, are compliant stops of stiffness "
-            f"{own['stiffness']:.4g} and damping {own['damping']:.4g}."
+            "Limits are compliant stops, of the moved inertia over the square of a time, by default "
+            f"{STOP_TIME} s: {{}}.",
+            name,
         )
 
     # Loops and couplings
@@ -219,7 +225,7 @@ class _Builder:
                 self.fused.point(link, point) for link, point in ((loop.link_a, loop.point_a), (loop.link_b, loop.point_b))
             )
             if a == b:
-                self.notes.say(f"Loop {loop.name!r} binds links that are fixed to each other anyway.")
+                self.notes.say("Loops between links that are fixed to each other anyway are left out: {}.", loop.name)
                 continue
             name = self._named(loop.name, "loop")
             if loop.rotation is None:
@@ -313,8 +319,9 @@ class _Builder:
             )
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
-                    f"Control or force of {actuator.name!r} are clipped to their ranges: where that sets in, the motion "
-                    "has a kink and steps are short."
+                    "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and steps "
+                    "are short: {}.",
+                    actuator.name,
                 )
 
     def _middle(self, name):
@@ -342,9 +349,7 @@ class _Builder:
         if carrier != GROUND:
             force = -share * link.mass * self.machine.gravity
             self.forces.append(PointForce(self._named(f"{name} buoyancy"), carrier, force=force, point=centre))
-            self.notes.say(
-                f"The weight of {name!r} is compensated by a constant force, which does not follow a change of gravity."
-            )
+            self.notes.say("Weight is compensated by constant forces, which do not follow a change of gravity: {}.", name)
 
     def _shapes(self):
         out = []

@@ -22,7 +22,7 @@ class Chain:
 class Fused:
     """What links became.
 
-    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of; `of`: for each link the
+    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with their own names; `of`: for each link the
     name of its carrier or the ground; `frames`: for each link that is fixed to another one its carrier, and position
     and rotation in it; `chains`.
     """
@@ -39,12 +39,12 @@ class Fused:
         if carrier == GROUND:
             return Body(GROUND, np.zeros(3), np.eye(3))
         own = self.carriers[carrier]
-        return Body(carrier, own.position, own.rotation)
+        return Body(own.name, own.position, own.rotation)
 
     def point(self, link: str, at: np.ndarray) -> tuple[str, np.ndarray]:
         """The body of a link, and a point of the link in that body's frame."""
         body = self.placed(link)
-        if link == GROUND or body.name == link:
+        if self.of[link] == link:
             return body.name, at
         own = self.links[link]
         return body.name, body.point(own.position + own.rotation @ at)
@@ -52,7 +52,7 @@ class Fused:
     def rotation(self, link: str) -> np.ndarray:
         """The rotation matrix from a link's axes to those of its body."""
         body = self.placed(link)
-        if link == GROUND or body.name == link:
+        if self.of[link] == link:
             return np.eye(3)
         return body.rotation.T @ self.links[link].rotation
 
@@ -151,7 +151,7 @@ def _chains(joints, of, light, links, notes):
 def _summed(frame: Link, links: list[Link]) -> Link:
     """Several links as one, in the frame of one of them."""
     if len(links) == 1:
-        return frame
+        return dataclasses.replace(frame)
     mass = sum(link.mass for link in links)
     centres = [frame.rotation.T @ (link.position + link.rotation @ link.centre - frame.position) for link in links]
     centre = sum(link.mass * own for link, own in zip(links, centres, strict=True)) / mass

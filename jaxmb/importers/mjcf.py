@@ -1,6 +1,5 @@
 """Machines from MJCF, MuJoCo's format, which MuJoCo itself reads."""
 
-import os
 from collections.abc import Collection
 from typing import Any
 
@@ -30,13 +29,13 @@ from .notes import Notes, checked_ignore
 _KINDS = ("free", "ball", "slide", "hinge")
 
 
-def mjcf(source: str | os.PathLike[str], *, ignore: str | Collection[str] = ()) -> ImportedModel:
+def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     """A machine from MJCF.
 
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here: `connect`,
     `weld` and `joint` equalities hold exactly, whatever their `solref` and `solimp`.
 
-    **Arguments:** `source`: a path, or the text of a file; `ignore`: what is to be left out, words such as
+    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words such as
     `"collisions"`, `"limits"` and `"friction"`, or names of elements.
 
     **Returns:** an `ImportedModel`; its `notes` say what is approximated.
@@ -107,11 +106,14 @@ def _read_links(model, data, names, machine):
             inertia=turn @ np.diag(model.body_inertia[k]) @ turn.T,
             position=np.array(data.xpos[k]),
             rotation=np.array(data.xmat[k]).reshape(3, 3),
-            moved=bool(model.body_mocapid[k] >= 0),
         )
+        if model.body_mocapid[k] >= 0:
+            # What moves as prescribed may have any mass.
+            link = machine.links[name]
+            link.moved, link.mass, link.inertia = True, max(link.mass, 1.0), link.inertia + np.eye(3)
         if model.body_gravcomp[k]:
             machine.buoyancy[name] = float(model.body_gravcomp[k])
-        if not model.body_jntnum[k]:
+        if not model.body_jntnum[k] and not machine.links[name].moved:
             parent = names("body", model.body_parentid[k])
             machine.joints.append(Joint(f"{name} weld", "fixed", parent, name))
 
@@ -160,7 +162,7 @@ def _read_equalities(mujoco, model, names, machine, notes):
     for k in range(model.neq):
         name, data = names("equality", k), np.array(model.eq_data[k])
         if not model.eq_active0[k]:
-            notes.say(f"The equality {name!r} is not active and is left out.")
+            notes.say("Equalities that are not active are left out: {}.", name)
             continue
         one, two, kind = model.eq_obj1id[k], model.eq_obj2id[k], kinds(int(model.eq_type[k]))
         if kind == kinds.mjEQ_JOINT:
@@ -247,12 +249,13 @@ def _read_shapes(mujoco, model, names, machine):
 
 
 class _Locate:
-    """States of the bodies at MuJoCo's coordinates and velocities."""
+    """States of the bodies at the coordinates and velocities of MuJoCo's `model`."""
 
     def __init__(self, mujoco: Any, model: Any, names: _Names, built: Any):
-        self._mujoco, self._model = mujoco, model
+        self._mujoco, self.model = mujoco, model
         self._bodies: list[tuple[str, int]] = []
-        numbers = {names("body", k): k for k in range(model.nbody)}
+        links = {names("body", k): k for k in range(model.nbody)}
+        numbers = {own.name: links[link] for link, own in built.fused.carriers.items()}
         joints = {names.joint(k): k for k in range(model.njnt)}
         for body in () if built.scene is None else built.scene.bodies:
             if body.name in built.rotors:
@@ -262,7 +265,7 @@ class _Locate:
         self._centres = [] if built.scene is None else [np.asarray(body.centre) for body in built.scene.bodies]
 
     def __call__(self, qpos: np.ndarray, qvel: np.ndarray) -> State:
-        mujoco, model = self._mujoco, self._model
+        mujoco, model = self._mujoco, self.model
         qvel = qvel if qvel.size else np.zeros(model.nv)
         if qpos.shape != (model.nq,) or qvel.shape != (model.nv,):
             raise ValueError(f"qpos must have shape ({model.nq},) and qvel ({model.nv},).")

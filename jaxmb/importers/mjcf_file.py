@@ -1,6 +1,7 @@
 """MuJoCo's compilation of an MJCF file, without what only pictures need."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,8 @@ from .notes import Notes
 from .source import file_name, is_text
 
 
-def compiled(source: str | os.PathLike[str], notes: Notes) -> tuple[Any, str]:
-    """MuJoCo's model of a file, and what messages call the file.
+def compiled(source: Any, notes: Notes) -> tuple[Any, str]:
+    """MuJoCo's model of a path, a text or an `MjSpec`, and what messages call it.
 
     Materials and textures, and meshes that are missing, are left out, and `notes` say so.
 
@@ -17,14 +18,27 @@ def compiled(source: str | os.PathLike[str], notes: Notes) -> tuple[Any, str]:
     """
     mujoco = _mujoco()
     file = file_name(source)
-    if not is_text(source) and not Path(source).exists():
-        raise ValueError(f"{file} does not exist.")
+    if isinstance(source, os.PathLike) or (isinstance(source, str) and not is_text(source)):
+        if not Path(source).is_file():
+            raise ValueError(f"{file} does not exist.")
     try:
-        spec = mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
-        _without_pictures(spec, notes)
-        return spec.compile(), file
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            spec = _specification(mujoco, source)
+            _without_pictures(spec, notes)
+            model = spec.compile()
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
+        notes.finish(file)
+        raise ValueError(f"{file}: {str(error).strip()}") from None
+    for warning in caught:
+        notes.say(f"MuJoCo: {warning.message}.")
+    return model, file
+
+
+def _specification(mujoco, source):
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy()
+    return mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
 
 
 def _mujoco():

@@ -47,11 +47,14 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     listed = ", ".join(f"{number} {what}" for what, number in effectless.items() if number)
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {listed}.")
-    for what, number, fields in (
-        ("Equalities", model.neq, (model.eq_solref, model.eq_solimp)),
-    ):
-        if number and any(np.any(np.asarray(own) != own[0]) or own.size for own in fields):
-            notes.say(f"{what} hold exactly: their solref and solimp have no effect.")
+    if model.neq:
+        notes.say("Equalities hold exactly: their solref and solimp have no effect.")
+    moved = np.flatnonzero(model.body_mocapid >= 0)
+    if moved.size:
+        notes.say(
+            "Mocap bodies are held by a joint, whose point_a and orientation may be inputs: {}.",
+            *(named("body", k) for k in moved),
+        )
 
 
 def _set(values):

@@ -27,25 +27,26 @@ class Notes:
     """Collects sentences while a file is read.
 
     **Fields:** `ignore`: what is to be left out, a word of `LEAVABLE` or the name of an element of the file; `said`:
-    approximations, and what was left out; `refused`.
+    approximations, and what was left out, each with the names that it holds for; `refused`.
     """
 
     ignore: frozenset[str]
-    said: list[str] = dataclasses.field(default_factory=list)
+    said: dict[str, list[str]] = dataclasses.field(default_factory=dict)
     refused: list[str] = dataclasses.field(default_factory=list)
     used: set[str] = dataclasses.field(default_factory=set)
 
-    def say(self, sentence: str) -> None:
-        """Note a sentence once."""
-        if sentence not in self.said:
-            self.said.append(sentence)
+    def say(self, sentence: str, *names: str) -> None:
+        """Note a sentence once; if it holds for elements, with their names in place of `{}`."""
+        own = self.said.setdefault(sentence, [])
+        own += [repr(name) for name in names if repr(name) not in own]
 
     def leaves_out(self, kind: str, name: str = "") -> bool:
         """Whether a kind of element, or the one of this name, is to be left out; if so, this is noted."""
         for word in (kind, name):
             if word and word in self.ignore:
                 self.used.add(word)
-                self.say(f"The {kind}{f' of {name!r}' if name else ''} are left out, as ignore={word!r} asks.")
+                sentence = f"Left out, as ignore={word!r} asks: {kind}"
+                self.say(f"{sentence} of {{}}." if name else f"{sentence}.", *[name][: bool(name)])
                 return True
         return False
 
@@ -64,7 +65,7 @@ class Notes:
         if self.refused:
             listed = "".join(f"\n- {sentence}" for sentence in self.refused)
             raise ValueError(f"{file} has elements that cannot be imported:{listed}")
-        return tuple(self.said)
+        return tuple(sentence.format(", ".join(names)) if names else sentence for sentence, names in self.said.items())
 
 
 def checked_ignore(ignore: str | Collection[str]) -> frozenset[str]:

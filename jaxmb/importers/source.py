@@ -12,7 +12,9 @@ def is_text(source: Any) -> bool:
 
 def file_name(source: Any) -> str:
     """What messages call a source."""
-    return "The text" if is_text(source) else str(Path(source))
+    if is_text(source):
+        return "The text"
+    return str(source) if isinstance(source, str | os.PathLike) else type(source).__name__
 
 
 def text_of(source: str | os.PathLike[str]) -> str:
