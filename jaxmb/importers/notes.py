@@ -55,7 +55,7 @@ class Notes:
         if not self.leaves_out(kind, name):
             self.refused.append(f"{sentence} (ignore={kind!r} leaves it out)")
 
-    def finish(self, file: str) -> tuple[str, ...]:
+    def finish(self, file: str, what: str = "cannot be imported") -> tuple[str, ...]:
         """The sentences.
 
         **Raises:** `ValueError` that lists all that was refused, and for words of `ignore` that nothing answers to.
@@ -64,7 +64,7 @@ class Notes:
             raise ValueError(f"ignore: {unknown('element', word, LEAVABLE)}")
         if self.refused:
             listed = "".join(f"\n- {sentence}" for sentence in self.refused)
-            raise ValueError(f"{file} has elements that cannot be imported:{listed}")
+            raise ValueError(f"{file} has elements that {what}:{listed}")
         return tuple(sentence.format(", ".join(names)) if names else sentence for sentence, names in self.said.items())
 
 
