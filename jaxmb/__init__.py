@@ -2,6 +2,7 @@
 
 from . import (
     formulations as formulations,
+    importers as importers,
     lagrangian as lagrangian,
     manifold as manifold,
     mechanisms as mechanisms,

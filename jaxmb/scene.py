@@ -235,8 +235,8 @@ def _check_names(scene: Scene):
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
     of_joints = AbstractCoordinatePart | AbstractCombination
-    is_joint = lambda part: isinstance(part, AbstractTendon) or (
-        isinstance(part, kinds) and not isinstance(part, of_joints)
+    is_joint = lambda part: (
+        isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not isinstance(part, of_joints))
     )
     joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
     for part in (*scene.joints, *scene.forces):

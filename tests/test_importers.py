@@ -129,10 +129,12 @@ def test_a_small_tree_moves_as_in_mujoco():
 
 @pytest.mark.long
 def test_joints_in_succession_move_as_in_mujoco():
-    two = '<joint name="u1" axis="1 0 0" damping=".1" armature=".01"/><joint name="u2" axis="0 1 0" stiffness="1" ref="9"/>'
+    two = '<joint name="u1" axis="1 0 0" damping=".1" armature=".01"/>'
+    two += '<joint name="u2" axis="0 1 0" stiffness="1" ref="9"/>'
     three = '<joint name="g1" axis="1 0 0" armature=".01"/><joint name="g2" axis="0 0 1" ref="5" stiffness="1"/>'
     three += '<joint name="g3" axis="0 1 0" damping=".2"/>'
-    both = '<joint name="c1" axis="1 0 0" damping=".1"/><joint name="c2" type="slide" axis="1 0 0" stiffness="9" ref=".1"/>'
+    both = '<joint name="c1" axis="1 0 0" damping=".1"/>'
+    both += '<joint name="c2" type="slide" axis="1 0 0" stiffness="9" ref=".1"/>'
     plane = '<joint name="px" type="slide" axis="1 0 0"/><joint name="pz" type="slide" axis="0 0 1" ref=".2"/>'
     plane += '<joint name="py" axis="0 1 0" damping=".1" armature=".1"/>'
     ball = '<joint name="ball" type="ball" damping=".1" stiffness="1.5"/>'
@@ -161,7 +163,12 @@ HINGE = '<joint name="hip" axis="0 1 0"/>'
         ('<joint name="hip" damping=".5"/>', "", "hip spring", {"damping": 0.5, "stiffness": 0}),
         ('<joint name="hip" armature=".1"/>', "", "hip rotor", {"inertia": 0.1 * np.eye(3)}),
         ('<joint name="hip" armature=".1"/>', "", "hip gear", {"coefficients": [0, 1]}),
-        (HINGE, '<equality><connect name="loop" body1="a" anchor=".3 0 0"/></equality>', "loop", {"point_b": [0.6, 0, 0]}),
+        (
+            HINGE,
+            '<equality><connect name="loop" body1="a" anchor=".3 0 0"/></equality>',
+            "loop",
+            {"point_b": [0.6, 0, 0]},
+        ),
         (HINGE, '<equality><weld name="loop" body1="a"/></equality>', "loop", {"orientation": [1, 0, 0, 0]}),
         (
             HINGE,
@@ -176,7 +183,12 @@ HINGE = '<joint name="hip" axis="0 1 0"/>'
             "m",
             {"gain": [5, 0, 0], "bias": [0, -5, -2]},
         ),
-        (HINGE, '<actuator><velocity name="m" joint="hip" kv="2"/></actuator>', "m", {"gain": [2, 0, 0], "bias": [0, 0, -2]}),
+        (
+            HINGE,
+            '<actuator><velocity name="m" joint="hip" kv="2"/></actuator>',
+            "m",
+            {"gain": [2, 0, 0], "bias": [0, 0, -2]},
+        ),
         (
             HINGE,
             '<tendon><fixed name="t"><joint joint="hip" coef=".4"/></fixed></tendon>',
@@ -194,7 +206,8 @@ def test_what_is_exact(joints, more, name, fields):
 
 
 def test_inertia_names_and_frames():
-    fixed = '<body name="sensor" pos="0 0 .1" euler="0 0 90"><geom type="sphere" size=".02"/><site name="eye" pos="1 0 0"/></body>'
+    inside = '<geom type="sphere" size=".02"/><site name="eye" pos="1 0 0"/>'
+    fixed = f'<body name="sensor" pos="0 0 .1" euler="0 0 90">{inside}</body>'
     model = importers.mjcf(file(rod("a", HINGE, fixed) + '<body name="wall"><geom type="box" size="1 1 1"/></body>'))
     reference = mujoco.MjModel.from_xml_string(file(rod("a", HINGE, fixed)))
     (body,) = model.scene.bodies
@@ -247,20 +260,51 @@ SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0
     "joints, more, head, message",
     [
         (SLIDES, "", "", "'a' has several joints in succession, slide 'x', hinge 'y'"),
-        (HINGE, '<tendon><spatial name="t"><site site="o"/><geom geom="drum"/><site site="s"/></spatial></tendon>', "", "Tendon 't' wraps around shapes or pulleys"),
-        (HINGE, '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>', "", "Actuator 'm' has dynamics of its own"),
-        (HINGE, '<actuator><general name="m" site="s" gear="0 0 1 0 0 0"/></actuator>', "", "Actuator 'm' acts by way of site"),
-        (HINGE, '<actuator><adhesion name="m" body="a" ctrlrange="0 1"/></actuator>', "", "Actuator 'm' acts by way of body"),
+        (
+            HINGE,
+            '<tendon><spatial name="t"><site site="o"/><geom geom="drum"/><site site="s"/></spatial></tendon>',
+            "",
+            "Tendon 't' wraps around shapes or pulleys",
+        ),
+        (
+            HINGE,
+            '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>',
+            "",
+            "Actuator 'm' has dynamics of its own",
+        ),
+        (
+            HINGE,
+            '<actuator><general name="m" site="s" gear="0 0 1 0 0 0"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of site",
+        ),
+        (
+            HINGE,
+            '<actuator><adhesion name="m" body="a" ctrlrange="0 1"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of body",
+        ),
         (HINGE, "", '<option density="1"/>', "A fluid is not modelled"),
         ('<joint name="hip" type="ball" armature=".1"/>', "", "", "armature of the ball joint 'hip'"),
         ('<joint name="hip" type="ball" limited="true" range="0 30"/>', "", "", "limits of the ball joint 'hip'"),
-        (HINGE, '<equality><tendon name="e" tendon1="t"/></equality><tendon><fixed name="t"><joint joint="hip" coef="1"/></fixed></tendon>', "", "The equality 'e' is of type tendon"),
+        (
+            HINGE,
+            '<equality><tendon name="e" tendon1="t"/></equality>'
+            '<tendon><fixed name="t"><joint joint="hip" coef="1"/></fixed></tendon>',
+            "",
+            "The equality 'e' is of type tendon",
+        ),
         ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
         ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused_is_named(joints, more, head, message):
-    text = file('<site name="o"/><geom name="drum" type="sphere" size=".01"/>' + rod("a", joints, '<site name="s" pos=".1 0 0"/>'), more, head)
+    text = file(
+        '<site name="o"/><geom name="drum" type="sphere" size=".01"/>'
+        + rod("a", joints, '<site name="s" pos=".1 0 0"/>'),
+        more,
+        head,
+    )
     with pytest.raises(ValueError, match=message):
         importers.mjcf(text)
 
@@ -308,7 +352,8 @@ def test_wrong_mjcf(text, message):
 
 def test_missing_meshes_of_pictures_are_said():
     text = file(
-        '<body name="a"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><geom type="mesh" mesh="m"/></body>',
+        '<body name="a"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+        '<geom type="mesh" mesh="m"/></body>',
         '<asset><mesh name="m" file="m.stl"/></asset>',
     )
     assert "Mesh files are missing, so the picture lacks them: m." in importers.mjcf(text).notes

@@ -13,7 +13,9 @@ mujoco = pytest.importorskip("mujoco")
 
 
 def small_scene():
-    body = lambda name, x, **more: spatial.Body(name, mass=1.0, inertia=(0.02, 0.09, 0.07), position=(x, 0.0, 0.0), **more)
+    body = lambda name, x, **more: spatial.Body(
+        name, mass=1.0, inertia=(0.02, 0.09, 0.07), position=(x, 0.0, 0.0), **more
+    )
     bodies = [body("arm", 0.5), body("hand", 1.5), body("float", 3.0, orientation=(0.8, 0.0, 0.6, 0.0))]
     joints = [
         spatial.Revolute("hip", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
@@ -81,7 +83,11 @@ def test_machines_of_the_library_read_back(name):
 @pytest.mark.parametrize(
     "joints, forces, message",
     [
-        ([spatial.Distance("rod", "ground", "body", point_a=(0, 0, 2.0))], [], "Distance 'rod' cannot be expressed where"),
+        (
+            [spatial.Distance("rod", "ground", "body", point_a=(0, 0, 2.0))],
+            [],
+            "Distance 'rod' cannot be expressed where",
+        ),
         ([], [spatial.PointForce("push", "body", force=(1.0, 0, 0))], "PointForce 'push' cannot be expressed"),
     ],
 )

@@ -32,7 +32,8 @@ class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each rotor its name and its joint's.
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each
+    rotor its joint.
     """
 
     scene: Scene
@@ -166,9 +167,7 @@ class _Builder:
             origin = {"point_b": np.zeros(3)}
             self.forces.append(Damper(self._named(f"{joint.name} drag"), a, b.name, damping=joint.damping, **origin))
         if "damping" in wanted:
-            self.forces.append(
-                RotationalDamper(self._named(f"{joint.name} damper"), a, b.name, damping=joint.damping)
-            )
+            self.forces.append(RotationalDamper(self._named(f"{joint.name} damper"), a, b.name, damping=joint.damping))
         if "springs" in wanted and joint.kind == "ball":
             free = np.zeros(3) if joint.free is None else joint.free
             self.forces.append(
@@ -222,7 +221,8 @@ class _Builder:
             if self.notes.leaves_out("loops", loop.name):
                 continue
             (a, point_a), (b, point_b) = (
-                self.fused.point(link, point) for link, point in ((loop.link_a, loop.point_a), (loop.link_b, loop.point_b))
+                self.fused.point(link, point)
+                for link, point in ((loop.link_a, loop.point_a), (loop.link_b, loop.point_b))
             )
             if a == b:
                 self.notes.say("Loops between links that are fixed to each other anyway are left out: {}.", loop.name)
@@ -319,8 +319,8 @@ class _Builder:
             )
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
-                    "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and steps "
-                    "are short: {}.",
+                    "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
+                    "steps are short: {}.",
                     actuator.name,
                 )
 
@@ -349,7 +349,9 @@ class _Builder:
         if carrier != GROUND:
             force = -share * link.mass * self.machine.gravity
             self.forces.append(PointForce(self._named(f"{name} buoyancy"), carrier, force=force, point=centre))
-            self.notes.say("Weight is compensated by constant forces, which do not follow a change of gravity: {}.", name)
+            self.notes.say(
+                "Weight is compensated by constant forces, which do not follow a change of gravity: {}.", name
+            )
 
     def _shapes(self):
         out = []

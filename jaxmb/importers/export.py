@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Collection
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np

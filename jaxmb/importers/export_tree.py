@@ -123,7 +123,7 @@ def _acts_on(group, part, k):
 
 
 def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> Tree:
-    """The tree of a system's bodies. Joints are taken in their order, first those of bodies that are reached already."""
+    """The tree of a system's bodies. Joints are taken in their order, first those of bodies that are reached."""
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
     tree = Tree(places)
     parts = [p for p in parts_of(system, system.constraints, places) if not notes.leaves_out("joints", p.name)]

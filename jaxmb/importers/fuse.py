@@ -22,9 +22,9 @@ class Chain:
 class Fused:
     """What links became.
 
-    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with their own names; `of`: for each link the
-    name of its carrier or the ground; `frames`: for each link that is fixed to another one its carrier, and position
-    and rotation in it; `chains`.
+    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with their own names; `of`:
+    for each link the name of its carrier or the ground; `frames`: for each link that is fixed to another one its body,
+    and position and rotation in it; `chains`.
     """
 
     carriers: dict[str, Link]
@@ -107,9 +107,7 @@ def fuse(machine: Machine, notes: Notes) -> Fused:
     moving = [joint for joint in machine.joints if joint.kind != "fixed"]
     light = {name for name, own in groups.items() if name != GROUND and not any(link.mass > 0 for link in own)}
     chains = _chains(moving, of, light, links, notes)
-    carriers = {
-        name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light
-    }
+    carriers = {name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light}
     fused = Fused(carriers, of, links, {}, chains)
     for name, carrier in of.items():
         if carrier != name and carrier not in light:
@@ -129,8 +127,8 @@ def _chains(joints, of, light, links, notes):
         if len(at.get(name, [])) != 2:
             ends = "carries nothing" if len(at.get(name, [])) < 2 else "branches"
             notes.refused.append(
-                f"{links[name].where}Link {name!r} moves without mass and {ends}: give it a mass and an inertia, or fix "
-                "it to another link."
+                f"{links[name].where}Link {name!r} moves without mass and {ends}: give it a mass and an inertia, or "
+                "fix it to another link."
             )
     out = []
     for joint in joints:

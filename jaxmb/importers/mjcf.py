@@ -32,11 +32,11 @@ _KINDS = ("free", "ball", "slide", "hinge")
 def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     """A machine from MJCF.
 
-    MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here: `connect`,
-    `weld` and `joint` equalities hold exactly, whatever their `solref` and `solimp`.
+    MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
+    `connect`, `weld` and `joint` equalities hold exactly, whatever their `solref` and `solimp`.
 
-    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words such as
-    `"collisions"`, `"limits"` and `"friction"`, or names of elements.
+    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
+    such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
 
     **Returns:** an `ImportedModel`; its `notes` say what is approximated.
 
@@ -217,9 +217,7 @@ def _read_tendons(mujoco, model, names, machine, off):
 def _read_marks(model, names, machine):
     for k in range(model.nsite):
         link = names("body", model.site_bodyid[k])
-        machine.marks.append(
-            Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k]))
-        )
+        machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k])))
 
 
 _SHAPES = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
@@ -288,4 +286,3 @@ class _Locate:
             q += [*(data.xpos[k] + arm), *data.xquat[k]]
             u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
         return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))
-

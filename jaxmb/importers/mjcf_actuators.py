@@ -1,4 +1,4 @@
-"""Actuators of MJCF: those whose force is a function of the control and of the length and speed of a joint or tendon."""
+"""Actuators of MJCF whose force depends on the control and on the length and speed of a joint or tendon."""
 
 from typing import Any
 
@@ -27,7 +27,10 @@ def _read(mujoco, model, names, notes, k, name):
     if model.actuator_dyntype[k] != mujoco.mjtDyn.mjDYN_NONE:
         return refuse("has dynamics of its own, such as a filter or a muscle")
     if kind in (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT):
-        if mujoco.mjtJoint(int(model.jnt_type[target])) not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if mujoco.mjtJoint(int(model.jnt_type[target])) not in (
+            mujoco.mjtJoint.mjJNT_HINGE,
+            mujoco.mjtJoint.mjJNT_SLIDE,
+        ):
             return refuse("acts on a ball or free joint")
         of = names.joint(target)
     elif kind == transmissions.mjTRN_TENDON:

@@ -18,9 +18,9 @@ def compiled(source: Any, notes: Notes) -> tuple[Any, str]:
     """
     mujoco = _mujoco()
     file = file_name(source)
-    if isinstance(source, os.PathLike) or (isinstance(source, str) and not is_text(source)):
-        if not Path(source).is_file():
-            raise ValueError(f"{file} does not exist.")
+    is_path = isinstance(source, os.PathLike | str) and not is_text(source)
+    if is_path and not Path(source).is_file():
+        raise ValueError(f"{file} does not exist.")
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -54,7 +54,9 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
         for element in getattr(spec, kind, ()):
             if hasattr(element, "material"):
                 element.material = ""
-    left_out = [f"{len(getattr(spec, kind))} {kind}" for kind in ("materials", "textures", "skins") if getattr(spec, kind)]
+    left_out = [
+        f"{len(getattr(spec, kind))} {kind}" for kind in ("materials", "textures", "skins") if getattr(spec, kind)
+    ]
     if left_out:
         notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
     for kind in ("materials", "textures", "skins"):
@@ -82,8 +84,8 @@ def _without_meshes(spec, missing, notes):
             notes.refuse(
                 "meshes",
                 body.name,
-                f"The mass of body {body.name!r} comes from mesh {geom.meshname!r}, whose file is missing: give the file, "
-                "or the body an <inertial>",
+                f"The mass of body {body.name!r} comes from mesh {geom.meshname!r}, whose file is missing: give the "
+                "file, or the body an <inertial>",
             )
         spec.delete(geom)
     for mesh in missing.values():

@@ -26,7 +26,9 @@ _MUST_VANISH = {
 
 def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     """Refuse what has no counterpart, and say what is not read because it has no effect on a motion."""
-    named = lambda kind, k: mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) or f"{kind} {k}"
+    named = lambda kind, k: (
+        mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) or f"{kind} {k}"
+    )
     for field, (kind, what, leave) in _MUST_VANISH.items():
         for k in _set(getattr(model, field, np.zeros(0))):
             name = named("joint", model.dof_jntid[k]) if kind == "dof" else named(kind, k)
@@ -43,7 +45,12 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
         notes.refused.append("Plugins are not known; remove them from the file.")
     if model.opt.density or model.opt.viscosity:
         notes.refused.append("A fluid is not modelled: set density and viscosity of <option> to zero.")
-    effectless = {"sensors": model.nsensor, "cameras": model.ncam, "lights": model.nlight, "height fields": model.nhfield}
+    effectless = {
+        "sensors": model.nsensor,
+        "cameras": model.ncam,
+        "lights": model.nlight,
+        "height fields": model.nhfield,
+    }
     listed = ", ".join(f"{number} {what}" for what, number in effectless.items() if number)
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {listed}.")

@@ -36,8 +36,8 @@ def sdf(
 ) -> ImportedModel:
     """A machine from SDF.
 
-    A model is free unless a joint binds it to `world`, or it is static. Angles that are written with few digits, such as
-    1.5708, are the multiples of π/12 that they round: the hinges of a loop are then as parallel as they are meant.
+    A model is free unless a joint binds it to `world`, or it is static. Angles that are written with few digits, such
+    as 1.5708, are the multiples of π/12 that they round: the hinges of a loop are then as parallel as they are meant.
 
     **Arguments:** `source`: a path, or the text of a file, with one model; `gravity` [m/s²], shape (3,), unless a world
     in the file has it; `ignore`: what is to be left out, words such as `"limits"` and `"friction"`, or names of joints.
@@ -209,9 +209,7 @@ def _read_axis(joint, axis, frame, machine, notes, kind):
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
     in_model = axis.first("use_parent_model_frame")
-    if in_model is not None and in_model.text.strip() in ("1", "true"):
-        frame = np.eye(3)
-    elif expressed == "__model__":
+    if (in_model is not None and in_model.text.strip() in ("1", "true")) or expressed == "__model__":
         frame = np.eye(3)
     elif expressed:
         frame = machine.links[expressed].rotation if expressed in machine.links else frame

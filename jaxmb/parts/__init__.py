@@ -17,6 +17,7 @@ from .base import (
     AbstractPlanarPart as AbstractPlanarPart,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,
+    AbstractTendon as AbstractTendon,
     AbstractVelocityConstraint as AbstractVelocityConstraint,
 )
 from .contact import (
@@ -38,6 +39,7 @@ from .fields import (
     law as law,
     length as length,
     name as name,
+    names as names,
     numbers as numbers,
     parameter as parameter,
     point as point,

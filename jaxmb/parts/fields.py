@@ -44,10 +44,10 @@ class Declaration:
 
     **Fields:**
 
-    - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the name of a body (`"bodies"` for
-        several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
-        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess,
-        which is not a parameter.
+    - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
+        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module
+        with parameters, `"part"` for another part of the scene (`"parts"` for a dictionary of them), `"state"` for a
+        number of the initial guess, which is not a parameter.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
