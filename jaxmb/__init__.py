@@ -2,6 +2,7 @@
 
 from . import (
     formulations as formulations,
+    importers as importers,
     lagrangian as lagrangian,
     manifold as manifold,
     mechanisms as mechanisms,
@@ -17,6 +18,7 @@ from ._types import State as State
 from .linalg import rotations as rotations
 from .parts import contact as contact, terrain as terrain
 from .parts.actuators import Actuator as Actuator
+from .parts.combinations import FixedTendon as FixedTendon, JointCoupling as JointCoupling, Tendon as Tendon
 from .parts.controller import Controller as Controller
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
@@ -24,6 +26,11 @@ from .parts.functions import (
     Force as Force,
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
+)
+from .parts.joint_laws import (
+    JointActuator as JointActuator,
+    JointFriction as JointFriction,
+    JointStop as JointStop,
 )
 from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
 from .parts.series import Series as Series

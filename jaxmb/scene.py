@@ -17,11 +17,11 @@ from .parts.base import (
     AbstractForce,
     AbstractLink,
     AbstractNonIdeal,
+    AbstractTendon,
     AbstractVelocityConstraint,
     rows_of,
 )
 from .parts.boundary import check_kernels
-from .parts.controller import Controller
 from .parts.fields import anonymous, declarations, inner_parts
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
@@ -30,6 +30,7 @@ from .parts.names import unknown
 from .parts.on_frames import framed, on_frames
 from .parts.planar.kinematics import PLANE
 from .parts.servo import Servo
+from .parts.sources import AbstractOfSources
 from .parts.spatial.kinematics import SPACE
 from .states.structure import with_structure
 from .system import RigidBodySystem
@@ -41,14 +42,15 @@ from .system.groups import (
     ForceGroup,
     FrameGroup,
     NonIdealGroup,
+    TendonGroup,
     VelocityConstraintGroup,
     servo_group,
     stack,
 )
 from .system.layout import Layout
 
-# Parts that act on joints, given by their names.
-_OF_JOINTS = (AbstractNonIdeal, AbstractCoordinatePart, Controller)
+# Parts that act on other parts, given by their names.
+_OF_OTHERS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractOfSources)
 
 
 class Scene(eqx.Module):
@@ -122,6 +124,7 @@ class Scene(eqx.Module):
                 NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
             ),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
+            tendons=tuple(map(TendonGroup, kind(AbstractTendon, None))),
             frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
             guess=guess,
             length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
@@ -142,8 +145,9 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
     """
     space = layout.space
     gravity, parts, laws, joints = None, [], [], {}
-    # Parts of joints after the joints that they act on.
-    for part in sorted((*scene.joints, *scene.forces), key=lambda part: isinstance(part, _OF_JOINTS)):
+    # Parts of joints after the joints that they act on, and after tendons along joints.
+    level = lambda part: isinstance(part, _OF_OTHERS) * (1 if isinstance(part, AbstractTendon) else 2)
+    for part in sorted((*scene.joints, *scene.forces), key=level):
         if isinstance(part, AbstractNonIdeal):
             joint, own, on = joints[part.joint]
             if any(on) and getattr(part, "point", None) is not None:
@@ -153,10 +157,13 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             joint, own, on = joints[part.joint_name]
             resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
             parts.append((on_frames(resolved, on), own))
-        elif isinstance(part, Controller):
-            _call(part, "check", space.dimension)
-            sources = {name: _source(name, joints, scene.frames, frames, index) for name in part.sources}
-            parts.append(part.on(sources, dict(enumerate((*(body.name for body in scene.bodies), GROUND))), space))
+        elif isinstance(part, AbstractOfSources):
+            held = [_source(name, joints, scene.frames, frames, index) for name in part.sources]
+            own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
+            placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
+            resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
+            joints[part.name] = resolved, own, (None,) * len(own)
+            parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
             own = tuple(index[name] for name in part.bodies)
             moving = [k for k in own if k < len(scene.bodies)]
@@ -234,17 +241,16 @@ def _check_names(scene: Scene):
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
-    is_joint = lambda part: isinstance(part, kinds) and not isinstance(part, AbstractCoordinatePart)
+    of_joints = AbstractCoordinatePart | AbstractOfSources
+    is_joint = lambda part: (
+        isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not isinstance(part, of_joints))
+    )
     joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
     for part in (*scene.joints, *scene.forces):
-        if isinstance(part, Controller):
-            for source in part.sources:
-                if source not in joints and (source not in known or source == GROUND):
-                    raise ValueError(f"{part.label}: {unknown('joint, body or frame', source, [*joints, *known])}")
-        elif isinstance(part, _OF_JOINTS):
-            joint = part.joint if isinstance(part, AbstractNonIdeal) else part.joint_name
-            if joint not in joints:
-                raise ValueError(f"{part.label}: {unknown('joint', joint, joints)}")
+        if isinstance(part, AbstractOfSources) and part.takes_bodies:
+            _check_sources(part, "joint, body or frame", [*joints, *(name for name in known if name != GROUND)])
+        elif isinstance(part, _OF_OTHERS):
+            _check_sources(part, "joint", joints)
         elif isinstance(part, AbstractLink):
             for name in part.bodies:
                 if name not in known:
@@ -252,6 +258,17 @@ def _check_names(scene: Scene):
             twice = [name for name in part.bodies if part.bodies.count(name) > 1]
             if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
+
+
+def _check_sources(part, what, known):
+    """Check that the parts that a part acts on are known, and other parts than itself."""
+    if isinstance(part, AbstractNonIdeal):
+        sources = (part.joint,)
+    else:
+        sources = part.sources if isinstance(part, AbstractOfSources) else (part.joint_name,)
+    for name in sources:
+        if name not in known or name == part.name:
+            raise ValueError(f"{part.label}: {unknown(what, name, known)}")
 
 
 def _check_rotation(part, components, own, layout, poses):

@@ -22,12 +22,13 @@ from jaxmb.parts import (
     AbstractConstraint,
     AbstractForce,
     AbstractNonIdeal,
+    AbstractTendon,
     AbstractVelocityConstraint,
     contact,
     terrain,
 )
 
-CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
+CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound, AbstractTendon)
 
 
 @dataclasses.dataclass
@@ -237,7 +238,29 @@ def controlled():
     return Example(part, [own], "gain", (pin,), (hold_2d(own),), rests=False)
 
 
+def of_tendon(part, parameter):
+    """A tendon along the angle of a pin, or straight to a body, with a spring on its length."""
+    own = body_2d(f"{part.kind} body")
+    pin = pin_2d(own)
+    spring = mb.JointSpring(f"{part.name} spring", f"{part.name}.length", stiffness=5.0, free=0.1)
+    return Example(part, [own], parameter, (pin,), (hold_2d(own), spring))
+
+
+def coupled():
+    bodies = [body_2d("driven body", position=(0.0, 0.0)), body_2d("driving body", position=(0.8, 0.0))]
+    pins = pin_2d(bodies[0], (0.0, 0.0)), pin_2d(bodies[1], (0.8, 0.0))
+    names = [f"{pin.name}.angle" for pin in pins]
+    part = mb.JointCoupling("JointCoupling", *names, coefficients=(0.0, -0.5, 0.1))
+    return Example(part, bodies, "coefficients", pins, (hold_2d(bodies[1]),))
+
+
 FUNCTIONS = [
+    of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1),
+    of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
+    of_joint(mb.JointActuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
+    coupled(),
+    of_tendon(mb.FixedTendon("FixedTendon", "FixedTendon body pin.angle", coefficients=(0.4,)), "coefficients"),
+    of_tendon(mb.Tendon("Tendon", [("ground", (0.0, 1.0)), ("Tendon body", (0.2, 0.1))]), "points"),
     of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
@@ -308,11 +331,15 @@ POINT_MASS_3D = spatial.PointMass("PointMass", mass=1.2, position=(0.4, 0.2, 0.1
 BODY_3D = body_3d("Body", angular_velocity=(1.0, 2.0, 0.5))
 
 SPATIAL = [
+    of_ground_3d(spatial.RotationalDamper, "damping", damping=0.3),
     Example(BODY_3D, [BODY_3D], "inertia", (), (hold_3d(BODY_3D),)),
     Example(POINT_MASS_3D, [POINT_MASS_3D], "mass", (), (hold_3d(POINT_MASS_3D),)),
     of_ground_3d(spatial.Spherical, "point_b", point=O),
     of_ground_3d(spatial.Revolute, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Universal, "point_b", point=O, axis_a_W=AXIS, axis_b_W=(0.0, 1.0, 0.0)),
+    of_ground_3d(
+        spatial.Gimbal, "point_b", point=O, axis_1_W=AXIS, axis_2_W=(0.0, 1.0, 0.0), axis_3_W=(-0.8, 0.0, 0.6)
+    ),
     of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
     of_ground_3d(spatial.Prismatic, "point_b", point=O, axis=AXIS),

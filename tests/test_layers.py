@@ -21,7 +21,7 @@ LAYERS = [
     ["scene", "lagrangian"],
     ["trajectory"],
     ["simulate"],
-    ["studies", "viz", "mechanisms"],
+    ["studies", "viz", "mechanisms", "importers"],
     ["report"],
     ["cli"],
     ["__main__"],
@@ -78,7 +78,7 @@ def test_solvers_know_nothing_of_mechanics():
 
 
 def test_optional_packages_are_not_imported():
-    code = "import sys, jaxmb; print([m for m in ('matplotlib', 'IPython', 'tqdm') if m in sys.modules])"
+    code = "import sys, jaxmb; print([m for m in ('matplotlib', 'IPython', 'tqdm', 'mujoco') if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
 

@@ -23,6 +23,7 @@ from jaxmb.parts import (
     AbstractFrictionLaw,
     AbstractNonIdeal,
     AbstractNormalLaw,
+    AbstractTendon,
     AbstractTerrain,
     AbstractVelocityConstraint,
     contact,
@@ -37,6 +38,7 @@ PARTS = (
     AbstractCompound,
     AbstractForce,
     AbstractNonIdeal,
+    AbstractTendon,
 )
 METHODS = [choice for options in test_every_part.METHODS.values() for choice in options.values()]
 # A program is no constraint of its own, and gravity is no force between bodies, but both are parts of scenes.

@@ -87,6 +87,11 @@ def cardan(q, point, axis, second):
     return spatial.Universal("J", "a", "b", point=point, axis_a_W=axis, axis_b_W=second)
 
 
+def gimbal(q, point, axis, second):
+    third = {"axis_3_W": rot.cross(axis, second)}
+    return spatial.Gimbal("J", "a", "b", point=point, axis_1_W=axis, axis_2_W=second, **third)
+
+
 def link(q, point, axis, second):
     return spatial.Distance("J", "a", "b", point_a=POINT_A, point_b=POINT_B)
 
@@ -125,6 +130,7 @@ CASES = {
         cardan,
         of_b(lambda q, point, a, b, x: move(q[1], rot.multiply(turn(a, x[0]), turn(b, x[1])), point, STILL)),
     ),
+    "Gimbal": Case(3, gimbal, of_b(lambda q, point, a, b, x: move(q[1], turn_3(x), point, STILL))),
     "Cylindrical": Case(
         4, world(spatial.Cylindrical), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[0]), point, x[1] * a))
     ),
@@ -430,6 +436,7 @@ def springs(damping):
 
 def pairs():
     return springs(1.0) | {
+        "RotationalDamper": spatial.RotationalDamper("F", "a", "b", damping=2.0),
         "Torque": spatial.Torque("F", "b", torque=(1.0, 2.0, 3.0), reaction="a"),
         "body Torque": spatial.Torque("F", "b", torque=(1.0, 2.0, 3.0), reaction="a", frame="body"),
     }

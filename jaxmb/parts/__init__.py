@@ -18,6 +18,7 @@ from .base import (
     AbstractPlanarPart as AbstractPlanarPart,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,
+    AbstractTendon as AbstractTendon,
     AbstractVelocityConstraint as AbstractVelocityConstraint,
 )
 from .contact import (
@@ -40,6 +41,7 @@ from .fields import (
     law as law,
     length as length,
     name as name,
+    names as names,
     numbers as numbers,
     parameter as parameter,
     point as point,

@@ -145,6 +145,14 @@ class AbstractLink(AbstractPart):
 
     bodies = _Bodies()
 
+    # Names of the coordinates that are angles known up to full turns.
+    periodic: ClassVar[frozenset[str]] = frozenset()
+
+    def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
+        """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""
+        del space, poses
+        return {}
+
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
         """A checked copy with every number filled in; world points and axes become body-fixed at the given poses."""
         # Methods are called through the class: binding one creates a module, too slow for thousands of parts.
@@ -189,17 +197,9 @@ class AbstractConstraint(AbstractLink):
     rows: AbstractVar[int]
     rheonomic: AbstractVar[bool]
 
-    # Names of the coordinates that are angles known up to full turns.
-    periodic: ClassVar[frozenset[str]] = frozenset()
-
     @abc.abstractmethod
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
         """Φ(poses, t) of this part."""
-
-    def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
-        """Hook: the joint's own coordinates by name, numbers or vectors, such as its `angle` or `displacement`."""
-        del space, poses
-        return {}
 
 
 class AbstractJoint(AbstractPair, AbstractConstraint):
@@ -213,6 +213,20 @@ class AbstractJoint(AbstractPair, AbstractConstraint):
     point_b: fields.Number = fields.point(body=1, optional=True)
     point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
     rheonomic: ClassVar[bool] = False
+
+
+class AbstractTendon(AbstractLink):
+    """A length along joints or bodies, for parts of coordinates to act on; by itself it exerts no force.
+
+    Its coordinate is `length`.
+    """
+
+    @abc.abstractmethod
+    def length(self, space: AbstractSpace, poses: Poses) -> Float[Array, ""]:
+        """The length at these poses of its bodies."""
+
+    def coordinates(self, space, poses):
+        return {"length": self.length(space, poses)}
 
 
 class AbstractVelocityConstraint(AbstractLink):

@@ -26,9 +26,10 @@ def check_kinds(part: Any, label: str) -> None:
         elif declared.kind in ("identity", "body"):
             if not isinstance(value, str):
                 raise ValueError(f"{label}: {field} must be a name, got {value!r}.")
-        elif declared.kind == "bodies":
+        elif declared.kind in ("identities", "bodies"):
             if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not value:
-                raise ValueError(f"{label}: {field} must be the name of a body or several names, got {value!r}.")
+                what = "a body" if declared.kind == "bodies" else "a part"
+                raise ValueError(f"{label}: {field} must be the name of {what} or several names, got {value!r}.")
         elif declared.kind == "choice":
             if value not in declared.of:
                 raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")

@@ -1,7 +1,7 @@
 """Forces on joints that a user's function computes from named measurements."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import fields
-from .base import AbstractConstraint, AbstractDynamicForce
+from .base import AbstractDynamicForce
 from .forces import generalized_force
 from .frames import AbstractFrame
 from .names import unknown
+from .sources import AbstractOfSources
 
 # What is seen of a body or a frame, and in which space if not in both.
 _OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
@@ -22,7 +23,7 @@ def _pairs(measures: Any) -> Any:
     return tuple(measures.items()) if isinstance(measures, Mapping) else measures
 
 
-class Controller(AbstractDynamicForce):
+class Controller(AbstractOfSources, AbstractDynamicForce):
     """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
     parameters) -> forces, rates`.
 
@@ -58,8 +59,8 @@ class Controller(AbstractDynamicForce):
     parameters: fields.Numbers = fields.numbers()
     # Filled in by the scene: joints and frames by name, and the places of their bodies among all bodies.
     held: Any = fields.parts()
-    bodies: Any = eqx.field(static=True, default=(), kw_only=True)
     places: Any = eqx.field(static=True, default=(), kw_only=True)
+    takes_bodies: ClassVar[bool] = True
 
     def __check_init__(self):
         names = [name for pair in self.measures for name in pair] if isinstance(self.measures, tuple) else [None]
@@ -78,23 +79,21 @@ class Controller(AbstractDynamicForce):
             raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
 
     @property
-    def sources(self) -> tuple[str, ...]:
-        """The names of the joints, bodies and frames that are measured or acted on."""
+    def sources(self):
         return tuple(dict.fromkeys(name.split(".")[0] for name in (*dict(self.measures).values(), *self.acts_on)))
 
-    def on(self, sources: Mapping[str, tuple[Any, tuple[int, ...]]], bodies: Mapping[int, str], space: Any) -> Any:
-        """The controller on its sources: each a joint, a frame or None for a body, with the numbers of its bodies.
+    @property
+    def bodies(self):
+        of_source = lambda name: self.held[name].bodies if self._is_joint(name) else (name,)
+        return tuple(dict.fromkeys(body for name, _ in self.places for body in of_source(name)))
 
-        **Returns:** the controller, and the numbers of its bodies.
+    def of_sources(self, parts, places):
+        held = {name: part for name, part in zip(self.sources, parts, strict=True) if part is not None}
+        return self.with_fields(held=held, places=tuple(zip(self.sources, places, strict=True)))
 
-        **Raises:** `ValueError` for quantities that a source does not have.
-        """
-        numbers = tuple(dict.fromkeys(k for _, own in sources.values() for k in own))
-        places = tuple((name, tuple(numbers.index(k) for k in own)) for name, (_, own) in sources.items())
-        held = {name: part for name, (part, _) in sources.items() if part is not None}
-        part = self.with_fields(held=held, bodies=tuple(bodies[k] for k in numbers), places=places)
-        part._check_names(space)
-        return part, numbers
+    def complete(self, space, poses):
+        self._check_names(space)
+        return self
 
     def _check_names(self, space):
         for name in (*dict(self.measures).values(), *self.acts_on):
@@ -109,7 +108,7 @@ class Controller(AbstractDynamicForce):
                 raise ValueError(f"{self.label}: {unknown('quantity', name, listed)}")
 
     def _is_joint(self, source):
-        return isinstance(self.held.get(source), AbstractConstraint)
+        return source in self.held and not isinstance(self.held[source], AbstractFrame)
 
     def _known(self, source, space):
         if self._is_joint(source):

@@ -44,10 +44,11 @@ class Declaration:
 
     **Fields:**
 
-    - `kind`: `"identity"` for a name that distinguishes stacked parts, `"body"` for the name of a body (`"bodies"` for
-        several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module with parameters, `"part"` for
-        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
-        `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
+    - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
+        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module
+        with parameters, `"part"` for another part of the scene (`"parts"` for a dictionary of them), `"state"` for a
+        number of the initial guess, and `"internal"` for an internal state (`"internals"` for a dictionary of them);
+        these are not parameters.
     - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
@@ -148,7 +149,7 @@ _NUMBER, _NUMBERS, _NAMES = _lenient(as_parameter), _lenient(_as_numbers), _leni
 
 
 def _field(declaration: Declaration, **options: Any) -> Any:
-    static = declaration.kind in ("identity", "body", "bodies", "choice")
+    static = declaration.kind in ("identity", "identities", "body", "bodies", "choice")
     options = {name: value for name, value in options.items() if value is not dataclasses.MISSING}
     return eqx.field(static=static, metadata={"declaration": declaration}, **options)
 
@@ -156,6 +157,11 @@ def _field(declaration: Declaration, **options: Any) -> Any:
 def name() -> Any:
     """The name of the part, or of another part that it refers to; stacked parts may differ in it."""
     return _field(Declaration("identity"))
+
+
+def names() -> Any:
+    """The names of any number of other parts that it refers to; a single name becomes a tuple."""
+    return _field(Declaration("identities"), converter=_NAMES)
 
 
 def body_name(*, default: Any = dataclasses.MISSING) -> Any:
@@ -327,7 +333,7 @@ def anonymous(part: Any) -> Any:
         value, kind = getattr(part, field), declared[field].kind if field in declared else None
         if kind in ("identity", "body"):
             value = ""
-        elif kind == "bodies":
+        elif kind in ("identities", "bodies"):
             value = ("",) * len(value)
         elif kind == "state":
             value = None

@@ -17,7 +17,7 @@ from .names import unknown
 
 
 class AbstractCoordinatePart(AbstractLink):
-    """A part that acts on a coordinate of a joint, in the plane or in space.
+    """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
 
     **Fields:** `coordinate`: `"joint.coordinate"`, a coordinate that the joint's class documents. A scene fills in the
     `joint`, whose numbers keep the joint's name, and the coordinate's name `within` it.
@@ -25,7 +25,7 @@ class AbstractCoordinatePart(AbstractLink):
 
     name: str = fields.name()
     coordinate: str = fields.name()
-    joint: Any = fields.part(AbstractConstraint)
+    joint: Any = fields.part(AbstractLink)
     within: str = eqx.field(static=True, default="", kw_only=True)
 
     @property
@@ -45,18 +45,12 @@ class AbstractCoordinatePart(AbstractLink):
         return self.with_fields(joint=joint, within=self.coordinate.partition(".")[2])
 
     def complete(self, space, poses):
-        known = self.joint.coordinates(space, poses) if isinstance(self.joint, AbstractConstraint) else {}
-        if self.within not in known:
-            names = [f"{self.joint_name}.{own}" for own in known]
-            if not names:
-                raise ValueError(f"{self.label}: {self.joint.label} has no coordinate of its own.")
-            raise ValueError(f"{self.label}: {unknown('coordinate', self.coordinate, names)}")
-        return self.with_numbers(np.asarray(known[self.within]))
+        return self.with_numbers(given_coordinate(self, self.joint, self.coordinate, space, poses))
 
     def unit(self, alternatives: str) -> str:
         """Of the units of an angle and of a displacement, `"N m or N"`, that of the coordinate."""
         of_angle, of_displacement = alternatives.split(" or ")
-        return of_displacement if self.within == "displacement" else of_angle
+        return of_displacement if self.within in ("displacement", "length") else of_angle
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
@@ -74,9 +68,7 @@ class AbstractCoordinatePart(AbstractLink):
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of angles that are known up to full turns the smallest such difference."""
         out = value - target.reshape(-1)
-        if self.within in self.joint.periodic:
-            out = out - 2 * np.pi * lax.stop_gradient(jnp.round(out / (2 * np.pi)))
-        return out
+        return shortest(out) if self.within in self.joint.periodic else out
 
     def _check_shape(self, field: str, given: np.ndarray) -> None:
         shape = np.shape(getattr(self, field))
@@ -84,6 +76,23 @@ class AbstractCoordinatePart(AbstractLink):
             raise ValueError(
                 f"{self.label}: {field} must have the shape of {self.coordinate!r}, {given.shape}, got {shape}."
             )
+
+
+def given_coordinate(part: AbstractLink, joint: Any, coordinate: str, space: Any, poses: Any) -> np.ndarray:
+    """A joint's coordinate at the given poses; an error of the part if there is none of this name."""
+    known = joint.coordinates(space, poses)
+    name, _, within = coordinate.partition(".")
+    if within not in known:
+        names = [f"{name}.{own}" for own in known]
+        if not names:
+            raise ValueError(f"{part.label}: {joint.label} has no coordinate of its own.")
+        raise ValueError(f"{part.label}: {unknown('coordinate', coordinate, names)}")
+    return np.asarray(known[within])
+
+
+def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The angle [rad] less full turns, in [−π, π]."""
+    return angle - 2 * np.pi * lax.stop_gradient(jnp.round(angle / (2 * np.pi)))
 
 
 class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):

@@ -13,6 +13,7 @@ from .base import (
     AbstractLink,
     AbstractPart,
     AbstractPotentialForce,
+    AbstractTendon,
     AbstractVelocityConstraint,
 )
 from .frames import AbstractFrame
@@ -42,6 +43,8 @@ def _on(part: AbstractLink, frames: dict[str, AbstractFrame]) -> AbstractLink:
         return DynamicForceOnFrames(part=part, frames=frames)
     if isinstance(part, AbstractForce):
         return ForceOnFrames(part=part, frames=frames)
+    if isinstance(part, AbstractTendon):
+        return TendonOnFrames(part=part, frames=frames)
     raise ValueError(f"{part.label} has friction of its own parts and cannot be on frames; name its bodies.")
 
 
@@ -110,6 +113,13 @@ class ConstraintOnFrames(AbstractOnFrames, AbstractConstraint):
 
     def coordinates(self, space, poses):
         return self.part.coordinates(space, self._poses(space, poses))
+
+
+class TendonOnFrames(AbstractOnFrames, AbstractTendon):
+    """A tendon on frames."""
+
+    def length(self, space, poses):
+        return self.part.length(space, self._poses(space, poses))
 
 
 class VelocityConstraintOnFrames(AbstractOnFrames, AbstractVelocityConstraint):

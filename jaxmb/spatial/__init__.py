@@ -16,6 +16,7 @@ from ..parts.spatial.bodies import (
 from ..parts.spatial.drivers import Driver as Driver
 from ..parts.spatial.forces import (
     Bushing as Bushing,
+    RotationalDamper as RotationalDamper,
     Torque as Torque,
     TorsionalSpringDamper as TorsionalSpringDamper,
 )
@@ -24,6 +25,7 @@ from ..parts.spatial.joints import (
     Cylindrical as Cylindrical,
     Distance as Distance,
     Fixed as Fixed,
+    Gimbal as Gimbal,
     Planar as Planar,
     PointOnLine as PointOnLine,
     PointOnPlane as PointOnPlane,

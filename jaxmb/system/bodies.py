@@ -31,6 +31,7 @@ from .groups import (
     FrameGroup,
     NonIdealGroup,
     ServoGroup,
+    TendonGroup,
     VelocityConstraintGroup,
 )
 from .internal_states import (
@@ -84,6 +85,7 @@ class AbstractBodySystem(AbstractSystem):
     elimination: JointOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
     frames: tuple[FrameGroup, ...] = ()
+    tendons: tuple[TendonGroup, ...] = ()
 
     # Sizes
 
@@ -220,7 +222,7 @@ class AbstractBodySystem(AbstractSystem):
 
     @property
     def _groups(self):
-        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames")
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
         return {kind: getattr(self, kind) for kind in kinds}
 
     @property
@@ -247,6 +249,7 @@ class AbstractBodySystem(AbstractSystem):
                 (self.servos, ", a program of a Servo"),
             ],
             forces=self.forces,
+            tendons=self.tendons,
             laws=self.nonideal,
             gravity=self._gravity_name,
             implied=self.implied,
@@ -275,14 +278,19 @@ class AbstractBodySystem(AbstractSystem):
         return out | frame_quantities(self, self.frames, self.layout)
 
     def joint_coordinates(self):
-        return joint_coordinates(self.constraints, self.layout, batch=self.length.ndim)
+        return joint_coordinates(self._measured, self.layout, batch=self.length.ndim)
+
+    @property
+    def _measured(self):
+        """The groups of parts that have coordinates."""
+        return (*self.constraints, *self.tendons)
 
     def joint_coordinate(self, coordinate, t, q):
-        values = self.constraints[coordinate.group].coordinates(t, self.prepared_poses(q))
+        values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))
         return values[coordinate.field][coordinate.member]
 
     def holding(self, values, rates, t):
-        held = held_groups(self.constraints, self.joint_coordinates(), values, rates, t)
+        held = held_groups(self._measured, self.joint_coordinates(), values, rates, t)
         rows = sum(g.rows for g in held)
         ranks = dataclasses.astuple(self.ranks)
         more = Ranks(*(rank + rows for rank in ranks))

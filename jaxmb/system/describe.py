@@ -57,12 +57,13 @@ def describe_scene(
     implied: Sequence[Any],
     design: Sequence[tuple[str, str, str]] = (),
     frames: Sequence[Any] = (),
+    tendons: Sequence[Any] = (),
 ) -> Description:
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well.
 
     **Arguments:** `bodies`: names by kind; `joints`: groups of constraints, with a note on each kind; `forces`, `laws`:
     groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows;
-    `design`: rows on the design variables; `frames`: groups of frames.
+    `design`: rows on the design variables; `frames`, `tendons`: groups of them.
     """
     count = sum(map(len, bodies.values()))
     grubler = system.nu - system.velocity_rows
@@ -88,6 +89,7 @@ def describe_scene(
             *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in laws),
             *((kind(g), shorten(g.group.names), "") for g in forces),
         ],
+        "tendons": [(kind(g), shorten(g.group.names), "") for g in tendons],
         "frames": [(kind(g), shorten(g.group.names), "") for g in frames],
         "design variables": list(design),
     }

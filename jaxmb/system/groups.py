@@ -296,6 +296,17 @@ class ForceGroup(eqx.Module):
         return jnp.sum(self.group.map(single, self.group.gather(poses)))
 
 
+class TendonGroup(eqx.Module):
+    """Stacked tendons."""
+
+    group: Group
+
+    def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
+        """Their coordinates, by name within the tendon."""
+        space = self.group.layout.space
+        return self.group.map(lambda at, x: at(t).coordinates(space, x), self.group.gather(poses))
+
+
 class FrameGroup(eqx.Module):
     """Stacked frames."""
 

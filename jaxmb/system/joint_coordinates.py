@@ -14,7 +14,7 @@ from jaxtyping import Array
 from .._types import Scalar
 from ..parts.joint_parts import JointDriver
 from .equation import AbstractSystem
-from .groups import ConstraintGroup, Group
+from .groups import ConstraintGroup, Group, TendonGroup
 from .layout import Layout
 from .quantities import Quantity
 
@@ -34,7 +34,9 @@ class JointCoordinate(NamedTuple):
     periodic: bool
 
 
-def joint_coordinates(groups: Sequence[ConstraintGroup], layout: Layout, batch: int = 0) -> dict[str, JointCoordinate]:
+def joint_coordinates(
+    groups: Sequence[ConstraintGroup | TendonGroup], layout: Layout, batch: int = 0
+) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
     space, out = layout.space, {}
     ground: Any = np.asarray(space.ground, jnp.result_type(float))
@@ -92,7 +94,7 @@ def _continued(ts, angles, rates):
 
 
 def held_groups(
-    groups: Sequence[ConstraintGroup],
+    groups: Sequence[ConstraintGroup | TendonGroup],
     known: Mapping[str, JointCoordinate],
     values: Mapping[str, Array],
     rates: Mapping[str, Array],

@@ -67,7 +67,7 @@ def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
 
 def turn_about(axis: Vector3, start: Vector3, end: Vector3) -> Float[Array, ""]:
     """The angle [rad] about an axis from one direction to another, both perpendicular to it, in (−π, π]."""
-    return namespace(axis).arctan2(rot.cross(axis, start) @ end, start @ end)
+    return namespace(axis, start, end).arctan2(rot.cross(axis, start) @ end, start @ end)
 
 
 def rotation_vector(part, poses: Float[Array, "k p"]) -> Vector3:

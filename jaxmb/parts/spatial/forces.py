@@ -61,6 +61,21 @@ class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotential
         return 0.5 * self.stiffness * (angle(space, self, poses) - self.free_angle) ** 2
 
 
+class RotationalDamper(AbstractSpatialPart, AbstractPair, AbstractForce):
+    """A linear damper on the relative angular velocity, about every axis: moment `−damping (ω_B − ω_A)` on B.
+
+    **Arguments:** `damping` [N m s/rad] ≥ 0.
+    """
+
+    damping: fields.Number = fields.parameter(unit="N m s/rad", sign="non-negative")
+
+    def wrenches(self, space, poses, velocities, t):
+        omega_a, omega_b = (space.direction(x, v[3:]) for x, v in zip(poses, velocities, strict=True))
+        moment_W = -self.damping * (omega_b - omega_a)
+        moments = jnp.stack([-space.body_direction(poses[0], moment_W), space.body_direction(poses[1], moment_W)])
+        return jnp.concatenate([jnp.zeros_like(moments), moments], axis=1)
+
+
 class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A compliant joint: springs and dampers on the six relative motions of a frame in B with respect to one in A.
 

@@ -15,7 +15,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import cross, norm
+from ...linalg.rotations import conjugate, cross, multiply, norm, rotate
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
 from ..space import separation
@@ -26,6 +26,7 @@ from .axes import (
     measured_from_given_poses,
     offset_in_a,
     perpendiculars,
+    relative_orientation,
     rotation_error,
     rotation_vector,
     turn_about,
@@ -139,6 +140,53 @@ class Universal(AbstractSpatialPart, AbstractJoint):
         return {
             "angle_a": turn_about(self.axis_a, self.x_a, arm_b),
             "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
+        }
+
+
+class Gimbal(AbstractSpatialPart, AbstractJoint):
+    """Three hinges in succession about perpendicular axes through one point: a ball with angles. Rows 3: `d`.
+
+    Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
+    `body_a`, the second and the third, which is fixed in `body_b`, all zero at the given poses. They are smooth except
+    where the second is a quarter turn, in (−π/2, π/2).
+
+    **Arguments:** points as in `Spherical`; `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each
+    other, the axes where all angles are zero, in the axes of `body_a`; or in the world, `axis_1_W`, `axis_2_W`,
+    `axis_3_W`; `orientation`, shape (4,), unit Euler parameters of B relative to A there, default those of the given
+    poses.
+    """
+
+    axis_1: fields.Number = fields.axis(body=0, optional=True)
+    axis_2: fields.Number = fields.axis(body=0, optional=True)
+    axis_3: fields.Number = fields.axis(body=0, optional=True)
+    axis_1_W: fields.Number = fields.axis(body=None, gives=("axis_1",))
+    axis_2_W: fields.Number = fields.axis(body=None, gives=("axis_2",))
+    axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
+    orientation: fields.Number = fields.attitude(optional=True)
+    rows: ClassVar[int] = 3
+    periodic: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+
+    def complete(self, space, poses):
+        triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
+        if np.max(np.abs(triad @ triad.T - np.eye(3))) > 1e-6:
+            raise ValueError(f"{self.label}: the three axes must be perpendicular to each other, got {triad.tolist()}.")
+        return with_given_orientation(self, poses)
+
+    def residual(self, space, poses, t):
+        return separation(space, self, poses)
+
+    def coordinates(self, space, poses):
+        triad = jnp.stack([self.axis_1, self.axis_2, self.axis_3])
+        # The second and third axes, turned with B.
+        turned = multiply(relative_orientation(poses), conjugate(self.orientation))
+        moved = jnp.stack([rotate(turned, own) for own in triad], axis=1)
+        c = jnp.sum(triad[:, :, None] * moved[None], axis=1)
+        # With a left-handed triad the turns about its axes, and so all sines, have the other sign.
+        hand = jnp.where(jnp.dot(cross(self.axis_1, self.axis_2), self.axis_3) > 0, 1.0, -1.0)
+        return {
+            "angle_1": jnp.arctan2(-hand * c[1, 2], c[2, 2]),
+            "angle_2": jnp.arctan2(hand * c[0, 2], jnp.sqrt(c[1, 2] ** 2 + c[2, 2] ** 2)),
+            "angle_3": jnp.arctan2(-hand * c[0, 1], c[0, 0]),
         }
 
 

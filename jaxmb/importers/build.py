@@ -1,0 +1,373 @@
+"""From the description of a machine to a scene."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+
+from ..parts.base import GROUND
+from ..parts.combinations import FixedTendon, JointCoupling, Tendon
+from ..parts.forces import Damper, Gravity, PointForce
+from ..parts.joint_laws import JointActuator, JointFriction, JointStop
+from ..parts.joint_parts import JointDriver, JointSpring
+from ..parts.spatial.bodies import Body
+from ..parts.spatial.forces import RotationalDamper
+from ..parts.spatial.frames import Frame
+from ..parts.spatial.joints import Fixed, Revolute, Spherical
+from ..scene import Scene
+from . import chains
+from .description import Joint, Link, Machine, Shape, quaternion
+from .fuse import Fused, fuse
+from .notes import Notes
+
+# The time in which a compliant stop stops a joint [s], if the file gives none: MuJoCo's default.
+STOP_TIME = 0.02
+# The share of a joint's range over which a stop sets in, and the share of its rate scale over which friction does.
+_ROUNDING = 1e-3
+
+
+@dataclasses.dataclass
+class Built:
+    """A scene, with the coordinates and the bodies of the file's joints and links.
+
+    **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each
+    rotor its joint.
+    """
+
+    scene: Scene
+    coordinates: dict[str, tuple[str | None, float]]
+    controls: dict[str, str]
+    fused: Fused
+    rotors: dict[str, str]
+    shapes: tuple[Shape, ...]
+
+
+def build(machine: Machine, notes: Notes) -> Built:
+    """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
+    return _Builder(machine, notes).build()
+
+
+class _Builder:
+    def __init__(self, machine: Machine, notes: Notes):
+        self.machine, self.notes = machine, notes
+        self.fused = fuse(machine, notes)
+        self.bodies: list[Any] = []
+        self.joints: list[Any] = []
+        self.forces: list[Any] = []
+        self.frames: list[Any] = []
+        self.coordinates: dict[str, tuple[str | None, float]] = {}
+        self.controls: dict[str, str] = {}
+        self.rotors: dict[str, str] = {}
+        self.names: set[str] = {GROUND}
+        self.tendons: dict[str, tuple[str, float]] = {}
+
+    def build(self) -> Built:
+        machine = self.machine
+        for carrier in self.fused.carriers.values():
+            carrier.name = self._named(carrier.name, "link")
+            self.bodies.append(_body(carrier))
+            if carrier.moved:
+                self._moved(carrier)
+        # Names of joints come before those of other elements.
+        for chain in self.fused.chains:
+            self._chain(chain)
+        for step in (self._loops, self._couplings, self._tendons, self._actuators, self._marks):
+            step()
+        for name, share in machine.buoyancy.items():
+            self._buoyancy(name, share)
+        if np.any(machine.gravity):
+            self.forces.append(Gravity(machine.gravity, name=self._named("gravity")))
+        if self.notes.refused or not self.bodies:
+            if not self.bodies:
+                self.notes.refused.append("There is no moving link.")
+            scene: Any = None
+        else:
+            scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
+        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, self._shapes())
+
+    def _named(self, name, kind=""):
+        """A name that nothing in the scene has yet."""
+        own = name.replace(".", "_") or kind
+        tries = itertools.chain([own, f"{own} {kind}".strip()], (f"{own} {k}" for k in itertools.count(2)))
+        out = next(each for each in tries if each not in self.names)
+        self.names.add(out)
+        if name and out != name:
+            self.notes.say("Elements have other names, since names are unique in a scene: {}.", f"{name} → {out}")
+        return out
+
+    # Joints
+
+    def _chain(self, chain):
+        joints = chain.joints
+        a, b = self.fused.placed(chain.parent), self.fused.placed(chain.child)
+        name = self._named(" ".join(joint.name for joint in joints), "joint")
+        found = chains.joint_of(joints, a, b, name)
+        if found is None:
+            kinds = ", ".join(f"{joint.kind} {joint.name!r}" for joint in joints)
+            self.notes.refuse(
+                "joints",
+                joints[0].name,
+                f"{joints[0].where}{b.name!r} has several joints in succession, {kinds}, that make no universal, "
+                "gimbal, cylindrical or planar joint: put a link with mass between them",
+            )
+            return
+        if len(joints) > 1 and found.parts:
+            listed = ", ".join(f"{joint.name!r}" for joint in joints)
+            self.notes.say(f"Joints {listed} in succession are the {found.parts[0].kind} {name!r}.")
+        self.joints += found.parts
+        self.coordinates |= found.coordinates
+        for joint in joints:
+            self._passive(joint, a.name, b)
+
+    def _moved(self, link):
+        """A body whose motion is prescribed: that of its joint."""
+        place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": quaternion(link.rotation)}
+        self.joints.append(Fixed(self._named(f"{link.name} motion"), GROUND, link.name, **place))
+
+    def _passive(self, joint: Joint, a: str, b: chains.Body):
+        """What acts on a joint of itself."""
+        coordinate, offset = self.coordinates[joint.name]
+        values = {
+            "springs": joint.stiffness,
+            "damping": joint.damping,
+            "armature": joint.armature,
+            "friction": joint.friction,
+            "limits": joint.limits is not None,
+        }
+        wanted = {kind for kind, value in values.items() if value and not self.notes.leaves_out(kind, joint.name)}
+        if joint.kind in ("ball", "free"):
+            self._of_ball(joint, a, b, coordinate, wanted)
+            return
+        if coordinate is None:
+            for kind in sorted(wanted):
+                self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of {joint.name!r}, a slide of a planar joint")
+            return
+        if wanted & {"springs", "damping"}:
+            self.forces.append(
+                JointSpring(
+                    self._named(f"{joint.name} spring"),
+                    coordinate,
+                    stiffness=joint.stiffness if "springs" in wanted else 0.0,
+                    damping=joint.damping if "damping" in wanted else 0.0,
+                    free=joint.free - offset,
+                )
+            )
+        if "armature" in wanted:
+            self._rotor(joint.name, coordinate, joint.armature)
+        if "friction" in wanted:
+            self._friction(joint.name, coordinate, joint.friction)
+        if "limits" in wanted:
+            inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
+            self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
+
+    def _of_ball(self, joint, a, b, coordinate, wanted):
+        if joint.kind == "free" and "damping" in wanted:
+            origin = {"point_b": np.zeros(3)}
+            self.forces.append(Damper(self._named(f"{joint.name} drag"), a, b.name, damping=joint.damping, **origin))
+        if "damping" in wanted:
+            self.forces.append(RotationalDamper(self._named(f"{joint.name} damper"), a, b.name, damping=joint.damping))
+        if "springs" in wanted and joint.kind == "ball":
+            free = np.zeros(3) if joint.free is None else joint.free
+            self.forces.append(
+                JointSpring(self._named(f"{joint.name} spring"), coordinate, stiffness=joint.stiffness, free=free)
+            )
+        left = wanted - {"damping"} - ({"springs"} if joint.kind == "ball" else set())
+        for kind in sorted(left):
+            self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of the {joint.kind} joint {joint.name!r}")
+
+    def _rotor(self, name, coordinate, armature):
+        """A flywheel at the origin of the world, geared to a joint: there weight does no work on it."""
+        rotor, bearing = self._named(f"{name} rotor"), self._named(f"{name} bearing")
+        zero = np.zeros(3)
+        self.bodies.append(Body(rotor, mass=armature, inertia=np.full(3, armature), centre=zero))
+        self.joints.append(Revolute(bearing, GROUND, rotor, point=zero, axis=(0.0, 0.0, 1.0)))
+        self.joints.append(
+            JointCoupling(self._named(f"{name} gear"), f"{bearing}.angle", coordinate, coefficients=(0.0, 1.0))
+        )
+        self.rotors[rotor] = name
+
+    def _friction(self, name, coordinate, force):
+        self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
+        self.notes.say("Dry friction is force · tanh(rate / transition_speed), so that joints at rest creep: {}.", name)
+
+    def _stop(self, name, coordinate, limits, offset, inertia, time, *, turns):
+        lower, upper = limits
+        if turns and upper - lower >= 2 * np.pi:
+            self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
+            return
+        own = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
+        self.forces.append(
+            JointStop(
+                self._named(f"{name} stop"),
+                coordinate,
+                lower=lower - offset,
+                upper=upper - offset,
+                smoothing=_ROUNDING * (upper - lower),
+                **own,
+            )
+        )
+        self.notes.say(
+            "Limits are compliant stops, of the moved inertia over the square of a time, by default "
+            f"{STOP_TIME} s: {{}}.",
+            name,
+        )
+
+    # Loops and couplings
+
+    def _loops(self):
+        for loop in self.machine.loops:
+            if self.notes.leaves_out("loops", loop.name):
+                continue
+            (a, point_a), (b, point_b) = (
+                self.fused.point(link, point)
+                for link, point in ((loop.link_a, loop.point_a), (loop.link_b, loop.point_b))
+            )
+            if a == b:
+                self.notes.say("Loops between links that are fixed to each other anyway are left out: {}.", loop.name)
+                continue
+            name = self._named(loop.name, "loop")
+            if loop.rotation is None:
+                self.joints.append(Spherical(name, a, b, point_a=point_a, point_b=point_b))
+            else:
+                turn_a, turn_b = self.fused.rotation(loop.link_a), self.fused.rotation(loop.link_b)
+                attitude = quaternion(turn_a @ loop.rotation @ turn_b.T)
+                self.joints.append(Fixed(name, a, b, point_a=point_a, point_b=point_b, orientation=attitude))
+
+    def _couplings(self):
+        for coupling in self.machine.couplings:
+            if self.notes.leaves_out("couplings", coupling.name):
+                continue
+            name, offset = self._coordinate(coupling.joint, "couplings", coupling.name)
+            if name is None:
+                continue
+            zero = coupling.zero - offset
+            if coupling.other is None:
+                value = zero + coupling.coefficients[0]
+                self.joints.append(JointDriver(self._named(coupling.name, "coupling"), name, value=value))
+                continue
+            other, other_offset = self._coordinate(coupling.other, "couplings", coupling.name)
+            if other is not None:
+                own = {"zero": zero, "other_zero": coupling.other_zero - other_offset}
+                powers = np.trim_zeros(coupling.coefficients, "b")
+                own["coefficients"] = powers if powers.size else np.zeros(1)
+                self.joints.append(JointCoupling(self._named(coupling.name, "coupling"), name, other, **own))
+
+    def _coordinate(self, joint, kind, of):
+        name, offset = self.coordinates.get(joint, (None, 0.0))
+        if name is None:
+            self.notes.refuse(kind, of, f"{of!r} acts on {joint!r}, which has no coordinate of its own")
+        return name, offset
+
+    # Tendons and actuators
+
+    def _tendons(self):
+        for tendon in self.machine.tendons:
+            if self.notes.leaves_out("tendons", tendon.name):
+                continue
+            if tendon.points:
+                name, offset = self._named(tendon.name, "tendon"), 0.0
+                self.joints.append(Tendon(name, [self.fused.point(link, point) for link, point in tendon.points]))
+            else:
+                found = [(self._coordinate(joint, "tendons", tendon.name), c) for joint, c in tendon.joints]
+                if any(coordinate is None for (coordinate, _), _ in found):
+                    continue
+                name = self._named(tendon.name, "tendon")
+                along, coefficients = [own for (own, _), _ in found], [c for _, c in found]
+                offset = sum(c * own for (_, own), c in found)
+                self.joints.append(FixedTendon(name, along, coefficients=coefficients))
+            self.tendons[tendon.name] = (f"{name}.length", offset)
+            self._of_tendon(tendon, f"{name}.length", offset)
+
+    def _of_tendon(self, tendon, coordinate, offset):
+        if tendon.stiffness or tendon.damping:
+            own = {"stiffness": tendon.stiffness, "damping": tendon.damping, "free": tendon.free - offset}
+            self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
+        if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
+            self._friction(tendon.name, coordinate, tendon.friction)
+        if tendon.limits is not None and not self.notes.leaves_out("limits", tendon.name):
+            inertia, time = tendon.stop or (1.0, STOP_TIME)
+            self._stop(tendon.name, coordinate, tendon.limits, offset, inertia, time, turns=False)
+
+    def _actuators(self):
+        for actuator in self.machine.actuators:
+            if self.notes.leaves_out("actuators", actuator.name):
+                continue
+            if actuator.of in self.tendons:
+                coordinate, offset = self.tendons[actuator.of]
+            else:
+                coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name)
+            if coordinate is None:
+                continue
+            gear, shift = actuator.gear, actuator.gear * offset
+            shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
+            ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
+            name = self._named(actuator.name, "actuator")
+            self.controls[actuator.name] = f"{name}.control"
+            self.forces.append(
+                JointActuator(
+                    name,
+                    coordinate,
+                    control=actuator.control,
+                    gear=gear,
+                    gain=shifted(actuator.gain),
+                    bias=shifted(actuator.bias),
+                    middle=self._middle(actuator.of) - offset,
+                    **ranges,
+                )
+            )
+            if any(given is not None for given in ranges.values()):
+                self.notes.say(
+                    "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
+                    "steps are short: {}.",
+                    actuator.name,
+                )
+
+    def _middle(self, name):
+        """The middle of a joint's range, about which its angle counts; zero where it may turn as it likes."""
+        for joint in self.machine.joints:
+            if joint.name == name and joint.limits is not None and joint.limits[1] - joint.limits[0] < 2 * np.pi:
+                return 0.5 * (joint.limits[0] + joint.limits[1])
+        return 0.0
+
+    # Frames, weights and pictures
+
+    def _marks(self):
+        for name, (carrier, position, rotation) in self.fused.frames.items():
+            own = {"position": position, "orientation": quaternion(rotation)}
+            self.frames.append(Frame(self._named(name, "link"), carrier, **own))
+        for mark in self.machine.marks:
+            carrier, position = self.fused.point(mark.link, mark.position)
+            rotation = self.fused.rotation(mark.link) @ mark.rotation
+            own = {"position": position, "orientation": quaternion(rotation)}
+            self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **own))
+
+    def _buoyancy(self, name, share):
+        link = self.machine.links[name]
+        carrier, centre = self.fused.point(name, link.centre)
+        if carrier != GROUND:
+            force = -share * link.mass * self.machine.gravity
+            self.forces.append(PointForce(self._named(f"{name} buoyancy"), carrier, force=force, point=centre))
+            self.notes.say(
+                "Weight is compensated by constant forces, which do not follow a change of gravity: {}.", name
+            )
+
+    def _shapes(self):
+        out = []
+        for shape in self.machine.shapes:
+            body, position = self.fused.point(shape.body, shape.position)
+            orientation = quaternion(self.fused.rotation(shape.body) @ shape.orientation)
+            out.append(dataclasses.replace(shape, body=body, position=position, orientation=orientation))
+        return tuple(out)
+
+
+def _body(carrier: Link):
+    place = {"position": carrier.position, "orientation": quaternion(carrier.rotation)}
+    inertia = 0.5 * (carrier.inertia + carrier.inertia.T)
+    body = Body(carrier.name, mass=carrier.mass, inertia=inertia, centre=carrier.centre, **place)
+    try:
+        body.check()
+    except ValueError as error:
+        raise ValueError(f"{carrier.where}{error}") from None
+    return body

@@ -1,0 +1,209 @@
+"""What a file says of a machine, in one form for all formats: links, joints, loops, and what acts on them.
+
+Places and axes are those of the reference pose, in the world; `[...]` gives shapes and units. Orientations are rotation
+matrices from the link to the world.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+
+GROUND = "ground"
+
+Kind = Literal["hinge", "slide", "ball", "free", "fixed"]
+
+
+def _zeros():
+    return np.zeros(3)
+
+
+@dataclasses.dataclass
+class Link:
+    """A rigid link: `mass` [kg], `inertia` [kg m²] about the mass centre and `centre` [m] in the link's axes, and the
+    `position` [m] and `rotation` of its frame. `where`: file and line, for messages.
+
+    `moved`: its motion is prescribed.
+    """
+
+    name: str
+    mass: float = 0.0
+    centre: np.ndarray = dataclasses.field(default_factory=_zeros)
+    inertia: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((3, 3)))
+    position: np.ndarray = dataclasses.field(default_factory=_zeros)
+    rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    where: str = ""
+    moved: bool = False
+
+
+@dataclasses.dataclass
+class Joint:
+    """A joint of one of the elementary kinds, of `child` on `parent`, with what acts on its coordinate.
+
+    `point` [m] and `axis`, unit; `reference` [rad, m]: the coordinate at the reference pose; `stiffness` and `free`,
+    `damping`, `armature`, `friction`, and `limits`, a pair or None. `stop`: the inertia [kg m², kg] and the time [s]
+    that a compliant stop is made from, None for a default.
+    """
+
+    name: str
+    kind: Kind
+    parent: str
+    child: str
+    point: np.ndarray = dataclasses.field(default_factory=_zeros)
+    axis: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    reference: float = 0.0
+    stiffness: float = 0.0
+    free: Any = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    friction: float = 0.0
+    limits: tuple[float, float] | None = None
+    stop: tuple[float, float] | None = None
+    where: str = ""
+
+
+@dataclasses.dataclass
+class Loop:
+    """Two links whose points [m], in the links' axes, coincide; with `rotation`, that of B in A, they are welded."""
+
+    name: str
+    link_a: str
+    link_b: str
+    point_a: np.ndarray
+    point_b: np.ndarray
+    rotation: np.ndarray | None = None
+
+
+@dataclasses.dataclass
+class Coupling:
+    """A joint's coordinate as a polynomial of another's, `x − zero = Σ coefficients[k] (y − other_zero)ᵏ`; without
+    another one, it is held at the constant.
+    """
+
+    name: str
+    joint: str
+    other: str | None
+    coefficients: np.ndarray
+    zero: float = 0.0
+    other_zero: float = 0.0
+
+
+@dataclasses.dataclass
+class TendonPath:
+    """A tendon along joints, pairs of a name and a coefficient, or straight along points of links, with a spring and a
+    damper.
+    """
+
+    name: str
+    joints: list[tuple[str, float]] = dataclasses.field(default_factory=list)
+    points: list[tuple[str, np.ndarray]] = dataclasses.field(default_factory=list)
+    stiffness: float = 0.0
+    free: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+    limits: tuple[float, float] | None = None
+    stop: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass
+class Actuator:
+    """An actuator of a joint or tendon; its numbers as in `jaxmb.JointActuator`."""
+
+    name: str
+    of: str
+    gear: float = 1.0
+    gain: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    control: float = 0.0
+    control_range: tuple[float, float] | None = None
+    force_range: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass
+class Mark:
+    """A named frame on a link; `position` [m] and `rotation` in the link's axes."""
+
+    name: str
+    link: str
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A shape for the picture.
+
+    **Fields:** `kind`: `"box"`, `"sphere"`, `"cylinder"`, `"capsule"`, `"ellipsoid"`, `"plane"` or `"mesh"`; `body`, a
+    body of the scene or `"ground"`; `position` [m], shape (3,), and `orientation`, Euler parameters, in the body's
+    frame; `size` [m]: half edges of a box, radius and half length of a cylinder or capsule, radii; scales of a mesh;
+    `file` of a mesh; `colour`, red, green, blue and opacity in [0, 1]; `collides`: whether it is there for collisions.
+    """
+
+    kind: str
+    body: str
+    position: Any
+    orientation: Any
+    size: tuple[float, ...] = ()
+    file: str = ""
+    colour: tuple[float, float, float, float] = (0.5, 0.5, 0.5, 1.0)
+    collides: bool = False
+
+
+@dataclasses.dataclass
+class Machine:
+    """A machine as a file describes it. `shapes` have links in place of bodies, and rotation matrices."""
+
+    name: str
+    gravity: np.ndarray
+    links: dict[str, Link] = dataclasses.field(default_factory=dict)
+    joints: list[Joint] = dataclasses.field(default_factory=list)
+    loops: list[Loop] = dataclasses.field(default_factory=list)
+    couplings: list[Coupling] = dataclasses.field(default_factory=list)
+    tendons: list[TendonPath] = dataclasses.field(default_factory=list)
+    actuators: list[Actuator] = dataclasses.field(default_factory=list)
+    marks: list[Mark] = dataclasses.field(default_factory=list)
+    shapes: list[Any] = dataclasses.field(default_factory=list)
+    buoyancy: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+# Rotations
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit Euler parameters, scalar first, of a rotation matrix."""
+    r = np.asarray(rotation, float)
+    # The largest of the four squares is well conditioned.
+    squares = np.array([1 + np.trace(r), *(1 + 2 * np.diag(r) - np.trace(r))])
+    k = int(np.argmax(squares))
+    if k == 0:
+        out = np.array([squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    else:
+        i, j, l = k - 1, k % 3, (k + 1) % 3
+        out = np.zeros(4)
+        out[0], out[k] = r[l, j] - r[j, l], squares[k]
+        out[j + 1], out[l + 1] = r[j, i] + r[i, j], r[l, i] + r[i, l]
+    return out / np.linalg.norm(out)
+
+
+def matrix(quaternion: Any) -> np.ndarray:
+    """The rotation matrix of Euler parameters, scalar first."""
+    w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def turned(axis: np.ndarray, angle: float) -> np.ndarray:
+    """The rotation matrix of a turn [rad] about a unit axis."""
+    return matrix([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+
+
+def roll_pitch_yaw(angles: Any) -> np.ndarray:
+    """The rotation matrix of angles [rad] about the fixed axes x, y and z in turn."""
+    roll, pitch, yaw = angles
+    x, y, z = np.eye(3)
+    return turned(z, yaw) @ turned(y, pitch) @ turned(x, roll)

@@ -1,0 +1,87 @@
+"""A system as MJCF, so that it can be checked in MuJoCo."""
+
+import dataclasses
+from collections.abc import Collection
+from xml.etree import ElementTree
+
+import numpy as np
+
+from .._types import State
+from ..parts.base import GROUND
+from ..system import RigidBodySystem
+from .description import matrix
+from .export_forces import write_forces
+from .export_tree import Node, Tree, numbers, spanning_tree
+from .notes import Notes, checked_ignore
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """The `text` of an MJCF file, and `notes` on what is different in MuJoCo."""
+
+    text: str
+    notes: tuple[str, ...]
+
+
+def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str | Collection[str] = ()) -> Exported:
+    """A spatial scene as MJCF.
+
+    Joints that make a tree become joints of MuJoCo, with the names and the values of the coordinates here; those that
+    close loops become equality constraints, which MuJoCo holds softly. Frames of bodies are at their mass centres.
+
+    **Arguments:** `system`: a compiled scene; `state`: where the machine stands, default the poses given with the
+    bodies, which must satisfy the constraints; `ignore`: names of parts to leave out.
+
+    **Returns:** an `Exported`.
+
+    **Raises:** `ValueError` that lists the parts that MuJoCo cannot express.
+    """
+    if not system.spatial:
+        raise ValueError("to_mjcf needs a spatial scene.")
+    notes = Notes(checked_ignore(ignore))
+    poses = np.asarray(system.poses((system.guess if state is None else state).q))
+    tree = spanning_tree(system, poses, notes)
+    root = ElementTree.Element("mujoco", model="scene")
+    ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
+    gravity = np.zeros(3) if system.gravity is None else np.asarray(system.gravity)
+    ElementTree.SubElement(root, "option", gravity=numbers(gravity))
+    world = ElementTree.SubElement(root, "worldbody")
+    elements = {GROUND: world}
+    inertia, mass = np.asarray(system.moments_of_inertia), np.asarray(system.mass)
+    for node in tree.nodes:
+        k = system.body_names.index(node.body)
+        elements[node.body] = _body(elements[node.parent], node, tree, mass[k], inertia[k])
+    sections = {tag: ElementTree.Element(tag) for tag in ("equality", "tendon", "actuator")}
+    for loop in tree.loops:
+        loop.write(sections["equality"])
+        notes.say("Loops and couplings are held softly by MuJoCo: {}.", loop.name)
+    write_forces(system, tree, elements, sections, notes)
+    root.extend(section for section in sections.values() if len(section))
+    ElementTree.indent(root)
+    return Exported(ElementTree.tostring(root, encoding="unicode"), notes.finish("The scene", "MuJoCo cannot express"))
+
+
+def _body(parent, node: Node, tree: Tree, mass, inertia):
+    above, own = tree.place(node.parent), tree.place(node.body)
+    back = matrix(above[3:]).T
+    element = ElementTree.SubElement(parent, "body", name=node.body, pos=numbers(back @ (own[:3] - above[:3])))
+    conjugate = above[3:] * np.array([1, -1, -1, -1])
+    element.set("quat", numbers(_product(conjugate, own[3:])))
+    full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
+    ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))
+    for joint in node.joints:
+        written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.type)
+        turn = matrix(own[3:]).T
+        if joint.type != "free":
+            written.set("pos", numbers(turn @ (joint.point - own[:3])))
+        if joint.type in ("hinge", "slide"):
+            written.set("axis", numbers(turn @ joint.axis))
+            written.set("ref", numbers(joint.value))
+        tree.elements[joint.name] = written
+    return element
+
+
+def _product(a, b):
+    """The product of two Euler parameters."""
+    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    return np.array([a[0] * b[0] - a[1:] @ b[1:], *vector])

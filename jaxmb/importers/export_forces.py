@@ -1,0 +1,141 @@
+"""Springs, dampers, actuators, tendons and frames of a scene as elements of MJCF."""
+
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..parts.spatial.kinematics import SPACE
+from ..system import RigidBodySystem
+from .description import matrix, quaternion
+from .export_tree import Tree, numbers, parts_of
+from .notes import Notes
+
+
+def write_forces(
+    system: RigidBodySystem, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes
+) -> None:
+    """Write the forces, tendons and frames of a system."""
+    writer = _Writer(tree, elements, sections, notes)
+    for part in parts_of(system, system.tendons, tree.poses):
+        writer.tendon(part)
+    for part in parts_of(system, system.forces, tree.poses):
+        if notes.leaves_out("forces", part.name):
+            continue
+        write = getattr(writer, f"write_{part.kind}", None)
+        if write is None or write(part) is False:
+            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
+    for group in system.frames:
+        for k, name in enumerate(group.group.names):
+            writer.frame(name, group, k, system)
+
+
+class _Writer:
+    def __init__(self, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes):
+        self.tree, self.elements, self.sections, self.notes = tree, elements, sections, notes
+        self.tendons: dict[str, Any] = {}
+        self.springs: dict[str, tuple[float, float]] = {}
+
+    def site(self, name: str, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
+        """A site at a place and attitude in the world."""
+        place = self.tree.place(body)
+        back = matrix(place[3:]).T
+        own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
+        if rotation is not None:
+            own.set("quat", numbers(quaternion(back @ rotation)))
+
+    def frame(self, name, group, k, system):
+        body = (*system.body_names, "ground")[group.group.bodies[k][0]]
+        pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.place(body)))
+        self.site(name, body, pose[:3], matrix(pose[3:7]))
+
+    def tendon(self, part):
+        own = part.part
+        if part.kind == "Tendon":
+            element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
+            for k, (owner, point) in enumerate(zip(own.owners, np.asarray(own.points), strict=True)):
+                self.site(f"{part.name} {k}", part.bodies[owner], np.asarray(SPACE.point(part.poses[owner], point)))
+                ElementTree.SubElement(element, "site", site=f"{part.name} {k}")
+        else:
+            element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)
+            for name, coefficient in zip(part.acts_on, np.asarray(own.coefficients), strict=True):
+                joint = self.tree.coordinates.get(name)
+                if joint is None:
+                    self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
+                    return
+                ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
+        self.tendons[f"{part.name}.length"] = element
+
+    def write_JointSpring(self, part):
+        own = part.part
+        (coordinate,) = part.acts_on
+        tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
+        if tendon is None and (joint is None or joint.type == "ball"):
+            return False
+        element = tendon if joint is None else self.tree.elements[joint.name]
+        stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
+        before, its_free = self.springs.get(coordinate, (0.0, 0.0))
+        total = before + stiffness
+        free = free if total == 0 else (before * its_free + stiffness * free) / total
+        self.springs[coordinate] = total, free
+        element.set("stiffness", numbers(total))
+        element.set("springlength" if joint is None else "springref", numbers(free))
+        element.set("damping", numbers(float(element.get("damping", 0.0)) + float(own.damping)))
+        return None
+
+    def write_SpringDamper(self, part):
+        own = part.part
+        element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
+        for k, body in enumerate(part.bodies):
+            self.site(f"{part.name} {'ab'[k]}", body, part.point(k))
+            ElementTree.SubElement(element, "site", site=f"{part.name} {'ab'[k]}")
+        element.set("stiffness", numbers(own.stiffness))
+        element.set("damping", numbers(own.damping))
+        element.set("springlength", numbers(own.free_length))
+
+    def write_RotationalDamper(self, part):
+        balls = [
+            joint
+            for node in self.tree.nodes
+            if {node.body, node.parent} == {*part.bodies}
+            for joint in node.joints
+            if joint.type == "ball"
+        ]
+        if len(balls) != 1:
+            return False
+        self.tree.elements[balls[0].name].set("damping", numbers(part.part.damping))
+        return None
+
+    def write_JointActuator(self, part):
+        own = part.part
+        (coordinate,) = part.acts_on
+        joint = self.tree.coordinates.get(coordinate)
+        if joint is None and coordinate not in self.tendons:
+            return False
+        target = {"tendon": coordinate.split(".")[0]} if joint is None else {"joint": joint.name}
+        element = ElementTree.SubElement(self.sections["actuator"], "general", name=part.name, **target)
+        element.set("gear", numbers(own.gear))
+        element.set("gaintype", "affine")
+        element.set("gainprm", numbers(own.gain))
+        element.set("biastype", "affine")
+        element.set("biasprm", numbers(own.bias))
+        for name, given in (("ctrlrange", own.control_range), ("forcerange", own.force_range)):
+            if given is not None:
+                element.set(name, numbers(given))
+        return None
+
+    def write_JointStop(self, part):
+        own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
+        if joint is None:
+            return False
+        self.tree.elements[joint.name].set("range", numbers((own.lower, own.upper)))
+        self.notes.say("Stops are MuJoCo's limits, of its own stiffness: {}.", part.name)
+        return None
+
+    def write_JointFriction(self, part):
+        own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
+        if joint is None:
+            return False
+        self.tree.elements[joint.name].set("frictionloss", numbers(own.force))
+        self.notes.say("Dry friction is MuJoCo's frictionloss: {}.", part.name)
+        return None

@@ -1,0 +1,306 @@
+"""A spanning tree of a scene's joints, and the constraints that close loops."""
+
+import dataclasses
+import itertools
+from typing import Any
+from xml.etree import ElementTree
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..parts.base import GROUND
+from ..parts.on_frames import framed
+from ..parts.spatial.kinematics import SPACE
+from ..system import RigidBodySystem
+from .description import matrix
+from .notes import Notes
+
+
+def numbers(values: Any) -> str:
+    """Numbers as text, to the last digit."""
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+@dataclasses.dataclass
+class Part:
+    """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, and the coordinates
+    of joints that it acts on.
+    """
+
+    name: str
+    kind: str
+    part: Any
+    bodies: tuple[str, ...]
+    poses: np.ndarray
+    acts_on: tuple[str, ...]
+
+    def point(self, k: int) -> np.ndarray:
+        """The part's point on its k-th body, in the world [m]."""
+        return np.asarray(SPACE.point(self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])))
+
+    def direction(self, field: str, k: int = 0) -> np.ndarray:
+        """A direction of the part that is fixed in its k-th body, in the world."""
+        return matrix(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
+
+    def coordinates(self) -> dict[str, np.ndarray]:
+        found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
+        return {name: np.asarray(value) for name, value in found.items()}
+
+
+@dataclasses.dataclass
+class TreeJoint:
+    """A joint of MuJoCo: its name, type, point and axis in the world, and its value."""
+
+    name: str
+    type: str
+    point: np.ndarray
+    axis: np.ndarray
+    value: float = 0.0
+
+
+@dataclasses.dataclass
+class Node:
+    """A body of the tree, with its joints from the parent on."""
+
+    body: str
+    parent: str
+    joints: list[TreeJoint]
+
+
+@dataclasses.dataclass
+class Loop:
+    """Equality constraints, tags with attributes."""
+
+    name: str
+    equalities: list[tuple[str, dict[str, str]]]
+
+    def write(self, section: Any) -> None:
+        for tag, attributes in self.equalities:
+            ElementTree.SubElement(section, tag, **attributes)
+
+
+@dataclasses.dataclass
+class Tree:
+    """The bodies in order, parents first; the constraints that close loops; and for each coordinate, `"hip.angle"`, the
+    name of MuJoCo's joint. `elements`: the XML elements of joints.
+    """
+
+    poses: dict[str, np.ndarray]
+    nodes: list[Node] = dataclasses.field(default_factory=list)
+    loops: list[Loop] = dataclasses.field(default_factory=list)
+    coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
+    elements: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def place(self, body: str) -> np.ndarray:
+        """The pose of a body."""
+        return self.poses[body]
+
+
+def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[Part]:
+    """The parts of some groups."""
+    names, out = (*system.body_names, GROUND), []
+    for group in groups:
+        for k, name in enumerate(group.group.names):
+            own = group.group.single(k, jnp.zeros(()))
+            bodies = tuple(names[body] for body in group.group.bodies[k])
+            places = np.stack([poses[body] for body in bodies])
+            held = getattr(own, "frames", None)
+            if isinstance(held, dict):
+                places = np.asarray(framed(SPACE, tuple(held.get(str(j)) for j in range(len(bodies))), places))
+                own = own.part
+            out.append(Part(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
+    return out
+
+
+def _acts_on(group, part, k):
+    """The coordinates that a part acts on: stacked parts know their joints by number only."""
+    within = getattr(part, "within", ())
+    within = (within,) if isinstance(within, str) else within
+    is_joint = lambda keys: keys[-1] == "joint" or keys[-2:-1] == ("joints",)
+    depth = min((len(keys) for keys, _ in group.inner if is_joint(keys)), default=0)
+    names = [own[k] for keys, own in group.inner if is_joint(keys) and len(keys) == depth]
+    return tuple(f"{name}.{own}" for name, own in zip(names, within, strict=False))
+
+
+def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> Tree:
+    """The tree of a system's bodies. Joints are taken in their order, first those of bodies that are reached."""
+    places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
+    tree = Tree(places)
+    parts = [p for p in parts_of(system, system.constraints, places) if not notes.leaves_out("joints", p.name)]
+    rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
+    waiting = [p for p in parts if p.kind in _JOINTS and all(rotates.get(body, True) for body in p.bodies)]
+    closing = [p for p in parts if p not in waiting]
+    reached, left = {GROUND}, list(system.body_names)
+    while left:
+        part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
+        if part is None:
+            body, joints = left[0], _free(left[0], places[left[0]], rotates[left[0]])
+            tree.nodes.append(Node(body, GROUND, joints))
+        else:
+            waiting.remove(part)
+            parent, body = sorted(part.bodies, key=lambda own: own not in reached)
+            tree.nodes.append(Node(body, parent, _oriented(part, tree, body)))
+        reached.add(body)
+        left.remove(body)
+    for velocity in (*system.velocity_constraints, *system.servos, *system.nonideal):
+        for name in velocity.group.names:
+            if not notes.leaves_out("joints", name):
+                notes.refused.append(f"{velocity.group.part.kind} {name!r} cannot be expressed.")
+    for part in (*waiting, *closing):
+        equalities = _CLOSING.get(part.kind, lambda *_: None)(part, tree)
+        if equalities is None:
+            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed where it closes a loop.")
+        else:
+            tree.loops.append(Loop(part.name, equalities))
+    return tree
+
+
+def _free(body, place, rotates):
+    if rotates:
+        return [TreeJoint(f"{body} free", "free", place[:3], np.zeros(3))]
+    return [TreeJoint(f"{body} {way}", "slide", place[:3], axis) for way, axis in zip("xyz", np.eye(3), strict=True)]
+
+
+def _oriented(part, tree, child):
+    """The joints of MuJoCo that a joint is, from the parent to the child."""
+    found = _JOINTS[part.kind](part)
+    for coordinate, joint in found:
+        tree.coordinates[coordinate] = joint
+    joints = [joint for _, joint in found]
+    if child == part.bodies[0]:
+        for joint in joints:
+            joint.axis = -joint.axis
+        joints.reverse()
+    return joints
+
+
+def _hinges(part, **axes):
+    """Joints by the names of their coordinates, each with its type and its axis in the world."""
+    values, out = part.coordinates(), []
+    for field, (kind, axis) in axes.items():
+        name = part.name if len(axes) == 1 else f"{part.name} {field}"
+        joint = TreeJoint(name, kind, part.point(1), axis, float(values[field].reshape(-1)[0]))
+        out.append((f"{part.name}.{field}", joint))
+    return out
+
+
+def _revolute(part):
+    return _hinges(part, angle=("hinge", part.direction("axis_a")))
+
+
+def _prismatic(part):
+    return _hinges(part, displacement=("slide", part.direction("axis_a")))
+
+
+def _cylindrical(part):
+    axis = part.direction("axis_a")
+    return _hinges(part, displacement=("slide", axis), angle=("hinge", axis))
+
+
+def _universal(part):
+    return _hinges(part, angle_a=("hinge", part.direction("axis_a")), angle_b=("hinge", part.direction("axis_b", 1)))
+
+
+def _gimbal(part):
+    own = part.part
+    values = part.coordinates()
+    first, second = np.asarray(own.axis_1), np.asarray(own.axis_2)
+    to_world, angle = matrix(part.poses[0][3:7]), float(values["angle_1"])
+    turned = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
+    back = matrix(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
+    return _hinges(
+        part,
+        angle_1=("hinge", to_world @ first),
+        angle_2=("hinge", to_world @ turned),
+        angle_3=("hinge", matrix(part.poses[1][3:7]) @ back),
+    )
+
+
+def _spherical(part):
+    return [(f"{part.name}.rotation", TreeJoint(part.name, "ball", part.point(1), np.zeros(3)))]
+
+
+def _planar(part):
+    axis, x = part.direction("axis_a"), part.direction("x_a")
+    values = part.coordinates()
+    ways = zip("xy", (x, np.cross(axis, x)), values["displacement"], strict=True)
+    slides = [TreeJoint(f"{part.name} {w}", "slide", part.point(1), a, float(v)) for w, a, v in ways]
+    hinge = TreeJoint(f"{part.name} angle", "hinge", part.point(1), axis, float(values["angle"]))
+    return [*((f"{joint.name}.displacement", joint) for joint in slides), (f"{part.name}.angle", hinge)]
+
+
+_JOINTS = {
+    "Revolute": _revolute,
+    "Prismatic": _prismatic,
+    "Cylindrical": _cylindrical,
+    "Universal": _universal,
+    "Gimbal": _gimbal,
+    "Spherical": _spherical,
+    "Planar": _planar,
+    "Fixed": lambda part: [],
+}
+
+
+# Loops
+
+
+def _ends(part):
+    """Attributes that name the bodies, a moving one first, and the number of that."""
+    k = 0 if part.bodies[0] != GROUND else 1
+    other = part.bodies[1 - k]
+    return {"body1": part.bodies[k]} | ({} if other == GROUND else {"body2": other}), k
+
+
+def _connect(part, tree, name, point):
+    bodies, k = _ends(part)
+    place = tree.place(part.bodies[k])
+    anchor = matrix(place[3:]).T @ (point - place[:3])
+    return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
+
+
+def _close_spherical(part, tree):
+    return [_connect(part, tree, part.name, part.point(1))]
+
+
+def _close_revolute(part, tree):
+    """Two points of the axis coincide."""
+    point = part.point(1)
+    second = point + part.direction("axis_a")
+    return [_connect(part, tree, part.name, point), _connect(part, tree, f"{part.name} axis", second)]
+
+
+def _close_fixed(part, tree):
+    bodies, _ = _ends(part)
+    del tree
+    return [("weld", {"name": part.name, **bodies})]
+
+
+def _close_coupling(part, tree):
+    own = part.part
+    joints = [tree.coordinates.get(name) for name in part.acts_on]
+    if None in joints or own.coefficients.shape[0] > 5:
+        return None
+    x, y = joints
+    shift = np.polynomial.Polynomial([y.value - float(own.other_zero), 1.0])
+    polynomial = np.polynomial.Polynomial(np.asarray(own.coefficients))(shift)
+    powers = np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
+    powers[0] += float(own.zero) - x.value
+    return [("joint", {"name": part.name, "joint1": x.name, "joint2": y.name, "polycoef": numbers(powers)})]
+
+
+def _close_driver(part, tree):
+    own = part.part
+    joint = tree.coordinates.get(part.acts_on[0])
+    if joint is None or joint.type == "ball" or np.any(np.asarray(own.rate)):
+        return None
+    constant = [float(np.reshape(own.value, -1)[0]) - joint.value, *itertools.repeat(0.0, 4)]
+    return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
+
+
+_CLOSING = {
+    "Spherical": _close_spherical,
+    "Revolute": _close_revolute,
+    "Fixed": _close_fixed,
+    "JointCoupling": _close_coupling,
+    "JointDriver": _close_driver,
+}

@@ -1,0 +1,160 @@
+"""Links that are fixed to each other as one body, and joints in succession between links without mass."""
+
+import dataclasses
+
+import numpy as np
+
+from .chains import Body
+from .description import GROUND, Joint, Link, Machine
+from .notes import Notes
+
+
+@dataclasses.dataclass
+class Chain:
+    """Joints in succession from one body to the next."""
+
+    joints: list[Joint]
+    parent: str
+    child: str
+
+
+@dataclasses.dataclass
+class Fused:
+    """What links became.
+
+    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with their own names; `of`:
+    for each link the name of its carrier or the ground; `frames`: for each link that is fixed to another one its body,
+    and position and rotation in it; `chains`.
+    """
+
+    carriers: dict[str, Link]
+    of: dict[str, str]
+    links: dict[str, Link]
+    frames: dict[str, tuple[str, np.ndarray, np.ndarray]]
+    chains: list[Chain]
+
+    def placed(self, link: str) -> Body:
+        """The body of a link, at the reference pose."""
+        carrier = self.of[link]
+        if carrier == GROUND:
+            return Body(GROUND, np.zeros(3), np.eye(3))
+        own = self.carriers[carrier]
+        return Body(own.name, own.position, own.rotation)
+
+    def point(self, link: str, at: np.ndarray) -> tuple[str, np.ndarray]:
+        """The body of a link, and a point of the link in that body's frame."""
+        body = self.placed(link)
+        if self.of[link] == link:
+            return body.name, at
+        own = self.links[link]
+        return body.name, body.point(own.position + own.rotation @ at)
+
+    def rotation(self, link: str) -> np.ndarray:
+        """The rotation matrix from a link's axes to those of its body."""
+        body = self.placed(link)
+        if self.of[link] == link:
+            return np.eye(3)
+        return body.rotation.T @ self.links[link].rotation
+
+    def moved_inertia(self, joint: Joint) -> float:
+        """The inertia [kg m²] or mass [kg] that moves with a joint, all other joints held; in a closed loop only that
+        of the next body.
+        """
+        start, blocked = self.of[joint.child], self.of[joint.parent]
+        seen, queue = {start}, [start]
+        while queue:
+            body = queue.pop()
+            for chain in self.chains:
+                ends = self.of[chain.parent], self.of[chain.child]
+                if joint in chain.joints or body not in ends:
+                    continue
+                other = ends[1] if ends[0] == body else ends[0]
+                if other in (GROUND, blocked):
+                    seen, queue = {start}, []
+                    break
+                if other not in seen:
+                    seen.add(other)
+                    queue.append(other)
+        own = [self.carriers[name] for name in seen if name in self.carriers]
+        if joint.kind == "slide":
+            return sum(link.mass for link in own)
+        return sum(_about(link, joint) for link in own)
+
+
+def _about(link, joint):
+    axis = link.rotation.T @ joint.axis
+    arm = np.cross(joint.axis, link.position + link.rotation @ link.centre - joint.point)
+    return float(axis @ link.inertia @ axis + link.mass * arm @ arm)
+
+
+def fuse(machine: Machine, notes: Notes) -> Fused:
+    """Fuse links that are fixed to each other, the later ones of the file to the earlier ones."""
+    links = {GROUND: Link(GROUND), **machine.links}
+    parent = {name: name for name in links}
+
+    def root(name):
+        while parent[name] != name:
+            name = parent[name]
+        return name
+
+    order = {name: k for k, name in enumerate(links)}
+    for joint in machine.joints:
+        if joint.kind == "fixed":
+            first, last = sorted((root(joint.parent), root(joint.child)), key=order.__getitem__)
+            parent[last] = first
+    of = {name: root(name) for name in links}
+    groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
+    moving = [joint for joint in machine.joints if joint.kind != "fixed"]
+    light = {name for name, own in groups.items() if name != GROUND and not any(link.mass > 0 for link in own)}
+    chains = _chains(moving, of, light, links, notes)
+    carriers = {name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light}
+    fused = Fused(carriers, of, links, {}, chains)
+    for name, carrier in of.items():
+        if carrier != name and carrier not in light:
+            body = fused.placed(name)
+            own = links[name]
+            fused.frames[name] = (body.name, body.point(own.position), body.rotation.T @ own.rotation)
+    return fused
+
+
+def _chains(joints, of, light, links, notes):
+    """Joints in succession between bodies with mass."""
+    at: dict[str, list[Joint]] = {}
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            at.setdefault(of[link], []).append(joint)
+    for name in sorted(light, key=list(links).index):
+        if len(at.get(name, [])) != 2:
+            ends = "carries nothing" if len(at.get(name, [])) < 2 else "branches"
+            notes.refused.append(
+                f"{links[name].where}Link {name!r} moves without mass and {ends}: give it a mass and an inertia, or "
+                "fix it to another link."
+            )
+    out = []
+    for joint in joints:
+        if of[joint.parent] in light:
+            continue
+        chain, end = [joint], joint.child
+        while of[end] in light and len(chain) <= len(joints):
+            following = [own for own in at[of[end]] if own is not chain[-1] and of[own.parent] == of[end]]
+            if not following:
+                break
+            chain.append(following[0])
+            end = following[0].child
+        if of[end] not in light:
+            out.append(Chain(chain, joint.parent, end))
+    return out
+
+
+def _summed(frame: Link, links: list[Link]) -> Link:
+    """Several links as one, in the frame of one of them."""
+    if len(links) == 1:
+        return dataclasses.replace(frame)
+    mass = sum(link.mass for link in links)
+    centres = [frame.rotation.T @ (link.position + link.rotation @ link.centre - frame.position) for link in links]
+    centre = sum(link.mass * own for link, own in zip(links, centres, strict=True)) / mass
+    inertia = np.zeros((3, 3))
+    for link, own in zip(links, centres, strict=True):
+        turn, arm = frame.rotation.T @ link.rotation, own - centre
+        inertia += turn @ link.inertia @ turn.T + link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return dataclasses.replace(frame, mass=mass, centre=centre, inertia=inertia)

@@ -1,0 +1,288 @@
+"""Machines from MJCF, MuJoCo's format, which MuJoCo itself reads."""
+
+from collections.abc import Collection
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._types import State
+from .build import build
+from .description import (
+    GROUND,
+    Coupling,
+    Joint,
+    Link,
+    Loop,
+    Machine,
+    Mark,
+    Shape,
+    TendonPath,
+    matrix,
+)
+from .mjcf_actuators import read_actuators
+from .mjcf_file import compiled
+from .mjcf_refusals import refuse_unknown
+from .model import ImportedModel
+from .notes import Notes, checked_ignore
+
+_KINDS = ("free", "ball", "slide", "hinge")
+
+
+def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
+    """A machine from MJCF.
+
+    MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
+    `connect`, `weld` and `joint` equalities hold exactly, whatever their `solref` and `solimp`.
+
+    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
+    such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
+
+    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+
+    **Raises:** `ValueError` that lists the elements that cannot be imported; `ImportError` without MuJoCo, `pip install
+    "jaxmb[import]"`.
+    """
+    notes = Notes(checked_ignore(ignore))
+    model, file = compiled(source, notes)
+    import mujoco
+
+    refuse_unknown(mujoco, model, notes)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names = _Names(mujoco, model)
+    machine = Machine(names.model, np.array(model.opt.gravity))
+    disabled = {word for word in mujoco.mjtDisableBit.__members__.values() if model.opt.disableflags & int(word)}
+    off = {str(word).rpartition("mjDSBL_")[2] for word in disabled}
+    if "GRAVITY" in off:
+        machine.gravity = np.zeros(3)
+    _read_links(model, data, names, machine)
+    _read_joints(model, data, names, machine, off)
+    if "EQUALITY" not in off:
+        _read_equalities(mujoco, model, names, machine, notes)
+    _read_tendons(mujoco, model, names, machine, off)
+    if "ACTUATION" not in off:
+        machine.actuators = read_actuators(mujoco, model, names, notes)
+    _read_marks(model, names, machine)
+    _read_shapes(mujoco, model, names, machine)
+    built = build(machine, notes)
+    said = notes.finish(file)
+    locate = _Locate(mujoco, model, names, built)
+    states = {
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or f"key {k}": locate(model.key_qpos[k], model.key_qvel[k])
+        for k in range(model.nkey)
+    }
+    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
+    return ImportedModel(names.model, built.scene, said, coordinates, built.controls, states, built.shapes, locate)
+
+
+class _Names:
+    """Names of elements by kind and number; elements without a name are numbered."""
+
+    def __init__(self, mujoco: Any, model: Any):
+        self._find = lambda kind, k: mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k)
+        text = model.names[: model.names.find(b"\0")].decode()
+        self.model = text or "model"
+        self._model = model
+
+    def __call__(self, kind: str, k: int) -> str:
+        if kind == "body" and k == 0:
+            return GROUND
+        return self._find(kind, k) or f"{kind} {k}"
+
+    def joint(self, k: int) -> str:
+        """A joint; one without a name is called after its body."""
+        return self._find("joint", k) or f"{self('body', self._model.jnt_bodyid[k])} joint {k}"
+
+
+def _read_links(model, data, names, machine):
+    for k in range(1, model.nbody):
+        turn = matrix(model.body_iquat[k])
+        name = names("body", k)
+        machine.links[name] = Link(
+            name,
+            mass=float(model.body_mass[k]),
+            centre=np.array(model.body_ipos[k]),
+            inertia=turn @ np.diag(model.body_inertia[k]) @ turn.T,
+            position=np.array(data.xpos[k]),
+            rotation=np.array(data.xmat[k]).reshape(3, 3),
+        )
+        if model.body_mocapid[k] >= 0:
+            # What moves as prescribed may have any mass.
+            link = machine.links[name]
+            link.moved, link.mass, link.inertia = True, max(link.mass, 1.0), link.inertia + np.eye(3)
+        if model.body_gravcomp[k]:
+            machine.buoyancy[name] = float(model.body_gravcomp[k])
+        if not model.body_jntnum[k] and not machine.links[name].moved:
+            parent = names("body", model.body_parentid[k])
+            machine.joints.append(Joint(f"{name} weld", "fixed", parent, name))
+
+
+def _read_joints(model, data, names, machine, off):
+    fixed, machine.joints = machine.joints, []
+    for k in range(model.njnt):
+        body, dof, q = model.jnt_bodyid[k], model.jnt_dofadr[k], model.jnt_qposadr[k]
+        first, last = model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body] - 1
+        kind = _KINDS[model.jnt_type[k]]
+        child = names("body", body)
+        # Between joints in succession there are links without mass.
+        between = lambda j, child=child: f"{child} after {names.joint(j)}"
+        if k < last:
+            source = machine.links[child]
+            machine.links[between(k)] = Link(between(k), position=source.position, rotation=source.rotation)
+        parent = names("body", model.body_parentid[body]) if k == first else between(k - 1)
+        scalar = kind in ("hinge", "slide")
+        stop = None
+        if model.jnt_solref[k][0] > 0 and model.dof_invweight0[dof] > 0:
+            time, ratio = model.jnt_solref[k]
+            stop = (1 / model.dof_invweight0[dof], time * ratio)
+        machine.joints.append(
+            Joint(
+                names.joint(k),
+                kind,
+                parent,
+                child if k == last else between(k),
+                point=np.array(data.xanchor[k]),
+                axis=np.array(data.xaxis[k]),
+                reference=float(model.qpos0[q]) if scalar else 0.0,
+                stiffness=0.0 if "SPRING" in off else float(model.jnt_stiffness[k]),
+                free=float(model.qpos_spring[q]) if scalar else None,
+                damping=0.0 if "DAMPER" in off else float(model.dof_damping[dof]),
+                armature=float(model.dof_armature[dof]),
+                friction=0.0 if "FRICTIONLOSS" in off else float(model.dof_frictionloss[dof]),
+                limits=tuple(model.jnt_range[k]) if model.jnt_limited[k] and "LIMIT" not in off else None,
+                stop=stop,
+            )
+        )
+    machine.joints += fixed
+
+
+def _read_equalities(mujoco, model, names, machine, notes):
+    kinds = mujoco.mjtEq
+    for k in range(model.neq):
+        name, data = names("equality", k), np.array(model.eq_data[k])
+        if not model.eq_active0[k]:
+            notes.say("Equalities that are not active are left out: {}.", name)
+            continue
+        one, two, kind = model.eq_obj1id[k], model.eq_obj2id[k], kinds(int(model.eq_type[k]))
+        if kind == kinds.mjEQ_JOINT:
+            other = names.joint(two) if two >= 0 else None
+            zeros = [float(model.qpos0[model.jnt_qposadr[j]]) if j >= 0 else 0.0 for j in (one, two)]
+            machine.couplings.append(Coupling(name, names.joint(one), other, data[:5], *zeros))
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            machine.loops.append(_loop(mujoco, model, names, name, k, data))
+        else:
+            what = str(kind).rpartition("mjEQ_")[2].lower()
+            notes.refuse("loops", name, f"The equality {name!r} is of type {what}")
+
+
+def _loop(mujoco, model, names, name, k, data):
+    one, two = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+    weld = model.eq_type[k] == mujoco.mjtEq.mjEQ_WELD
+    if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
+        a, b = (names("body", model.site_bodyid[site]) for site in (one, two))
+        turns = [matrix(model.site_quat[site]) for site in (one, two)]
+        points = [np.array(model.site_pos[site]) for site in (one, two)]
+        return Loop(name, a, b, *points, turns[0] @ turns[1].T if weld else None)
+    a, b = names("body", one), names("body", two)
+    if weld:
+        return Loop(name, a, b, data[3:6], data[0:3], matrix(data[6:10]))
+    return Loop(name, a, b, data[0:3], data[3:6])
+
+
+def _read_tendons(mujoco, model, names, machine, off):
+    for k in range(model.ntendon):
+        start = model.tendon_adr[k]
+        wraps = range(start, start + model.tendon_num[k])
+        own = TendonPath(
+            names("tendon", k),
+            stiffness=0.0 if "SPRING" in off else float(model.tendon_stiffness[k]),
+            free=float(model.tendon_lengthspring[k][0]),
+            damping=0.0 if "DAMPER" in off else float(model.tendon_damping[k]),
+            friction=0.0 if "FRICTIONLOSS" in off else float(model.tendon_frictionloss[k]),
+            limits=tuple(model.tendon_range[k]) if model.tendon_limited[k] and "LIMIT" not in off else None,
+        )
+        if model.tendon_solref_lim[k][0] > 0 and model.tendon_invweight0[k] > 0:
+            time, ratio = model.tendon_solref_lim[k]
+            own.stop = (1 / model.tendon_invweight0[k], time * ratio)
+        for w in wraps:
+            item = model.wrap_objid[w]
+            if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT:
+                own.joints.append((names.joint(item), float(model.wrap_prm[w])))
+            elif model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_SITE:
+                own.points.append((names("body", model.site_bodyid[item]), np.array(model.site_pos[item])))
+        machine.tendons.append(own)
+
+
+def _read_marks(model, names, machine):
+    for k in range(model.nsite):
+        link = names("body", model.site_bodyid[k])
+        machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k])))
+
+
+_SHAPES = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
+
+
+def _read_shapes(mujoco, model, names, machine):
+    for k in range(model.ngeom):
+        kind = _SHAPES.get(int(model.geom_type[k]))
+        if kind is None:
+            continue
+        file = ""
+        if kind == "mesh":
+            start = model.mesh_pathadr[model.geom_dataid[k]]
+            file = model.paths[start : model.paths.find(b"\0", start)].decode() if start >= 0 else ""
+        machine.shapes.append(
+            Shape(
+                kind,
+                names("body", model.geom_bodyid[k]),
+                np.array(model.geom_pos[k]),
+                matrix(model.geom_quat[k]),
+                tuple(map(float, model.geom_size[k])),
+                file,
+                tuple(map(float, model.geom_rgba[k])),
+                bool(model.geom_contype[k] or model.geom_conaffinity[k]),
+            )
+        )
+
+
+class _Locate:
+    """States of the bodies at the coordinates and velocities of MuJoCo's `model`."""
+
+    def __init__(self, mujoco: Any, model: Any, names: _Names, built: Any):
+        self._mujoco, self.model = mujoco, model
+        self._bodies: list[tuple[str, int]] = []
+        links = {names("body", k): k for k in range(model.nbody)}
+        numbers = {own.name: links[link] for link, own in built.fused.carriers.items()}
+        joints = {names.joint(k): k for k in range(model.njnt)}
+        for body in () if built.scene is None else built.scene.bodies:
+            if body.name in built.rotors:
+                self._bodies.append(("rotor", joints[built.rotors[body.name]]))
+            else:
+                self._bodies.append(("link", numbers[body.name]))
+        self._centres = [] if built.scene is None else [np.asarray(body.centre) for body in built.scene.bodies]
+
+    def __call__(self, qpos: np.ndarray, qvel: np.ndarray) -> State:
+        mujoco, model = self._mujoco, self.model
+        qvel = qvel if qvel.size else np.zeros(model.nv)
+        if qpos.shape != (model.nq,) or qvel.shape != (model.nv,):
+            raise ValueError(f"qpos must have shape ({model.nq},) and qvel ({model.nv},).")
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel = qpos, qvel
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        q, u = [], []
+        for (kind, k), centre in zip(self._bodies, self._centres, strict=True):
+            if kind == "rotor":
+                angle, rate = data.qpos[model.jnt_qposadr[k]], data.qvel[model.jnt_dofadr[k]]
+                angle = angle - model.qpos0[model.jnt_qposadr[k]]
+                q += [0.0, 0.0, 0.0, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
+                u += [0.0, 0.0, 0.0, 0.0, 0.0, rate]
+                continue
+            turn = data.xmat[k].reshape(3, 3)
+            velocity = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, k, velocity, 0)
+            arm = turn @ centre
+            q += [*(data.xpos[k] + arm), *data.xquat[k]]
+            u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
+        return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))

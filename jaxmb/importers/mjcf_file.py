@@ -1,0 +1,92 @@
+"""MuJoCo's compilation of an MJCF file, without what only pictures need."""
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+from .notes import Notes
+from .source import file_name, is_text
+
+
+def compiled(source: Any, notes: Notes) -> tuple[Any, str]:
+    """MuJoCo's model of a path, a text or an `MjSpec`, and what messages call it.
+
+    Materials and textures, and meshes that are missing, are left out, and `notes` say so.
+
+    **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that an inertia comes from.
+    """
+    mujoco = _mujoco()
+    file = file_name(source)
+    is_path = isinstance(source, os.PathLike | str) and not is_text(source)
+    if is_path and not Path(source).is_file():
+        raise ValueError(f"{file} does not exist.")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            spec = _specification(mujoco, source)
+            _without_pictures(spec, notes)
+            model = spec.compile()
+    except ValueError as error:
+        notes.finish(file)
+        raise ValueError(f"{file}: {str(error).strip()}") from None
+    for warning in caught:
+        notes.say(f"MuJoCo: {warning.message}.")
+    return model, file
+
+
+def _specification(mujoco, source):
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy()
+    return mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
+
+
+def _mujoco():
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ImportError('mjcf needs MuJoCo: pip install "jaxmb[import]"') from error
+    return mujoco
+
+
+def _without_pictures(spec: Any, notes: Notes) -> None:
+    for kind in ("geoms", "sites", "tendons", "skins", "flexes"):
+        for element in getattr(spec, kind, ()):
+            if hasattr(element, "material"):
+                element.material = ""
+    left_out = [
+        f"{len(getattr(spec, kind))} {kind}" for kind in ("materials", "textures", "skins") if getattr(spec, kind)
+    ]
+    if left_out:
+        notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
+    for kind in ("materials", "textures", "skins"):
+        for element in list(getattr(spec, kind)):
+            spec.delete(element)
+    folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")
+    is_missing = lambda mesh: mesh.file and not (folder / mesh.file).exists()
+    missing = {_named(mesh): mesh for mesh in spec.meshes if is_missing(mesh)}
+    if missing:
+        notes.say(f"Mesh files are missing, so the picture lacks them: {', '.join(sorted(missing))}.")
+        _without_meshes(spec, missing, notes)
+
+
+def _named(mesh):
+    return mesh.name or Path(mesh.file).stem
+
+
+def _without_meshes(spec, missing, notes):
+    for geom in list(spec.geoms):
+        if geom.meshname not in missing:
+            continue
+        body = geom.parent
+        weighs = not (geom.mass == 0 or geom.density == 0)
+        if body.name != "world" and weighs and not body.explicitinertial:
+            notes.refuse(
+                "meshes",
+                body.name,
+                f"The mass of body {body.name!r} comes from mesh {geom.meshname!r}, whose file is missing: give the "
+                "file, or the body an <inertial>",
+            )
+        spec.delete(geom)
+    for mesh in missing.values():
+        spec.delete(mesh)

@@ -1,0 +1,52 @@
+"""What an import returns."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from .._types import State
+from ..scene import Scene
+from .description import Shape
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportedModel:
+    """A machine from a file.
+
+    **Fields:**
+
+    - `scene`: its bodies, joints, forces and frames, a `Scene` to extend and compile. Bodies and joints have the names
+        of the file, and bodies their frames; links that are fixed to others, sites and other marks are frames. An
+        angle or displacement of a joint is that of the file. The rotor of a motor with armature is a body of its own,
+        a flywheel at the origin that is geared to its joint.
+    - `notes`: sentences on what is approximated and what is left out.
+    - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.
+    - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
+        `simulate(..., inputs=)`.
+    - `states`: the named states of the file, such as keyframes of MJCF, for `assemble`.
+    - `shapes`: what the links look like, for a picture.
+    """
+
+    name: str
+    scene: Scene
+    notes: tuple[str, ...]
+    coordinates: Mapping[str, str]
+    controls: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    states: Mapping[str, State] = dataclasses.field(default_factory=dict)
+    shapes: tuple[Shape, ...] = ()
+    locate: Callable[[np.ndarray, np.ndarray], State] | None = dataclasses.field(default=None, repr=False)
+
+    def state(self, qpos: Any, qvel: Any = None) -> State:
+        """The state of the bodies at MuJoCo's coordinates and velocities, for models from MJCF.
+
+        **Arguments:** `qpos`, shape (nq,), and `qvel`, shape (nv,), default zero, in MuJoCo's order and conventions.
+
+        **Raises:** `ValueError` for a model from another format, which has no such order; use `assemble` with
+        `fix={"hip.angle": 0.3}` there.
+        """
+        if self.locate is None:
+            raise ValueError(f"{self.name!r} has no coordinates of MuJoCo: use assemble with fix= by joint names.")
+        qpos = np.asarray(qpos, float)
+        return self.locate(qpos, np.zeros(0) if qvel is None else np.asarray(qvel, float))

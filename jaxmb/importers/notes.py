@@ -1,0 +1,73 @@
+"""What an import says aloud: what it approximates and leaves out, and what it refuses."""
+
+import dataclasses
+from collections.abc import Collection
+
+from ..parts.names import unknown
+
+# What can be left out, by name.
+LEAVABLE = (
+    "actuators",
+    "armature",
+    "collisions",
+    "couplings",
+    "damping",
+    "friction",
+    "joints",
+    "limits",
+    "loops",
+    "meshes",
+    "springs",
+    "tendons",
+)
+
+
+@dataclasses.dataclass
+class Notes:
+    """Collects sentences while a file is read.
+
+    **Fields:** `ignore`: what is to be left out, a word of `LEAVABLE` or the name of an element of the file; `said`:
+    approximations, and what was left out, each with the names that it holds for; `refused`.
+    """
+
+    ignore: frozenset[str]
+    said: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    refused: list[str] = dataclasses.field(default_factory=list)
+    used: set[str] = dataclasses.field(default_factory=set)
+
+    def say(self, sentence: str, *names: str) -> None:
+        """Note a sentence once; if it holds for elements, with their names in place of `{}`."""
+        own = self.said.setdefault(sentence, [])
+        own += [repr(name) for name in names if repr(name) not in own]
+
+    def leaves_out(self, kind: str, name: str = "") -> bool:
+        """Whether a kind of element, or the one of this name, is to be left out; if so, this is noted."""
+        for word in (kind, name):
+            if word and word in self.ignore:
+                self.used.add(word)
+                sentence = f"Left out, as ignore={word!r} asks: {kind}"
+                self.say(f"{sentence} of {{}}." if name else f"{sentence}.", *[name][: bool(name)])
+                return True
+        return False
+
+    def refuse(self, kind: str, name: str, sentence: str) -> None:
+        """Refuse an element, unless it is to be left out."""
+        if not self.leaves_out(kind, name):
+            self.refused.append(f"{sentence} (ignore={kind!r} leaves it out)")
+
+    def finish(self, file: str, what: str = "cannot be imported") -> tuple[str, ...]:
+        """The sentences.
+
+        **Raises:** `ValueError` that lists all that was refused, and for words of `ignore` that nothing answers to.
+        """
+        for word in sorted(self.ignore - self.used - set(LEAVABLE)):
+            raise ValueError(f"ignore: {unknown('element', word, LEAVABLE)}")
+        if self.refused:
+            listed = "".join(f"\n- {sentence}" for sentence in self.refused)
+            raise ValueError(f"{file} has elements that {what}:{listed}")
+        return tuple(sentence.format(", ".join(names)) if names else sentence for sentence, names in self.said.items())
+
+
+def checked_ignore(ignore: str | Collection[str]) -> frozenset[str]:
+    """`ignore` as a set of words."""
+    return frozenset([ignore] if isinstance(ignore, str) else ignore)

@@ -1,0 +1,237 @@
+"""Machines from SDF, the format of Gazebo: links anywhere, joints between any two of them, closed loops included."""
+
+import os
+import re
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from .build import build
+from .description import GROUND, Joint, Link, Machine, Shape, roll_pitch_yaw
+from .model import ImportedModel
+from .notes import Notes, checked_ignore
+from .source import file_name, text_of
+from .xml_tree import Element, parse
+
+_KINDS = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "ball": "ball",
+    "fixed": "fixed",
+    "universal": "hinge",
+}
+# From this size on a limit of a joint is none.
+_UNLIMITED = 1e15
+# Elements that do not act on the motion.
+_EFFECTLESS = {"sensor", "light", "material", "self_collide", "allow_auto_disable", "audio_source", "transparency"}
+
+
+def sdf(
+    source: str | os.PathLike[str],
+    *,
+    gravity: Any = (0.0, 0.0, -9.81),
+    ignore: str | Collection[str] = (),
+) -> ImportedModel:
+    """A machine from SDF.
+
+    A model is free unless a joint binds it to `world`, or it is static. Angles that are written with few digits, such
+    as 1.5708, are the multiples of π/12 that they round: the hinges of a loop are then as parallel as they are meant.
+
+    **Arguments:** `source`: a path, or the text of a file, with one model; `gravity` [m/s²], shape (3,), unless a world
+    in the file has it; `ignore`: what is to be left out, words such as `"limits"` and `"friction"`, or names of joints.
+
+    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+
+    **Raises:** `ValueError` with file and line for elements that cannot be imported.
+    """
+    notes, file = Notes(checked_ignore(ignore)), file_name(source)
+    root = parse(text_of(source), file)
+    if root.tag != "sdf":
+        raise ValueError(f"{root.where}the root of SDF is <sdf>, got <{root.tag}>.")
+    holder = root.first("world") or root
+    for include in (*holder.all("include"), *root.all("include")):
+        raise ValueError(f"{include.where}<include> is not followed: put the model into the file.")
+    models = list(holder.all("model"))
+    if len(models) != 1:
+        raise ValueError(f"{root.where}the file must hold one model, got {len(models)}.")
+    (model,) = models
+    weight = holder.first("gravity")
+    machine = Machine(model.attributes.get("name", "model"), np.asarray(gravity, float))
+    if weight is not None:
+        machine.gravity = weight.numbers()
+    place = _pose(model, notes)
+    for nested in (*model.all("model"), *model.all("include"), *model.all("frame")):
+        notes.refused.append(f"{nested.where}<{nested.tag}> within a model is not read; write the model out.")
+    static = model.first("static")
+    for element in model.all("link"):
+        _read_link(element, machine, place, notes)
+        if static is not None and static.text.strip() in ("1", "true"):
+            machine.joints.append(Joint(f"{element.need('name')} weld", "fixed", GROUND, element.need("name")))
+    for element in model.all("joint"):
+        _read_joint(element, machine, notes)
+    if any(shape.collides for shape in machine.shapes):
+        notes.refuse("collisions", "", "Links have shapes for collisions")
+    for element in root.unread():
+        if element.tag not in _EFFECTLESS:
+            notes.say(f"{element.where}<{element.tag}> is not read.")
+    listed = sorted({element.tag for element in root.unread()} & _EFFECTLESS)
+    if listed:
+        notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
+    built = build(machine, notes)
+    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
+    said = notes.finish(file)
+    return ImportedModel(machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes)
+
+
+def _pose(element: Element, notes: Notes):
+    """Position and rotation of a `<pose>`."""
+    own = element.first("pose")
+    if own is None:
+        return np.zeros(3), np.eye(3)
+    relative = own.attributes.get("relative_to", own.attributes.get("frame", ""))
+    if relative not in ("", "__model__"):
+        notes.refused.append(f"{own.where}a pose relative to {relative!r}: give it in the model's frame.")
+    words = own.text.split()
+    numbers = own.numbers(count=6)
+    angles = [_rounded(word, value, own, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
+    if own.attributes.get("degrees") in ("1", "true"):
+        angles = [np.deg2rad(value) for value in numbers[3:]]
+    return numbers[:3], roll_pitch_yaw(angles)
+
+
+def _rounded(word, value, element, notes):
+    """An angle [rad]: the multiple of π/12 that the word is a rounding of, if it is one."""
+    digits = re.fullmatch(r"[-+]?\d*\.(\d{2,})", word)
+    if digits is None:
+        return value
+    step = np.pi / 12
+    exact = step * round(value / step)
+    if exact and exact != value and abs(value - exact) <= 0.51 * 10.0 ** -len(digits.group(1)):
+        notes.say("Angles such as 1.5708 are taken to be the multiples of π/12 that they round.")
+        return exact
+    return value
+
+
+def _read_link(element, machine, place, notes):
+    name = element.need("name")
+    if name in machine.links:
+        raise ValueError(f"{element.where}link {name!r} is there twice.")
+    position, rotation = _pose(element, notes)
+    link = Link(name, where=element.where)
+    link.position, link.rotation = place[0] + place[1] @ position, place[1] @ rotation
+    inertial = element.first("inertial")
+    if inertial is not None:
+        link.centre, turn = _pose(inertial, notes)
+        link.mass = inertial.number("mass", 1.0)
+        own = inertial.first("inertia")
+        xx, xy, xz, yy, yz, zz = (
+            (1.0 if i in ("ixx", "iyy", "izz") else 0.0) if own is None else own.number(i)
+            for i in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    else:
+        notes.refused.append(f"{element.where}link {name!r} has no <inertial>: give it a mass and an inertia.")
+    machine.links[name] = link
+    for tag in ("visual", "collision"):
+        for own in element.all(tag):
+            _read_shape(own, name, machine, notes)
+
+
+def _read_shape(element, link, machine, notes):
+    position, rotation = _pose(element, notes)
+    geometry = element.first("geometry")
+    shape = geometry.children[0] if geometry is not None and geometry.children else None
+    if shape is None:
+        raise ValueError(f"{element.where}<{element.tag}> needs a <geometry>.")
+    shape.read = True
+    kind, size, file = shape.tag, (), ""
+    if kind == "box":
+        edges = shape.first("size")
+        size = () if edges is None else tuple(0.5 * edges.numbers())
+    elif kind == "sphere":
+        size = (shape.number("radius"),)
+    elif kind in ("cylinder", "capsule"):
+        size = (shape.number("radius"), 0.5 * shape.number("length"))
+    elif kind == "mesh":
+        scale, uri = shape.first("scale"), shape.first("uri")
+        size = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers())
+        file = "" if uri is None else uri.text.strip()
+    else:
+        for child in shape.children:
+            child.read = True
+    own = Shape(kind, link, position, rotation, size, file, collides=element.tag == "collision")
+    machine.shapes.append(own)
+
+
+def _read_joint(element, machine, notes):
+    name, kind = element.need("name"), element.need("type")
+    if kind not in _KINDS:
+        known = ", ".join(_KINDS)
+        if kind in ("gearbox", "screw", "revolute2"):
+            for child in element.children:
+                child.read = True
+            notes.refuse("joints", name, f"{element.where}joint {name!r} is of type {kind!r}")
+            return
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+    ends = []
+    for tag in ("parent", "child"):
+        own = element.first(tag)
+        link = "" if own is None else own.text.strip()
+        if link not in machine.links and link != "world":
+            raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
+        ends.append(GROUND if link == "world" else link)
+    child = machine.links.get(ends[1], Link(GROUND))
+    position, rotation = _pose(element, notes)
+    frame = child.rotation @ rotation
+    point = child.position + child.rotation @ position
+    axes = [own for tag in ("axis", "axis2") if (own := element.first(tag)) is not None]
+    if kind == "universal" and len(axes) == 2:
+        between = f"{name} cross"
+        machine.links[between] = Link(between, position=point, rotation=frame, where=element.where)
+        first = Joint(f"{name} 1", "hinge", ends[0], between, point, where=element.where)
+        second = Joint(f"{name} 2", "hinge", between, ends[1], point, where=element.where)
+        pairs = list(zip((first, second), axes, strict=True))
+    else:
+        joint = Joint(name, _KINDS[kind], *ends, point, where=element.where)
+        pairs = [(joint, axes[0] if axes else None)]
+    for joint, axis in pairs:
+        if axis is not None:
+            _read_axis(joint, axis, frame, machine, notes, kind)
+        elif joint.kind in ("hinge", "slide"):
+            raise ValueError(f"{element.where}joint {name!r} needs an <axis>.")
+        machine.joints.append(joint)
+
+
+def _read_axis(joint, axis, frame, machine, notes, kind):
+    xyz = axis.first("xyz")
+    direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
+    expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
+    in_model = axis.first("use_parent_model_frame")
+    if (in_model is not None and in_model.text.strip() in ("1", "true")) or expressed == "__model__":
+        frame = np.eye(3)
+    elif expressed:
+        frame = machine.links[expressed].rotation if expressed in machine.links else frame
+    length = np.linalg.norm(direction)
+    if length == 0:
+        raise ValueError(f"{axis.where}the axis of joint {joint.name!r} is zero.")
+    joint.axis = frame @ (direction / length)
+    dynamics, limit = axis.first("dynamics"), axis.first("limit")
+    if dynamics is not None:
+        joint.damping, joint.friction = dynamics.number("damping"), dynamics.number("friction")
+        joint.stiffness = dynamics.number("spring_stiffness")
+        free = dynamics.number("spring_reference")
+        joint.free = None if joint.kind == "ball" else free
+    if limit is not None:
+        lower, upper = limit.number("lower", -np.inf), limit.number("upper", np.inf)
+        for child in limit.children:
+            if not child.read and child.tag in ("effort", "velocity"):
+                child.read = True
+                notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
+        if kind != "ball" and lower > -_UNLIMITED and upper < _UNLIMITED:
+            if not lower < upper:
+                raise ValueError(f"{limit.where}the limits of joint {joint.name!r} must increase: {lower}, {upper}.")
+            joint.limits = (lower, upper)
+        elif kind != "ball" and (lower > -_UNLIMITED or upper < _UNLIMITED):
+            notes.refuse("limits", joint.name, f"{limit.where}joint {joint.name!r} is limited on one side")

@@ -1,0 +1,212 @@
+"""Machines from URDF, the format of ROS."""
+
+import os
+from collections import Counter
+from collections.abc import Collection
+from typing import Any, Literal
+
+import numpy as np
+
+from .build import build
+from .description import GROUND, Coupling, Joint, Link, Machine, Shape, roll_pitch_yaw
+from .model import ImportedModel
+from .notes import Notes, checked_ignore
+from .source import file_name, text_of
+from .xml_tree import Element, parse
+
+_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fixed": "fixed", "floating": "free"}
+# Elements that do not act on the motion.
+_EFFECTLESS = {"material", "transmission", "verbose", "name"}
+
+
+def urdf(
+    source: str | os.PathLike[str],
+    *,
+    base: Literal["fixed", "free"] = "fixed",
+    gravity: Any = (0.0, 0.0, -9.81),
+    ignore: str | Collection[str] = (),
+) -> ImportedModel:
+    """A machine from URDF.
+
+    **Arguments:**
+
+    - `source`: a path, or the text of a file.
+    - `base`: whether the root link is fixed to the ground, or free. A root link called `world` is the ground.
+    - `gravity` [m/s²], shape (3,), which the format does not hold.
+    - `ignore`: what is to be left out, words such as `"limits"` and `"friction"`, or names of joints.
+
+    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+
+    **Raises:** `ValueError` with file and line for elements that cannot be imported.
+    """
+    notes, file = Notes(checked_ignore(ignore)), file_name(source)
+    if base not in ("fixed", "free"):
+        raise ValueError(f"base must be 'fixed' or 'free', got {base!r}.")
+    root = parse(text_of(source), file)
+    if root.tag != "robot":
+        raise ValueError(f"{root.where}the root of URDF is <robot>, got <{root.tag}>.")
+    if any(child.tag.startswith("xacro:") for child in root.children):
+        raise ValueError(f"{root.where}the file has xacro macros: run xacro on it first.")
+    machine = Machine(root.attributes.get("name", "robot"), np.asarray(gravity, float))
+    for element in root.all("link"):
+        _read_link(element, machine)
+    joints = [_read_joint(element, machine) for element in root.all("joint")]
+    _place(machine, joints, base, root)
+    for joint, element, _ in joints:
+        machine.joints.append(joint)
+        _read_mimic(joint, element, machine)
+    if any(shape.collides for shape in machine.shapes):
+        notes.refuse("collisions", "", "Links have shapes for collisions")
+    _say_unread(root, notes)
+    built = build(machine, notes)
+    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
+    said = notes.finish(file)
+    return ImportedModel(machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes)
+
+
+def _origin(element: Element | None):
+    """Position and rotation of an `<origin>`."""
+    own = None if element is None else element.first("origin")
+    if own is None:
+        return np.zeros(3), np.eye(3)
+    position = own.numbers(own.attributes.get("xyz", "0 0 0"))
+    return position, roll_pitch_yaw(own.numbers(own.attributes.get("rpy", "0 0 0")))
+
+
+def _read_link(element, machine):
+    name = element.need("name")
+    if name in machine.links:
+        raise ValueError(f"{element.where}link {name!r} is there twice.")
+    link = Link(name, where=element.where)
+    inertial = element.first("inertial")
+    if inertial is not None:
+        link.centre, turn = _origin(inertial)
+        mass, inertia = inertial.first("mass"), inertial.first("inertia")
+        if mass is None or inertia is None:
+            raise ValueError(f"{inertial.where}<inertial> of link {name!r} needs <mass> and <inertia>.")
+        link.mass = float(mass.numbers(mass.need("value"), 1)[0])
+        xx, xy, xz, yy, yz, zz = (inertia.attribute_number(i) for i in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+        link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    machine.links[name] = link
+    for tag in ("visual", "collision"):
+        for own in element.all(tag):
+            _read_shape(own, name, machine)
+
+
+def _read_shape(element, link, machine):
+    position, rotation = _origin(element)
+    geometry = element.first("geometry")
+    colour = (0.5, 0.5, 0.5, 1.0)
+    material = element.first("material")
+    if material is not None and (own := material.first("color")) is not None:
+        colour = tuple(own.numbers(own.attributes.get("rgba", "0.5 0.5 0.5 1"), 4))
+    shape = geometry.children[0] if geometry is not None and geometry.children else None
+    if shape is None:
+        raise ValueError(f"{element.where}<{element.tag}> needs a <geometry>.")
+    shape.read = True
+    file, size = "", ()
+    if shape.tag == "box":
+        size = tuple(0.5 * shape.numbers(shape.need("size")))
+    elif shape.tag == "sphere":
+        size = (shape.attribute_number("radius"),)
+    elif shape.tag in ("cylinder", "capsule"):
+        size = (shape.attribute_number("radius"), 0.5 * shape.attribute_number("length"))
+    elif shape.tag == "mesh":
+        file, size = shape.need("filename"), tuple(shape.numbers(shape.attributes.get("scale", "1 1 1")))
+    else:
+        raise ValueError(f"{shape.where}unknown geometry <{shape.tag}>.")
+    own = Shape(shape.tag, link, position, rotation, size, file, colour, element.tag == "collision")
+    machine.shapes.append(own)
+
+
+def _read_joint(element, machine):
+    """A joint, its element, and place and rotation of its frame in the parent link."""
+    name, kind = element.need("name"), element.need("type")
+    if kind not in (*_KINDS, "planar"):
+        known = ", ".join((*_KINDS, "planar"))
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+    ends = []
+    for tag in ("parent", "child"):
+        own = element.first(tag)
+        link = None if own is None else own.need("link")
+        if link not in machine.links:
+            raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
+        ends.append(link)
+    axis = element.first("axis")
+    direction = np.array([1.0, 0.0, 0.0]) if axis is None else axis.numbers(axis.attributes.get("xyz", "1 0 0"))
+    length = np.linalg.norm(direction)
+    if length == 0 and kind not in ("fixed", "floating"):
+        raise ValueError(f"{element.where}the axis of joint {name!r} is zero.")
+    joint = Joint(name, _KINDS.get(kind, "hinge"), *ends, where=element.where)
+    joint.axis = direction / length if length else direction
+    dynamics, limit = element.first("dynamics"), element.first("limit")
+    if dynamics is not None:
+        joint.damping = dynamics.attribute_number("damping")
+        joint.friction = dynamics.attribute_number("friction")
+    if limit is not None and kind in ("revolute", "prismatic"):
+        joint.limits = (limit.attribute_number("lower"), limit.attribute_number("upper"))
+        if not joint.limits[0] < joint.limits[1]:
+            raise ValueError(f"{limit.where}the limits of joint {name!r} must increase, got {joint.limits}.")
+    return joint, element, _origin(element)
+
+
+def _place(machine, joints, base, root):
+    """Place the links where all coordinates are zero."""
+    children = [joint.child for joint, _, _ in joints]
+    twice = [name for name, number in Counter(children).items() if number > 1]
+    if twice:
+        raise ValueError(f"{root.where}link {twice[0]!r} is the child of several joints; URDF holds trees only.")
+    roots = [name for name in machine.links if name not in children]
+    if len(roots) != 1:
+        raise ValueError(f"{root.where}the links make no tree: roots are {', '.join(map(repr, roots)) or 'none'}.")
+    if base == "fixed" or roots[0] == "world":
+        machine.joints.append(Joint("base", "fixed", GROUND, roots[0]))
+    else:
+        machine.joints.append(Joint("base", "free", GROUND, roots[0]))
+    of_parent: dict[str, list[Any]] = {}
+    for own in joints:
+        of_parent.setdefault(own[0].parent, []).append(own)
+    queue = [roots[0]]
+    while queue:
+        parent = machine.links[queue.pop()]
+        for joint, element, (position, rotation) in of_parent.get(parent.name, ()):
+            child = machine.links[joint.child]
+            child.position = parent.position + parent.rotation @ position
+            child.rotation = parent.rotation @ rotation
+            joint.point, joint.axis = child.position, child.rotation @ joint.axis
+            queue.append(child.name)
+            if element.attributes["type"] == "planar":
+                _spread(machine, joint)
+
+
+def _spread(machine, joint):
+    """A planar joint as two slides and a hinge, with links without mass between them."""
+    child = machine.links[joint.child]
+    u = child.rotation[:, int(np.argmin(np.abs(child.rotation.T @ joint.axis)))]
+    u = np.cross(np.cross(joint.axis, u), joint.axis)
+    u /= np.linalg.norm(u)
+    names = [f"{joint.name} {way}" for way in "xy"]
+    for name in names:
+        machine.links[name] = Link(name, position=child.position, rotation=child.rotation, where=joint.where)
+    machine.joints.append(Joint(names[0], "slide", joint.parent, names[0], joint.point, u))
+    machine.joints.append(Joint(names[1], "slide", names[0], names[1], joint.point, np.cross(joint.axis, u)))
+    joint.parent = names[1]
+
+
+def _read_mimic(joint, element, machine):
+    mimic = element.first("mimic")
+    if mimic is not None:
+        factor, offset = mimic.attribute_number("multiplier", 1.0), mimic.attribute_number("offset")
+        coefficients = np.array([offset, factor])
+        machine.couplings.append(Coupling(f"{joint.name} mimic", joint.name, mimic.need("joint"), coefficients))
+
+
+def _say_unread(root, notes):
+    for element in root.unread():
+        if element.tag not in _EFFECTLESS:
+            notes.say(f"{element.where}<{element.tag}> is not read.")
+    listed = sorted({element.tag for element in root.unread()} & _EFFECTLESS)
+    if listed:
+        notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
+    if any(element.first("limit") is not None for element in root.all("joint")):
+        notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")

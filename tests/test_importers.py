@@ -1,0 +1,383 @@
+"""Machines from MJCF, URDF and SDF: every row of the table of what is exact, approximate and refused."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import importers
+from jaxmb.formulations import Multipliers, accelerations
+
+mujoco = pytest.importorskip("mujoco")
+
+OFF = ("collisions", "limits", "friction")
+
+
+def file(bodies, more="", head=""):
+    """An MJCF text whose shapes do not collide."""
+    default = '<default><geom contype="0" conaffinity="0"/></default>'
+    return f"<mujoco>{head}{default}<worldbody>{bodies}</worldbody>{more}</mujoco>"
+
+
+ROD = '<geom type="capsule" fromto="0 0 0 .3 .05 -.1" size=".03"/>'
+
+
+def rod(name, joints, inner="", pos=".3 0 0"):
+    return f'<body name="{name}" pos="{pos}">{joints}{ROD}{inner}</body>'
+
+
+def part(model, name):
+    scene = model.scene
+    return next(own for own in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames) if own.name == name)
+
+
+def kinds(model):
+    return {own.name: own.kind for own in (*model.scene.joints, *model.scene.forces, *model.scene.frames)}
+
+
+# Accelerations and energies
+
+
+def random_states(model, count, *, scale=1.0, seed=0):
+    """MuJoCo's coordinates and velocities."""
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        q = model.qpos0.copy()
+        mujoco.mj_integratePos(model, q, scale * random.normal(size=model.nv), 1.0)
+        yield q, random.normal(size=model.nv)
+
+
+def body_accelerations(model, data, imported):
+    """Accelerations of the mass centres and angular ones in body axes, of the bodies that MuJoCo has."""
+    out = {}
+    for k, body in enumerate(imported.scene.bodies):
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name)
+        if number < 0:  # a rotor
+            continue
+        turn = data.xmat[number].reshape(3, 3)
+        centre = data.xpos[number] + turn @ np.asarray(body.centre)
+        moves, turns, more_moves, more_turns = (np.zeros((3, model.nv)) for _ in range(4))
+        mujoco.mj_jac(model, data, moves, turns, centre, number)
+        mujoco.mj_jacDot(model, data, more_moves, more_turns, centre, number)
+        linear = moves @ data.qacc + more_moves @ data.qvel
+        out[k] = np.append(linear, turn.T @ (turns @ data.qacc + more_turns @ data.qvel))
+    return out
+
+
+def check_dynamics(imported, count=20, *, scale=1.0):
+    """Accelerations and energies are MuJoCo's, without what jaxmb approximates, at random states and controls."""
+    model = imported.locate.model
+    bits = mujoco.mjtDisableBit
+    model.opt.disableflags |= int(bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_FRICTIONLOSS)
+    data = mujoco.MjData(model)
+    system = imported.scene.compile()
+    states = list(random_states(model, count, scale=scale))
+    controls = np.random.default_rng(1).normal(size=(count, model.nu))
+    names = list(imported.controls.values())
+
+    @jax.jit
+    def evaluate(q, u, control):
+        own = mb.with_parameters(system, dict(zip(names, control, strict=True))) if names else system
+        udot, _ = accelerations(own, Multipliers(), 0.0, q, u)
+        unmet = jnp.max(jnp.abs(own.velocity_residual(0.0, q, u)), initial=0.0)
+        return udot, own.kinetic_energy(0.0, q, u), own.potential_energy(0.0, q), unmet
+
+    offset = None
+    for (q, v), control in zip(states, controls, strict=True):
+        data.qpos, data.qvel, data.ctrl = q, v, control
+        mujoco.mj_forward(model, data)
+        mujoco.mj_energyPos(model, data)
+        mujoco.mj_energyVel(model, data)
+        state = imported.state(q, v)
+        udot, kinetic, potential, unmet = jax.tree.map(np.asarray, evaluate(state.q, state.u, list(control)))
+        assert unmet < 1e-12
+        expected = body_accelerations(model, data, imported)
+        found = udot.reshape(-1, 6)[list(expected)]
+        size = np.max(np.abs(list(expected.values())))
+        np.testing.assert_allclose(found, list(expected.values()), rtol=0, atol=1e-9 * size)
+        potential_there, kinetic_there = data.energy
+        assert kinetic == pytest.approx(kinetic_there, rel=1e-10)
+        # Bodies that are fixed to the world have a weight in MuJoCo.
+        offset = potential_there - potential if offset is None else offset
+        scale_of_energy = abs(kinetic_there) + abs(potential_there) + abs(offset)
+        assert potential + offset == pytest.approx(potential_there, abs=1e-10 * scale_of_energy)
+    return system
+
+
+def small_tree():
+    inner = rod(
+        "arm",
+        '<joint name="elbow" axis="0 1 1" damping=".3" stiffness="2" springref="10" armature=".02" ref="5"/>',
+        '<site name="tip" pos=".3 0 0"/>'
+        + rod("hand", '<joint name="reach" type="slide" axis="1 0 .2" stiffness="50" armature=".3" ref=".1"/>'),
+    )
+    bodies = f'<site name="hook" pos="1 1 1"/><body name="base" pos="0 0 1"><freejoint/>{ROD}{inner}</body>'
+    more = """<tendon><fixed name="cord" stiffness="3" damping=".2"><joint joint="elbow" coef=".5"/><joint joint="reach"
+        coef="-.3"/></fixed><spatial name="rope" stiffness="3" springlength=".3"><site site="tip"/><site site="hook"/>
+        </spatial></tendon><actuator><position name="servo" joint="elbow" kp="10" kv="1" gear="2"/><motor name="pull"
+        tendon="cord" gear="3"/><velocity name="speed" joint="reach" kv="2"/></actuator>"""
+    return file(bodies, more, '<option gravity="0 1 -9"/>')
+
+
+def test_a_small_tree_moves_as_in_mujoco():
+    """Hinge, slide and free joints, springs, dampers, armature, reference values, tendons and actuators."""
+    check_dynamics(importers.mjcf(small_tree()))
+
+
+@pytest.mark.long
+def test_joints_in_succession_move_as_in_mujoco():
+    two = '<joint name="u1" axis="1 0 0" damping=".1" armature=".01"/>'
+    two += '<joint name="u2" axis="0 1 0" stiffness="1" ref="9"/>'
+    three = '<joint name="g1" axis="1 0 0" armature=".01"/><joint name="g2" axis="0 0 1" ref="5" stiffness="1"/>'
+    three += '<joint name="g3" axis="0 1 0" damping=".2"/>'
+    both = '<joint name="c1" axis="1 0 0" damping=".1"/>'
+    both += '<joint name="c2" type="slide" axis="1 0 0" stiffness="9" ref=".1"/>'
+    plane = '<joint name="px" type="slide" axis="1 0 0"/><joint name="pz" type="slide" axis="0 0 1" ref=".2"/>'
+    plane += '<joint name="py" axis="0 1 0" damping=".1" armature=".1"/>'
+    ball = '<joint name="ball" type="ball" damping=".1" stiffness="1.5"/>'
+    inner = rod("wrist", three, pos="-.2 0 0") + rod("piston", both, pos=".2 0 0")
+    text = file(rod("shoulder", two, inner) + rod("sledge", plane, pos="0 2 0") + rod("bob", ball, pos="0 3 0"))
+    model = importers.mjcf(text)
+    check_dynamics(model, scale=0.5)
+    assert set(kinds(model).values()) >= {"Universal", "Gimbal", "Cylindrical", "Planar", "Spherical"}
+    assert "Joints 'u1', 'u2' in succession are the Universal 'u1 u2'." in model.notes
+    assert model.coordinates["g2"] == "g1 g2 g3.angle_2"
+
+
+# The rows of the table
+
+
+HINGE = '<joint name="hip" axis="0 1 0"/>'
+
+
+@pytest.mark.parametrize(
+    "joints, more, name, fields",
+    [
+        ('<joint name="hip" axis="0 2 0"/>', "", "hip", {"axis_a": [0, 1, 0]}),
+        ('<joint name="hip" type="slide" axis="1 0 0"/>', "", "hip", {"axis_a": [1, 0, 0]}),
+        ('<joint name="hip" type="ball"/>', "", "hip", {}),
+        ('<joint name="hip" stiffness="2" springref="90"/>', "", "hip spring", {"stiffness": 2, "free": np.pi / 2}),
+        ('<joint name="hip" damping=".5"/>', "", "hip spring", {"damping": 0.5, "stiffness": 0}),
+        ('<joint name="hip" armature=".1"/>', "", "hip rotor", {"inertia": 0.1 * np.eye(3)}),
+        ('<joint name="hip" armature=".1"/>', "", "hip gear", {"coefficients": [0, 1]}),
+        (
+            HINGE,
+            '<equality><connect name="loop" body1="a" anchor=".3 0 0"/></equality>',
+            "loop",
+            {"point_b": [0.6, 0, 0]},
+        ),
+        (HINGE, '<equality><weld name="loop" body1="a"/></equality>', "loop", {"orientation": [1, 0, 0, 0]}),
+        (
+            HINGE,
+            '<equality><joint name="loop" joint1="hip" polycoef=".2 0 0 0 0"/></equality>',
+            "loop",
+            {"value": 0.2},
+        ),
+        (HINGE, '<actuator><motor name="m" joint="hip" gear="3"/></actuator>', "m", {"gear": 3, "gain": [1, 0, 0]}),
+        (
+            HINGE,
+            '<actuator><position name="m" joint="hip" kp="5" kv="2"/></actuator>',
+            "m",
+            {"gain": [5, 0, 0], "bias": [0, -5, -2]},
+        ),
+        (
+            HINGE,
+            '<actuator><velocity name="m" joint="hip" kv="2"/></actuator>',
+            "m",
+            {"gain": [2, 0, 0], "bias": [0, 0, -2]},
+        ),
+        (
+            HINGE,
+            '<tendon><fixed name="t"><joint joint="hip" coef=".4"/></fixed></tendon>',
+            "t",
+            {"coefficients": [0.4]},
+        ),
+    ],
+)
+def test_what_is_exact(joints, more, name, fields):
+    model = importers.mjcf(file(rod("a", joints), more))
+    own = part(model, name)
+    for field, value in fields.items():
+        np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
+    assert all("Equalities hold exactly" in note for note in model.notes)
+
+
+def test_inertia_names_and_frames():
+    inside = '<geom type="sphere" size=".02"/><site name="eye" pos="1 0 0"/>'
+    fixed = f'<body name="sensor" pos="0 0 .1" euler="0 0 90">{inside}</body>'
+    model = importers.mjcf(file(rod("a", HINGE, fixed) + '<body name="wall"><geom type="box" size="1 1 1"/></body>'))
+    reference = mujoco.MjModel.from_xml_string(file(rod("a", HINGE, fixed)))
+    (body,) = model.scene.bodies
+    assert body.name == "a" and float(body.mass) == pytest.approx(reference.body_subtreemass[1], rel=1e-14)
+    frames = {frame.name: frame for frame in model.scene.frames}
+    assert {name: frame.body for name, frame in frames.items()} == {"sensor": "a", "eye": "a", "wall": "ground"}
+    np.testing.assert_allclose(frames["eye"].position, [0, 1, 0.1], atol=1e-15)
+    assert model.coordinates == {"hip": "hip.angle"}
+
+
+@pytest.mark.parametrize(
+    "joints, more, name, kind, note",
+    [
+        ('<joint name="hip" frictionloss=".2"/>', "", "hip friction", "JointFriction", "joints at rest creep: 'hip'"),
+        ('<joint name="hip" range="-30 40"/>', "", "hip stop", "JointStop", "Limits are compliant stops"),
+        (
+            HINGE,
+            '<actuator><motor name="m" joint="hip" ctrlrange="-1 1"/></actuator>',
+            "m",
+            "JointActuator",
+            "clipped to their ranges.*'m'",
+        ),
+        (
+            HINGE,
+            '<equality><connect name="l" body1="a" anchor=".3 0 0" solref=".1 1"/></equality>',
+            "l",
+            "Spherical",
+            "their solref and solimp have no effect",
+        ),
+    ],
+)
+def test_what_is_approximated_is_said(joints, more, name, kind, note):
+    model = importers.mjcf(file(rod("a", joints), more))
+    assert kinds(model)[name] == kind
+    assert any(re.search(note, said) for said in model.notes)
+
+
+def test_mocap_bodies_move_as_prescribed():
+    text = file('<body name="hand" mocap="true" pos="0 0 1"/>' + rod("a", HINGE))
+    model = importers.mjcf(text)
+    assert kinds(model)["hand motion"] == "Fixed"
+    np.testing.assert_array_equal(part(model, "hand motion").point_a, [0, 0, 1])
+    assert any("Mocap bodies are held by a joint" in note and "'hand'" in note for note in model.notes)
+
+
+SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0"/>'
+
+
+@pytest.mark.parametrize(
+    "joints, more, head, message",
+    [
+        (SLIDES, "", "", "'a' has several joints in succession, slide 'x', hinge 'y'"),
+        (
+            HINGE,
+            '<tendon><spatial name="t"><site site="o"/><geom geom="drum"/><site site="s"/></spatial></tendon>',
+            "",
+            "Tendon 't' wraps around shapes or pulleys",
+        ),
+        (
+            HINGE,
+            '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>',
+            "",
+            "Actuator 'm' has dynamics of its own",
+        ),
+        (
+            HINGE,
+            '<actuator><general name="m" site="s" gear="0 0 1 0 0 0"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of site",
+        ),
+        (
+            HINGE,
+            '<actuator><adhesion name="m" body="a" ctrlrange="0 1"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of body",
+        ),
+        (HINGE, "", '<option density="1"/>', "A fluid is not modelled"),
+        ('<joint name="hip" type="ball" armature=".1"/>', "", "", "armature of the ball joint 'hip'"),
+        ('<joint name="hip" type="ball" limited="true" range="0 30"/>', "", "", "limits of the ball joint 'hip'"),
+        (
+            HINGE,
+            '<equality><tendon name="e" tendon1="t"/></equality>'
+            '<tendon><fixed name="t"><joint joint="hip" coef="1"/></fixed></tendon>',
+            "",
+            "The equality 'e' is of type tendon",
+        ),
+        ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
+        ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
+    ],
+)
+def test_what_is_refused_is_named(joints, more, head, message):
+    text = file(
+        '<site name="o"/><geom name="drum" type="sphere" size=".01"/>'
+        + rod("a", joints, '<site name="s" pos=".1 0 0"/>'),
+        more,
+        head,
+    )
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+
+
+def test_collisions_are_refused_unless_left_out():
+    text = f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{rod("a", "<freejoint/>")}</worldbody></mujoco>'
+    with pytest.raises(ValueError, match=r"Shapes of 1 bodies may collide \(a.*ignore='collisions' leaves it out"):
+        importers.mjcf(text)
+    model = importers.mjcf(text, ignore="collisions")
+    assert "Left out, as ignore='collisions' asks: collisions." in model.notes
+    assert [shape.kind for shape in model.shapes] == ["plane", "capsule"]
+
+
+def test_elements_are_left_out_by_kind_or_by_name():
+    text = file(rod("a", '<joint name="hip" range="-30 40" damping=".1"/>'))
+    assert "hip stop" in kinds(importers.mjcf(text))
+    assert set(kinds(importers.mjcf(text, ignore=("limits", "damping")))) == {"hip", "gravity"}
+    assert set(kinds(importers.mjcf(text, ignore="hip"))) == {"hip", "gravity"}
+    with pytest.raises(ValueError, match="Unknown element 'limit'; did you mean 'limits'"):
+        importers.mjcf(text, ignore="limit")
+
+
+# Files that are wrong
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("<mujoco><worldbody><body><joint type='hing'/></body></worldbody></mujoco>", "hing"),
+        ("<mujoco><worldbody><body name='a'><joint name='j'/></body></worldbody></mujoco>", "mass and inertia"),
+        ("<mujoco><include file='nowhere.xml'/></mujoco>", "nowhere.xml"),
+        (
+            "<mujoco><asset><mesh name='m' file='m.stl'/></asset><worldbody><body name='a'><joint name='j'/>"
+            "<geom type='mesh' mesh='m'/></body></worldbody></mujoco>",
+            "The mass of body 'a' comes from mesh 'm', whose file is missing",
+        ),
+        ("nowhere.xml", "nowhere.xml does not exist"),
+        ("<mujoco/>", "There is no moving link"),
+    ],
+)
+def test_wrong_mjcf(text, message):
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+
+
+def test_missing_meshes_of_pictures_are_said():
+    text = file(
+        '<body name="a"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+        '<geom type="mesh" mesh="m"/></body>',
+        '<asset><mesh name="m" file="m.stl"/></asset>',
+    )
+    assert "Mesh files are missing, so the picture lacks them: m." in importers.mjcf(text).notes
+
+
+def test_degrees_and_compiler_options_are_those_of_mujoco():
+    body = rod("a", '<joint name="hip" axis="0 1 0" ref="90" springref="45" stiffness="1"/>')
+    degrees = importers.mjcf(file(body))
+    numbers = body.replace("90", f"{np.pi / 2!r}").replace("45", f"{np.pi / 4!r}")
+    radians = importers.mjcf(file(numbers, head='<compiler angle="radian"/>'))
+    for own in (degrees, radians):
+        assert float(part(own, "hip spring").free) == pytest.approx(np.pi / 4)
+
+
+def test_names_that_stand_twice():
+    model = importers.mjcf(file(rod("a.1", '<joint name="a_1"/>')))
+    assert [body.name for body in model.scene.bodies] == ["a_1"]
+    assert model.coordinates == {"a_1": "a_1 joint.angle"}
+    assert any("a.1 → a_1" in note and "a_1 → a_1 joint" in note for note in model.notes)
+
+
+def test_keyframes_are_states():
+    text = file(rod("a", HINGE), '<keyframe><key name="up" qpos="1.5" qvel="2"/></keyframe>')
+    model = importers.mjcf(text)
+    state = model.states["up"]
+    np.testing.assert_allclose(state.u[3:], [0, 2, 0], atol=1e-15)
+    np.testing.assert_allclose(state.q[3:], [np.cos(0.75), 0, np.sin(0.75), 0], atol=1e-15)

@@ -1,0 +1,99 @@
+"""Scenes as MJCF, read back."""
+
+import jax
+import numpy as np
+import pytest
+from test_importers import check_dynamics
+
+import jaxmb as mb
+from jaxmb import importers, spatial
+from jaxmb.formulations import Multipliers, accelerations
+
+mujoco = pytest.importorskip("mujoco")
+
+
+def small_scene():
+    body = lambda name, x, **more: spatial.Body(
+        name, mass=1.0, inertia=(0.02, 0.09, 0.07), position=(x, 0.0, 0.0), **more
+    )
+    bodies = [body("arm", 0.5), body("hand", 1.5), body("float", 3.0, orientation=(0.8, 0.0, 0.6, 0.0))]
+    joints = [
+        spatial.Revolute("hip", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)),
+        spatial.Prismatic("reach", "hand", "arm", point=(1.0, 0.0, 0.0), axis=(0.6, 0.0, 0.8)),
+        mb.FixedTendon("cord", ("hip.angle", "reach.displacement"), coefficients=(0.3, 0.5)),
+        mb.Tendon("rope", [("ground", (0.0, 0.0, 1.0)), ("arm", (0.2, 0.0, 0.1)), ("hand", (0.0, 0.1, 0.0))]),
+    ]
+    forces = [
+        mb.Gravity((0.0, 0.0, -9.81)),
+        mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.2, free=0.3),
+        mb.JointSpring("pull", "rope.length", stiffness=3.0, free=0.5),
+        mb.JointActuator("motor", "reach.displacement", gear=2.0, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -1.0)),
+        mb.JointActuator("winch", "cord.length", gear=2.0),
+        spatial.SpringDamper("rubber", "hand", "float", stiffness=20.0, damping=0.5, free_length=0.8),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=forces, frames=[spatial.Frame("tip", "hand", position=(0.1, 0, 0))])
+
+
+def test_what_mujoco_reads_of_a_scene():
+    system = small_scene().compile()
+    exported = importers.to_mjcf(system)
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    assert (model.nbody, model.njnt, model.ntendon, model.nu, model.nsite) == (4, 3, 3, 2, 6)
+    # The slide holds the arm on the hand, and the arm is the parent: its axis points the other way.
+    np.testing.assert_allclose(model.joint("reach").axis, [-0.6, 0.0, -0.8], atol=1e-15)
+    assert model.joint("hip").stiffness[0] == 3.0 and model.qpos_spring[model.joint("hip").qposadr[0]] == 0.3
+    back = importers.mjcf(exported.text)
+    assert [body.name for body in back.scene.bodies] == ["arm", "hand", "float"]
+    assert back.coordinates == {"hip": "hip.angle", "reach": "reach.displacement"}
+
+
+def accelerations_at(system, state):
+    udot, _ = jax.jit(lambda q, u: accelerations(system, Multipliers(), 0.0, q, u))(state.q, state.u)
+    return np.asarray(udot)
+
+
+@pytest.mark.long
+def test_a_scene_read_back_moves_alike():
+    system = small_scene().compile()
+    state = mb.assemble(system, fix={"hip.angle": 0.4, "reach.displacement": 0.2}, rates={"hip.angle": 1.0})
+    back = importers.mjcf(importers.to_mjcf(system, state).text)
+    again = check_dynamics(back, 5, scale=0.3)
+    np.testing.assert_allclose(accelerations_at(again, state), accelerations_at(system, state), rtol=0, atol=1e-11)
+
+
+MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "cable")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", MACHINES)
+def test_machines_of_the_library_read_back(name):
+    own = mb.mechanisms.get(name)
+    exported = importers.to_mjcf(own.system, own.state)
+    mujoco.MjModel.from_xml_string(exported.text)
+    system = importers.mjcf(exported.text).scene.compile()
+    order = [own.system.body_names.index(body) for body in system.body_names]
+    places, speeds = own.system.poses(own.state.q), own.system.velocities(own.state.u)
+    state = mb.State(places[np.array(order)].reshape(-1), speeds[np.array(order)].reshape(-1))
+    expected = accelerations_at(own.system, own.state).reshape(-1, 6)[order]
+    found = accelerations_at(system, state).reshape(-1, 6)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+    assert system.velocity_rank == own.system.velocity_rank
+
+
+@pytest.mark.parametrize(
+    "joints, forces, message",
+    [
+        (
+            [spatial.Distance("rod", "ground", "body", point_a=(0, 0, 2.0))],
+            [],
+            "Distance 'rod' cannot be expressed where",
+        ),
+        ([], [spatial.PointForce("push", "body", force=(1.0, 0, 0))], "PointForce 'push' cannot be expressed"),
+    ],
+)
+def test_what_mujoco_cannot_express(joints, forces, message):
+    body = spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    system = mb.Scene([body], joints=joints, forces=forces).compile()
+    with pytest.raises(ValueError, match=message):
+        importers.to_mjcf(system)
+    assert "<body" in importers.to_mjcf(system, ignore=[part.name for part in (*joints, *forces)]).text
