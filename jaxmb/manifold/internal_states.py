@@ -16,11 +16,11 @@ from ..solvers import AbstractManifoldTerm
 
 def with_internal_states(term: Any) -> Any:
     """The term for (q, u, z) from one for (q, u), which a manifold has prepared; the same one where z is empty."""
-    field = isinstance(term, diffrax.ODETerm)
-    system = term.vector_field.system if field else term.system  # pyright: ignore[reportAttributeAccessIssue]
-    if system.nz == 0:
+    field: Any = term.vector_field if isinstance(term, diffrax.ODETerm) else None
+    equation: Any = term if field is None else field
+    if equation.system.nz == 0:
         return term
-    return diffrax.ODETerm(StatefulField(term.vector_field)) if field else StatefulTerm(term)
+    return StatefulTerm(term) if field is None else diffrax.ODETerm(StatefulField(field))
 
 
 def _at(equation, y):

@@ -23,6 +23,10 @@ def _pairs(measures: Any) -> Any:
     return tuple(measures.items()) if isinstance(measures, Mapping) else measures
 
 
+def _names(names: Any) -> Any:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
 class Controller(AbstractOfSources, AbstractDynamicForce):
     """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
     parameters) -> forces, rates`.
@@ -53,8 +57,8 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     name: str = fields.name()
     function: Callable[..., Any] = fields.function()
-    measures: Any = eqx.field(static=True, converter=_pairs)
-    acts_on: Any = eqx.field(static=True, converter=lambda names: (names,) if isinstance(names, str) else tuple(names))
+    measures: Any = eqx.field(static=True, converter=_pairs)  # pyright: ignore[reportGeneralTypeIssues]
+    acts_on: Any = eqx.field(static=True, converter=_names)  # pyright: ignore[reportGeneralTypeIssues]
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
     # Filled in by the scene: joints and frames by name, and the places of their bodies among all bodies.

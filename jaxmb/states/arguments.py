@@ -32,7 +32,9 @@ def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
     if guess.z is not None and system.nz == 0:
         raise ValueError(f"{function}: guess.z: the system has no internal states.")
     # A guess without internal states takes those of the system's own.
-    z = system.guess.z if guess.z is None else _vector(f"{function}: guess.z", guess.z, system.guess.z)
+    z: Any = system.guess.z
+    if guess.z is not None:
+        z = _vector(f"{function}: guess.z", guess.z, z)
     return State(
         _vector(f"{function}: guess.q", guess.q, system.guess.q),
         _vector(f"{function}: guess.u", guess.u, system.guess.u),

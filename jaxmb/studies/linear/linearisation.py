@@ -111,8 +111,8 @@ class Linearisation(eqx.Module):
             raise ValueError(f"There are {count} modes, numbered from 0, got {k!r}.")
         values, vectors = _spectrum(self)
         shape = self.basis.astype(vectors.dtype) @ vectors[:, k]
-        ends = [self.system.nq, self.system.nq + self.system.nu]
-        return Mode(values[k], *jnp.split(shape, ends), self.system, self.state, self.t)
+        q, u, z = jnp.split(shape, [self.system.nq, self.system.nq + self.system.nu])
+        return Mode(values[k], q, u, z, self.system, self.state, self.t)
 
     def frequency_response(self, omega: ArrayLike) -> Complex[Array, "frequencies o i"]:
         """`C (iω − A)⁻¹ B + D` at angular frequencies [rad/s], shape (frequencies, outputs, inputs).
