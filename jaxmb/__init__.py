@@ -15,7 +15,7 @@ from . import (
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from .linalg import rotations as rotations
-from .parts import contact as contact, terrain as terrain
+from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
     Constraint as Constraint,

@@ -15,10 +15,11 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import cross, norm
+from ...linalg.rotations import cross, norm, unrotate
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
-from ..space import separation
+from ..shapes import ball, pin, sleeve
+from ..space import both_points, separation
 from .axes import (
     angle,
     cosine_sine,
@@ -69,6 +70,9 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"rotation": rotation_vector(self, poses)}
 
+    def shapes(self, space, size):
+        return ((0, ball(self.point_a, size)),)
+
 
 class Revolute(AbstractSpatialPart, AbstractJoint):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, `u·b`, `v·b`.
@@ -94,6 +98,9 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses)}
+
+    def shapes(self, space, size):
+        return ((0, pin(self.point_a, size, self.axis_a)),)
 
 
 class Universal(AbstractSpatialPart, AbstractJoint):
@@ -141,6 +148,9 @@ class Universal(AbstractSpatialPart, AbstractJoint):
             "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
         }
 
+    def shapes(self, space, size):
+        return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
+
 
 class Cylindrical(AbstractSpatialPart, AbstractJoint):
     """A pin that turns and slides: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
@@ -165,6 +175,12 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, self.axis_b)),)
 
 
 class Screw(AbstractSpatialPart, AbstractJoint):
@@ -207,6 +223,12 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, self.axis_b)),)
+
 
 class Prismatic(AbstractSpatialPart, AbstractJoint):
     """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
@@ -232,6 +254,12 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)
 
 
 class Planar(AbstractSpatialPart, AbstractJoint):
@@ -300,6 +328,9 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         d = separation(space, self, poses)
         return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
 
 class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     """A point of B stays in a plane fixed in A, through A normal to the axis. Rows 1: `a·d`.
@@ -332,3 +363,9 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, ball(self.point_b, size)),)

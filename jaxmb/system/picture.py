@@ -1,0 +1,114 @@
+"""What a picture shows of a motion of bodies: where they are, the shapes of their parts, and where these act."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .._types import State
+from ..parts.base import GROUND, PathKind
+from ..parts.shapes import AbstractShape
+from .groups import Group
+
+
+class Anchors(NamedTuple):
+    """Where a part acts: its bodies, and its point [m] on each, in that body's frame, None if it has none."""
+
+    bodies: tuple[str, ...]
+    points: tuple[Float[np.ndarray, "3"] | None, ...]
+
+
+class Path(NamedTuple):
+    """The line of a part: how it is drawn, and its points [m] along a motion, shape (times, points, 3)."""
+
+    kind: PathKind
+    points: Float[np.ndarray, "times points 3"]
+
+
+class Picture(NamedTuple):
+    """A motion of bodies, everything in three dimensions; the plane is z = 0.
+
+    **Fields:** `planar`; `up`, the unit vector that is upright in the picture; `positions` [m], shape (times, 3), and
+    `orientations`, Euler parameters, shape (times, 4), of the bodies by name, those of the ground last; `parts` by
+    name; `shapes` of parts with the names of the bodies that they are fixed in; `paths` of parts by name; `inertias`:
+    mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies, zero for point masses.
+    """
+
+    planar: bool
+    up: Float[np.ndarray, "3"]
+    positions: dict[str, Float[np.ndarray, "times 3"]]
+    orientations: dict[str, Float[np.ndarray, "times 4"]]
+    parts: dict[str, Anchors]
+    shapes: list[tuple[str, AbstractShape]]
+    paths: dict[str, Path]
+    inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
+
+
+def picture(system: Any, groups: Sequence[Group], ts: Float[np.ndarray, "times"], ys: State, size: float) -> Picture:
+    """The picture of a system of bodies and of these stacked parts; `size` [m]: the radius of a bar."""
+    layout, names = system.layout, (*system.body_names, GROUND)
+    space = layout.space
+    position, orientation = _placements(system, ys)
+    gravity = None if system.gravity is None else np.asarray(system.gravity)
+    parts: dict[str, Anchors] = {}
+    shapes: list[tuple[str, AbstractShape]] = []
+    paths: dict[str, Path] = {}
+    for group in groups:
+        lines = _paths(system, group, ts, ys)
+        if lines is not None:
+            lines = np.asarray(jax.vmap(jax.vmap(jax.vmap(space.in_space)))(lines))
+        stacked = jax.tree.map(np.asarray, group.part)
+        for k, (name, bodies) in enumerate(zip(group.names, group.bodies, strict=True)):
+            part = jax.tree.map(lambda leaf, k=k: leaf[k], stacked)
+            own = tuple(names[body] for body in bodies)
+            points = [part.anchor(i) for i in range(len(own))]
+            parts.setdefault(name, Anchors(own, tuple(None if p is None else space.in_space(p) for p in points)))
+            shapes += [(GROUND if i is None else own[i], shape) for i, shape in part.shapes(space, size)]
+            if lines is not None:
+                paths[name] = Path(part.path_kind, lines[:, k])
+    mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
+    if not system.spatial:
+        moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
+    return Picture(
+        planar=not system.spatial,
+        up=_up(space, gravity),
+        positions=dict(zip(names, position, strict=True)),
+        orientations=dict(zip(names, orientation, strict=True)),
+        parts=parts,
+        shapes=shapes,
+        paths=paths,
+        inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
+    )
+
+
+@eqx.filter_jit
+def _placements(system, ys):
+    poses = jax.vmap(system.prepared_poses)(ys.q)
+    position, orientation = jax.vmap(jax.vmap(system.layout.space.placement))(poses)
+    return jnp.swapaxes(position, 0, 1), jnp.swapaxes(orientation, 0, 1)
+
+
+@eqx.filter_jit
+def _paths(system, group, ts, ys):
+    """World points of the lines of the parts, shape (times, parts, points, d), or None."""
+
+    def at_time(t, y):
+        poses = group.gather(system.prepared_poses(y.q))
+        return group.map(lambda at, x: at(t).path(system.layout.space, x), poses)
+
+    return jax.vmap(at_time)(ts, ys)
+
+
+def _up(space, gravity):
+    """Against gravity, along a coordinate axis of the world."""
+    vertical = np.zeros(3)
+    if space.dimension == 2 or gravity is None or not np.any(gravity):
+        vertical[space.dimension - 1] = 1.0
+    else:
+        k = np.argmax(np.abs(gravity))
+        vertical[k] = -np.sign(gravity[k])
+    return vertical

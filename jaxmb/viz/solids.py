@@ -1,0 +1,106 @@
+"""The shapes by which a picture shows bodies: those given, those of their parts, or bars to where parts act."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..linalg.rotations import from_matrix
+from ..parts.base import GROUND
+from ..parts.shapes import DARK, AbstractShape, Box, Color, Mesh, Sphere, cylinder_between
+from ..system.picture import Picture
+
+# Distinct also for colour-blind readers, after Okabe and Ito, darkened for a white background.
+COLORS: tuple[Color, ...] = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 140, 105),
+    (204, 121, 167),
+    (214, 150, 0),
+    (64, 160, 215),
+    (130, 92, 60),
+    (120, 120, 200),
+)
+_GROUND: Color = (125, 125, 125)
+
+Placed = tuple[str, AbstractShape]
+
+
+def solids(
+    picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], width: float, tint: Color | None
+) -> list[Placed]:
+    """All shapes with the names of the bodies that they are fixed in.
+
+    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `width` [m]: the radius of a bar;
+    `tint`: a colour for all bodies, default one for each.
+    """
+    points = _attachments(picture)
+    of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
+    for body, shape in picture.shapes:
+        of_parts[body].append(shape)
+    out: list[Placed] = []
+    for k, name in enumerate(picture.positions):
+        if name in given:
+            own = given[name]
+            own = [own] if isinstance(own, AbstractShape) else list(own)
+        elif name == GROUND:
+            own = [_support(point, picture.up, width) for point in points[name]]
+        else:
+            own = _linkage(points[name], picture.planar, width)
+            if not own and not of_parts[name]:
+                own = _equivalent(*picture.inertias[name], width)
+        color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
+        out += [(name, shape.colored(color)) for shape in (*own, *of_parts[name])]
+    return out
+
+
+def _attachments(picture):
+    """The distinct points of every body where parts act on it."""
+    points: dict[str, dict[tuple, np.ndarray]] = {name: {} for name in picture.positions}
+    for part in picture.parts.values():
+        for body, point in zip(part.bodies, part.points, strict=True):
+            if point is not None:
+                points[body][tuple(np.round(point, 9))] = point
+    return {name: list(own.values()) for name, own in points.items()}
+
+
+def _linkage(points, planar, width):
+    """In the plane a plate through three points and more; else bars from the mass centre to the points, and a ball at
+    the mass centre.
+    """
+    if planar and len(points) > 2:
+        middle = np.mean(points, axis=0)
+        corners = np.array(sorted(points, key=lambda p: np.arctan2(*(p - middle)[1::-1])))
+        ahead = np.roll(corners, -1, axis=0)
+        area = 0.5 * np.abs(np.sum(np.cross(corners - middle, ahead - middle)[:, 2]))
+        if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
+            return [_plate(middle, corners, width)]
+    away = [point for point in points if np.linalg.norm(point) > 0.5 * width]
+    bars = [cylinder_between(np.zeros(3), point, width) for point in away]
+    return [*bars, Sphere(1.4 * width)] if bars else []
+
+
+def _plate(middle, corners, width):
+    """A plate behind the bars, whose outline joins the corners."""
+    n = len(corners)
+    rim = np.concatenate([corners + (0, 0, -0.8 * width), corners + (0, 0, -1.6 * width)])
+    k, ahead = np.arange(n), np.roll(np.arange(n), -1)
+    face = np.stack([np.full(n, 2 * n), k, ahead], axis=1)
+    sides = np.concatenate([np.stack([k + n, ahead + n, ahead], 1), np.stack([k + n, ahead, k], 1)])
+    return Mesh(np.concatenate([rim, [middle + (0, 0, -0.8 * width)]]), np.concatenate([face, sides]))
+
+
+def _support(point, up, width):
+    """A block below a point of the ground."""
+    return Box(np.where(up == 0, 4.0, 2.4) * width, position=point - 1.2 * width * up, color=DARK)
+
+
+def _equivalent(mass, moments, width) -> list[AbstractShape]:
+    """The homogeneous cuboid with a body's mass and moments of inertia; a ball for a point mass."""
+    values, axes = np.linalg.eigh(moments)
+    if values[-1] <= 0:
+        return [Sphere(2.5 * width)]
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    squares = 6.0 * (np.sum(values) - 2.0 * values) / mass
+    size = np.sqrt(np.maximum(squares, (0.5 * width) ** 2))
+    return [Box(size, orientation=np.asarray(from_matrix(axes)))]
