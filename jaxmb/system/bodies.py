@@ -271,8 +271,8 @@ class AbstractBodySystem(AbstractSystem):
         poses = jax.vmap(self.poses)(ys.q)
         return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
 
-    def picture(self, ts, ys, size):
-        return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys, size)
+    def picture(self, ts, ys):
+        return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
 
     def not_finite(self, t, q, u):
         values = self._of_parts(jnp.asarray(t, q.dtype), q, u)

@@ -170,8 +170,8 @@ class AbstractSystem(eqx.Module):
         """
 
     @abc.abstractmethod
-    def picture(self, ts: Float[Array, "times"], ys: State, size: float) -> Picture:
-        """The bodies and parts that a picture shows along a motion; `size` [m]: the radius of a bar.
+    def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
+        """The bodies and parts that a picture shows along a motion.
 
         **Raises:** `ValueError` for a system without bodies.
         """

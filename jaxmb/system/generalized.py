@@ -65,7 +65,7 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def outline(self, ys):
         return {}
 
-    def picture(self, ts, ys, size):
+    def picture(self, ts, ys):
         raise ValueError(
             f"A picture shows bodies, and a {type(self).__name__} has none; viz.plot_motion shows its coordinates."
         )

@@ -96,11 +96,11 @@ def show(
         for k, (name, own) in enumerate(_named(trajectory).items())
     ]
     forces_of = [_arrows(own, reactions, forces) for own in motions]
-    strongest = max(
-        (float(np.max(np.linalg.norm(force, axis=-1))) for own in forces_of for _, force in own.values()), default=0.0
-    )
     view = scenery.View.of(motions, overlay)
-    scale = 0.25 * view.size / strongest if strongest > 0 else 0.0
+    strength = _strength(forces_of)
+    # So that the side of a square of the grid is a round force [N].
+    square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
+    scale = view.cell / square if square else 0.0
     first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
     speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
     played: list[tuple[np.ndarray, Sequence[Node]]] = []
@@ -109,7 +109,7 @@ def show(
         played.append(((own.times - first) / speed, nodes))
     still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
-    notes += [f"arrows {_step(1 / scale):.3g} N per {_step(1 / scale) * scale:.3g} m"] if scale else []
+    notes += [f"arrows {square:g} N a square"] if square else []
     played += [(np.zeros(1), still), ((clock - first) / speed, [scenery.clock(clock, notes, view)])]
     return MovingPicture(page(played, view.camera), height, max(own.times.size for own in motions))
 
@@ -140,7 +140,11 @@ def _arrows(own: Motion, reactions: Sequence[str], forces: Sequence[str]) -> dic
     return out | {f"forces/{name}": own.force(name) for name in forces}
 
 
-def _step(size: float) -> float:
-    """The next lower number of the kind 1, 2, 5, 10, …"""
-    power = 10.0 ** np.floor(np.log10(size))
-    return float(max(digit * power for digit in (1, 2, 5) if digit * power <= size * (1 + 1e-9)))
+def _strength(forces_of: Sequence[Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> float:
+    """The force [N] that the largest arrow exceeds for a tenth of the time."""
+    largest = [
+        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in own.values()], axis=0)
+        for own in forces_of
+        if own
+    ]
+    return float(np.quantile(np.concatenate(largest), 0.9)) if largest else 0.0

@@ -17,8 +17,6 @@ from . import stage
 from .meshes import Triangles, unit_mesh
 from .solids import COLORS, Placed, solids
 
-# The radius of a bar, to the system's length.
-_WIDTH = 0.022
 _SPRING: Color = (95, 100, 110)
 _REACTION: Color = (200, 30, 45)
 _FORCE: Color = (20, 120, 60)
@@ -28,15 +26,15 @@ _FORCE: Color = (20, 120, 60)
 class Motion:
     """A motion to be shown.
 
-    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `width` [m]:
-    the radius of a bar; `solids`: shapes with their bodies.
+    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `solids`: shapes
+    with their bodies; `tint`: the one colour of all bodies, None for one each.
     """
 
     name: str
     trajectory: Trajectory
     picture: Picture
-    width: float
     solids: list[Placed]
+    tint: Color | None
 
     @property
     def times(self) -> Float[np.ndarray, "times"]:
@@ -120,13 +118,16 @@ class Motion:
         """All nodes, moved by an offset [m]; `arrows`: points and forces by name, drawn with `scale` [m/N]."""
         prefix = f"/{self.name}" if self.name else ""
         out = self._solids(prefix, offset, grain) + self._paths(prefix, offset, grain)
+        if self.picture.planar:
+            # In front of all bodies.
+            offset = offset + (0.0, 0.0, self.bounds[1, 2])
         for k, name in enumerate(points):
             segments = _trail(self.point(name) + offset)
             out.append(stage.lines(f"{prefix}/trails/{name}", segments, COLORS[(k + 1) % len(COLORS)], 2.5, grain))
         for name, (start, force) in arrows.items():
             color = _REACTION if name.startswith("reactions") else _FORCE
             ends = np.stack([start, start + scale * force], axis=2) + offset
-            out.append(stage.arrows(f"{prefix}/{name}", ends, color, 0.7 * self.width, grain))
+            out.append(stage.arrows(f"{prefix}/{name}", ends, color, 0.5 * self.picture.width, grain))
         return out
 
     def _solids(self, prefix, offset, grain):
@@ -159,7 +160,7 @@ class Motion:
             along_z = np.array([0.0, 0.0, 1.0]) * (length == 0)[..., None] + line
             orientation = np.apply_along_axis(along, -1, along_z)
             start = ends[:, :, 0] if kind == "coil" else ends.mean(axis=2)
-            radius = (1.8 if kind == "coil" else 0.5) * self.width
+            radius = (1.8 if kind == "coil" else 0.5) * self.picture.width
             scales = np.stack([np.full_like(length, radius), np.full_like(length, radius), length], axis=-1)
             scales = np.maximum(scales, grain)
             colors = np.tile(_SPRING if kind == "coil" else DARK, (ends.shape[1], 1))
@@ -180,12 +181,11 @@ def motion(
     tint: Color | None,
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
-    width = _WIDTH * float(trajectory.system.length)
-    shown = trajectory.system.picture(trajectory.ts, trajectory.ys, width)
+    shown = trajectory.system.picture(trajectory.ts, trajectory.ys)
     for body in given:
         if body not in shown.positions:
             raise unknown("body", body, shown.positions)
-    return Motion(name, trajectory, shown, width, solids(shown, given, width, tint))
+    return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 
 def chosen(trajectory: Trajectory, frames: int) -> Trajectory:

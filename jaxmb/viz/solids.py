@@ -26,14 +26,14 @@ Placed = tuple[str, AbstractShape]
 
 
 def solids(
-    picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], width: float, tint: Color | None
+    picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], tint: Color | None
 ) -> list[Placed]:
     """All shapes with the names of the bodies that they are fixed in.
 
-    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `width` [m]: the radius of a bar;
-    `tint`: a colour for all bodies, default one for each.
+    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies, default
+    one for each.
     """
-    points = _attachments(picture)
+    points, width = _attachments(picture), picture.width
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
     for body, shape in picture.shapes:
         of_parts[body].append(shape)
@@ -68,15 +68,35 @@ def _linkage(points, planar, width):
     the mass centre.
     """
     if planar and len(points) > 2:
-        middle = np.mean(points, axis=0)
-        corners = np.array(sorted(points, key=lambda p: np.arctan2(*(p - middle)[1::-1])))
-        ahead = np.roll(corners, -1, axis=0)
-        area = 0.5 * np.abs(np.sum(np.cross(corners - middle, ahead - middle)[:, 2]))
+        corners = _hull([np.zeros(3), *points])
+        middle = np.mean(corners, axis=0)
+        area = 0.5 * np.sum(_turn(corners, np.roll(corners, -1, axis=0), middle))
         if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
-            return [_plate(middle, corners, width)]
+            return [_plate(middle, corners, width), Sphere(1.4 * width)]
     away = [point for point in points if np.linalg.norm(point) > 0.5 * width]
     bars = [cylinder_between(np.zeros(3), point, width) for point in away]
     return [*bars, Sphere(1.4 * width)] if bars else []
+
+
+def _hull(points):
+    """The corners of the convex hull of points of the plane, counter-clockwise, by A. M. Andrew's monotone chain."""
+    ascending = sorted(points, key=lambda p: (p[0], p[1]))
+
+    def half(ordered):
+        chain: list[np.ndarray] = []
+        for point in ordered:
+            while len(chain) > 1 and _turn(chain[-1], point, chain[-2]) <= 0:
+                chain.pop()
+            chain.append(point)
+        return chain[:-1]
+
+    return np.array([*half(ascending), *half(ascending[::-1])])
+
+
+def _turn(a, b, origin):
+    """The third component of the product of two arms from an origin, positive for a turn to the left."""
+    a, b = a - origin, b - origin
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _plate(middle, corners, width):

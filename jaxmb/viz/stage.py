@@ -82,6 +82,15 @@ class Camera:
     field_of_view: float
     shadows: bool
 
+    @property
+    def bottom(self) -> np.ndarray:
+        """A point near the bottom of the picture."""
+        line = self.target - self.position
+        right = np.cross(line, self.up)
+        upwards = np.cross(right, line)
+        height = np.linalg.norm(line) * np.tan(self.field_of_view / 2)
+        return self.target - 0.93 * height * upwards / np.linalg.norm(upwards)
+
     def place(self, camera: Any) -> None:
         """Give these numbers to viser's initial camera."""
         distance = float(np.linalg.norm(self.position - self.target))
@@ -157,7 +166,7 @@ def arrows(name: str, ends: Float[np.ndarray, "times n 2 3"], color, radius: flo
 
     def add(scene: "SceneApi", points):
         return scene.add_arrows(
-            name, points, colors=color, shaft_radius=radius, head_radius=2.5 * radius, head_length=6 * radius
+            name, points, colors=color, shaft_radius=radius, head_radius=2.6 * radius, head_length=6.5 * radius
         )
 
     return Node(add, {"points": rounded(ends, grain)})
