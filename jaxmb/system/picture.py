@@ -54,7 +54,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[np.ndarray, "times"]
     """The picture of a system of bodies and of these stacked parts."""
     layout, names = system.layout, (*system.body_names, GROUND)
     space = layout.space
-    position, orientation = _placements(system, ys)
+    position, orientation = map(np.asarray, _placements(system, ys))
     single = [
         (name, tuple(names[body] for body in bodies), part)
         for group in groups
@@ -63,7 +63,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[np.ndarray, "times"]
     parts: dict[str, Anchors] = {}
     for name, own, part in single:
         points = [part.anchor(k) for k in range(len(own))]
-        parts.setdefault(name, Anchors(own, tuple(None if p is None else space.in_space(p) for p in points)))
+        parts.setdefault(name, Anchors(own, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points)))
     width = _width(float(system.length), parts)
     shapes = [
         (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in part.shapes(space, width)
