@@ -17,7 +17,7 @@ pytestmark = [
 # The time slider of viser's client, in the page or in a frame of it, and the pictures of its canvas.
 DOCUMENT = "(document.querySelector('iframe')?.contentDocument ?? document)"
 SLIDER = f"{DOCUMENT}.querySelector('.mantine-Slider-root')"
-LOADED = f"{DOCUMENT}.querySelector('canvas')?.width > 100 && {SLIDER}?.clientWidth > 50"
+LOADED = f"[...{DOCUMENT}.querySelectorAll('canvas')].some(own => own.width > 100) && {SLIDER}?.clientWidth > 50"
 
 
 @pytest.fixture(scope="module")
