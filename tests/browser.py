@@ -30,9 +30,7 @@ class Browser:
         self.requests, self.complaints = [], []
         for domain in ("Page", "Network", "Runtime"):
             self.call(f"{domain}.enable")
-        self.call(
-            "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
-        )
+        self.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
 
     def call(self, method, **parameters):
         self._count += 1

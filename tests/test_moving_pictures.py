@@ -155,7 +155,9 @@ def test_several_motions_stand_apart_or_together(pendulum):
     trajectory, _, _, _ = pendulum
     apart = Page(viz.show({"before": trajectory, "after": trajectory}, points=["tip"]).html)
     assert {"/before/trails/tip", "/after/trails/tip", "/names/before", "/names/after"} <= apart.names()
-    first, second = (np.array(apart.values(f"/{k}/solids/cylinder", "batched_positions")[1]) for k in ("before", "after"))
+    first, second = (
+        np.array(apart.values(f"/{k}/solids/cylinder", "batched_positions")[1]) for k in ("before", "after")
+    )
     shift = second - first
     assert np.allclose(shift, shift[0], atol=3e-4)
     assert max(abs(shift[0])) > max(np.ptp(first, axis=0)[:2])
@@ -196,10 +198,10 @@ def test_bodies_on_which_nothing_acts_are_cuboids_of_their_inertia():
 def test_wheels_terrain_and_tracks():
     """A track wraps its circles: between equal ones two straight parts and one circumference."""
     wheels = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.5)) for name, x in (("a", 0.0), ("b", 3.0))]
-    path = [("a", (0.0, 0.0)), ("b", (0.0, 0.0)), ("b", (0.0, 0.0))]
-    del path
     road = contact.Linear(1e4)
-    touching = mb.planar.Contact("road", ["a", "b"], terrain=terrain.Bump(start=1.0, length=1.0, peak=0.3), normal=road, radius=0.5)
+    touching = mb.planar.Contact(
+        "road", ["a", "b"], terrain=terrain.Bump(start=1.0, length=1.0, peak=0.3), normal=road, radius=0.5
+    )
     third = planar.Body("c", mass=1.0, inertia=0.1, position=(1.5, 1.5))
     points = [("a", (0.0, 0.0)), ("b", (0.0, 0.0)), ("c", (0.0, 0.0))]
     belt = planar.Track("belt", points, pretension=1.0, stiffness=10.0, radii=(0.5, 0.5, 0.5))
@@ -218,8 +220,12 @@ def test_wheels_terrain_and_tracks():
 
 def test_parts_on_frames_are_drawn_there():
     hull = spatial.Body("hull", mass=1.0, inertia=np.eye(3), position=(1.0, 0.0, 0.0))
-    turned = spatial.Frame("corner", "hull", position=(0.0, 2.0, 0.0), orientation=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0))
-    hinge = spatial.Revolute("hinge", "corner", "ground", point_a=(0.0, 0.0, 0.5), point_b=(1.0, 1.5, 0.0), axis=(0.0, 1.0, 0.0))
+    turned = spatial.Frame(
+        "corner", "hull", position=(0.0, 2.0, 0.0), orientation=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
+    )
+    hinge = spatial.Revolute(
+        "hinge", "corner", "ground", point_a=(0.0, 0.0, 0.5), point_b=(1.0, 1.5, 0.0), axis=(0.0, 1.0, 0.0)
+    )
     system = mb.Scene([hull], joints=[hinge], frames=[turned]).compile()
     still = at_rest(system)
     picture = system.picture(still.ts, still.ys)
@@ -271,7 +277,7 @@ def test_motions_that_cannot_be_shown(pendulum):
 
 def test_a_system_without_bodies():
     system = mb.lagrangian.LagrangianSystem(lambda t, q, v, p: 0.5 * v[0] ** 2, q=[0.0])
-    with pytest.raises(ValueError, match="shows bodies.*plot_motion"):
+    with pytest.raises(ValueError, match=r"shows bodies.*plot_motion"):
         viz.show(motion_of(system, [0.0, 1.0], [[0.0], [1.0]], [[1.0], [1.0]]))
     with pytest.raises(ValueError, match="this mechanism has none"):
         check_picture(system)
@@ -292,7 +298,7 @@ def test_shapes_are_checked():
 
 
 def test_directions_and_bars():
-    for axis in np.random.default_rng(0).standard_normal((5, 3)).tolist() + [[0.0, 0.0, -1.0], [0.0, 0.0, 2.0]]:
+    for axis in [*np.random.default_rng(0).standard_normal((5, 3)), (0.0, 0.0, -1.0), (0.0, 0.0, 2.0)]:
         turned = rot.rotate(shapes.along(axis), np.array([0.0, 0.0, 1.0]))
         assert np.allclose(turned, np.asarray(axis) / np.linalg.norm(axis))
     bar = shapes.cylinder_between((1.0, 0.0, 0.0), (0.0, 2.0, 2.0), 0.1)

@@ -23,12 +23,12 @@ STEEL, DARK, GROUND = (150, 155, 162), (64, 68, 76), (176, 170, 158)
 class AbstractShape(abc.ABC):
     """A shape with its place in a body; `color`: red, green and blue from 0 to 255, default that of the body."""
 
-    position: VectorLike = (0.0, 0.0, 0.0)
-    orientation: VectorLike = (1.0, 0.0, 0.0, 0.0)
+    position: Any = (0.0, 0.0, 0.0)
+    orientation: Any = (1.0, 0.0, 0.0, 0.0)
     color: Color | None = None
 
     # Which mesh of unit size the shape is a scaled copy of; "own" for one with vertices of its own.
-    primitive: ClassVar[Literal["box", "sphere", "cylinder", "own"]]
+    primitive: ClassVar[Literal["box", "sphere", "cylinder", "own", "ground"]]
 
     def __post_init__(self):
         for name, size in (("position", 3), ("orientation", 4)):
@@ -45,7 +45,7 @@ class AbstractShape(abc.ABC):
     def scale(self) -> np.ndarray:
         """Lengths [m] by which the mesh of unit size is stretched along its axes, shape (3,)."""
 
-    def moved(self, position: np.ndarray, orientation: np.ndarray) -> Self:
+    def moved(self, position: Any, orientation: Any) -> Self:
         """The shape in another frame, in which its present one is at a position with an orientation."""
         moved = position + rot.rotate(orientation, self.position)
         return dataclasses.replace(self, position=moved, orientation=rot.multiply(orientation, self.orientation))
@@ -168,7 +168,7 @@ class Ground(AbstractShape):
     """
 
     height: Callable[[Any], Any] | None = None
-    primitive = "own"
+    primitive = "ground"
 
     @property
     def scale(self):
@@ -214,9 +214,7 @@ def wheel(
 
 def marked_ball(radius: float, position: VectorLike = (0.0, 0.0, 0.0)) -> tuple[AbstractShape, ...]:
     """A ball with two bands around it that show how it turns."""
-    band = lambda axis: Cylinder(
-        1.005 * radius, 0.1 * radius, position=position, orientation=along(axis), color=DARK
-    )
+    band = lambda axis: Cylinder(1.005 * radius, 0.1 * radius, position=position, orientation=along(axis), color=DARK)
     return Sphere(radius, position=position), band((0.0, 0.0, 1.0)), band((1.0, 0.0, 0.0))
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from .._types import State
 from ..parts.base import GROUND, PathKind
@@ -22,7 +22,7 @@ class Anchors(NamedTuple):
     points: tuple[Float[np.ndarray, "3"] | None, ...]
 
 
-class Path(NamedTuple):
+class Line(NamedTuple):
     """The line of a part: how it is drawn, and its points [m] along a motion, shape (times, points, 3)."""
 
     kind: PathKind
@@ -32,11 +32,13 @@ class Path(NamedTuple):
 class Picture(NamedTuple):
     """A motion of bodies, everything in three dimensions; the plane is z = 0.
 
-    **Fields:** `planar`; `up`, the unit vector that is upright in the picture; `width` [m]: the radius of a bar;
-    `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name, those
-    of the ground last; `parts` by name; `shapes` of parts with the names of the bodies that they are fixed in; `paths`
-    of parts by name; `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies, zero for point
-    masses.
+    **Fields:**
+
+    - `planar`; `up`, the unit vector that is upright in the picture; `width` [m]: the radius of a bar.
+    - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name,
+        those of the ground last.
+    - `parts` by name; `shapes` of parts, with the names of the bodies that they are fixed in; `paths` of parts by name.
+    - `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies by name, zero for point masses.
     """
 
     planar: bool
@@ -46,11 +48,11 @@ class Picture(NamedTuple):
     orientations: dict[str, Float[np.ndarray, "times 4"]]
     parts: dict[str, Anchors]
     shapes: list[tuple[str, AbstractShape]]
-    paths: dict[str, Path]
+    paths: dict[str, Line]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
 
 
-def picture(system: Any, groups: Sequence[Group], ts: Float[np.ndarray, "times"], ys: State) -> Picture:
+def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State) -> Picture:
     """The picture of a system of bodies and of these stacked parts."""
     layout, names = system.layout, (*system.body_names, GROUND)
     space = layout.space
@@ -63,7 +65,9 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[np.ndarray, "times"]
     parts: dict[str, Anchors] = {}
     for name, own, part in single:
         points = [part.anchor(k) for k in range(len(own))]
-        parts.setdefault(name, Anchors(own, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points)))
+        parts.setdefault(
+            name, Anchors(own, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
+        )
     width = _width(float(system.length), parts)
     shapes = [
         (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in part.shapes(space, width)
@@ -101,13 +105,13 @@ def _width(length, parts):
     return min(0.02 * length, 0.07 * typical)
 
 
-def _paths(system, group, ts, ys) -> dict[str, Path]:
+def _paths(system, group, ts, ys) -> dict[str, Line]:
     lines = _world_paths(system, group, ts, ys)
     if lines is None:
         return {}
     lines = np.asarray(lines)
     lines = np.concatenate([lines, np.zeros((*lines.shape[:-1], 3 - lines.shape[-1]))], axis=-1)
-    return {name: Path(group.part.path_kind, lines[:, k]) for k, name in enumerate(group.names)}
+    return {name: Line(group.part.path_kind, lines[:, k]) for k, name in enumerate(group.names)}
 
 
 @eqx.filter_jit

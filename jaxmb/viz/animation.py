@@ -73,13 +73,14 @@ def show(
     - `trajectory`: a motion of a scene; a list, or a dictionary by name, of several, such as one before and one after a
         change, or members of a sweep.
     - `points`: names of bodies (their mass centres), frames and joints that leave a trail.
-    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale, on
-        the last body of a joint, and on each body of a force element.
+    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
+        on the last body of a joint, and on each body of a force element.
     - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, in place of the default; `"ground"` as
         well.
     - `frames`: how many of the saved times are shown at most.
     - `speed`: of playing, 1 for real time; the default is 1, but for motions that are over within 2 s or last for more
-        than a minute what makes them last so long. The slider shows the time of playing, the picture that of the motion.
+        than a minute what makes them last so long. The slider shows the time of playing, the picture that of the
+        motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
 
@@ -129,8 +130,7 @@ def _named(trajectory: Motions) -> dict[str, Trajectory]:
     if not motions:
         raise ValueError("There is no motion to show.")
     for own in motions.values():
-        # A concrete class: a motion is of no other kind, and what is given instead is worth a message.
-        if not isinstance(own, Trajectory):
+        if not (hasattr(own, "system") and hasattr(own, "ts")):
             raise ValueError(f"show takes motions as simulate returns them, got {type(own).__name__}.")
     return motions
 

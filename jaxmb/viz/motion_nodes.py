@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from ..parts.base import GROUND
 from ..parts.names import unknown
-from ..parts.shapes import DARK, AbstractShape, Color, Ground, along
+from ..parts.shapes import DARK, AbstractShape, Color, along
 from ..system.picture import Picture
 from ..trajectory import Trajectory
 from . import stage
@@ -26,8 +27,8 @@ _FORCE: Color = (20, 120, 60)
 class Motion:
     """A motion to be shown.
 
-    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `solids`: shapes
-    with their bodies; `tint`: the one colour of all bodies, None for one each.
+    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `solids`:
+    shapes with their bodies; `tint`: the one colour of all bodies, None for one each.
     """
 
     name: str
@@ -41,16 +42,14 @@ class Motion:
         return np.asarray(self.trajectory.ts)
 
     @property
-    def grounds(self) -> list[Ground]:
-        """The ground of the motion."""
-        # A concrete class: ground alone has no end, and is drawn as far as the motion reaches.
-        return [shape for _, shape in self.solids if isinstance(shape, Ground)]
+    def grounds(self) -> list[Any]:
+        """The ground of the motion, which is drawn as far as the motion reaches."""
+        return [shape for _, shape in self.solids if shape.primitive == "ground"]
 
     @functools.cached_property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Least and greatest coordinates [m] that bodies reach."""
-        # A concrete class, as in `grounds`.
-        bounded = [own for own in self.solids if not isinstance(own[1], Ground)]
+        bounded = [own for own in self.solids if own[1].primitive != "ground"]
         position, _ = self._placed(bounded)
         reach = np.array([_reach(shape) for _, shape in bounded])[:, None]
         low, high = [position.min(axis=0) - reach], [position.max(axis=0) + reach]
@@ -100,8 +99,10 @@ class Motion:
 
     def _anchor(self, body, point):
         turn, place = self.picture.orientations[body], self.picture.positions[body]
-        return place if point is None else place + stage.viser().transforms.SO3(turn).apply(
-            np.broadcast_to(point, place.shape)
+        return (
+            place
+            if point is None
+            else place + stage.viser().transforms.SO3(turn).apply(np.broadcast_to(point, place.shape))
         )
 
     # Nodes
@@ -120,7 +121,7 @@ class Motion:
         out = self._solids(prefix, offset, grain) + self._paths(prefix, offset, grain)
         if self.picture.planar:
             # In front of all bodies.
-            offset = offset + (0.0, 0.0, self.bounds[1, 2])
+            offset = offset + np.array([0.0, 0.0, self.bounds[1, 2]])
         for k, name in enumerate(points):
             segments = _trail(self.point(name) + offset)
             out.append(stage.lines(f"{prefix}/trails/{name}", segments, COLORS[(k + 1) % len(COLORS)], 2.5, grain))
@@ -133,8 +134,7 @@ class Motion:
     def _solids(self, prefix, offset, grain):
         groups: dict[str, list[Placed]] = {}
         for k, (body, shape) in enumerate(self.solids):
-            # A concrete class, as in `grounds`.
-            if not isinstance(shape, Ground):
+            if shape.primitive != "ground":
                 kind = shape.primitive if shape.primitive != "own" else f"mesh {k} of {body}"
                 groups.setdefault(f"{kind}{' of the ground' if body == GROUND else ''}", []).append((body, shape))
         out = []
@@ -191,7 +191,8 @@ def motion(
 def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
     """The motion at no more than `frames` of its saved times, in ascending order.
 
-    **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not finite.
+    **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not
+    finite.
     """
     if trajectory.ts is None or trajectory.ts.ndim != 1:
         shape = () if trajectory.ts is None else trajectory.ts.shape[:-1]

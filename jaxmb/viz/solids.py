@@ -1,6 +1,7 @@
 """The shapes by which a picture shows bodies: those given, those of their parts, or bars to where parts act."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ COLORS: tuple[Color, ...] = (
 )
 _GROUND: Color = (125, 125, 125)
 
-Placed = tuple[str, AbstractShape]
+Placed = tuple[str, Any]
 
 
 def solids(
@@ -30,8 +31,8 @@ def solids(
 ) -> list[Placed]:
     """All shapes with the names of the bodies that they are fixed in.
 
-    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies, default
-    one for each.
+    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
+    default one for each.
     """
     points, width = _attachments(picture), picture.width
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
@@ -101,12 +102,12 @@ def _turn(a, b, origin):
 
 def _plate(middle, corners, width):
     """A plate behind the bars, whose outline joins the corners."""
-    n = len(corners)
-    rim = np.concatenate([corners + (0, 0, -0.8 * width), corners + (0, 0, -1.6 * width)])
+    n, front, back = len(corners), np.array([0.0, 0.0, -0.8 * width]), np.array([0.0, 0.0, -1.6 * width])
+    rim = np.concatenate([corners + front, corners + back])
     k, ahead = np.arange(n), np.roll(np.arange(n), -1)
     face = np.stack([np.full(n, 2 * n), k, ahead], axis=1)
     sides = np.concatenate([np.stack([k + n, ahead + n, ahead], 1), np.stack([k + n, ahead, k], 1)])
-    return Mesh(np.concatenate([rim, [middle + (0, 0, -0.8 * width)]]), np.concatenate([face, sides]))
+    return Mesh(np.concatenate([rim, [middle + front]]), np.concatenate([face, sides]))
 
 
 def _support(point, up, width):

@@ -23,7 +23,7 @@ class Node:
     """
 
     add: Callable[..., Any]
-    varying: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
+    varying: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def viser() -> Any:
@@ -40,8 +40,7 @@ def viser() -> Any:
 
 
 def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[Node]]], camera: "Camera") -> str:
-    """A page that plays some nodes, each with the times [s] of its motion, from 0 on.
-    """
+    """A page that plays some nodes, each with the times [s] of its motion, from 0 on."""
     with _server() as server:
         scene = server.scene
         scene.set_up_direction(camera.up)
