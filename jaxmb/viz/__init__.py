@@ -1,6 +1,6 @@
 """Pictures of motions and of their stability.
 
-Needs the extra `jaxmb[plot]`; matplotlib is imported when a figure is made.
+Figures need the extra `jaxmb[plot]`, moving pictures `jaxmb[view]`; matplotlib and viser are imported when one is made.
 """
 
 from .animation import MovingPicture as MovingPicture, save_html as save_html, show as show
