@@ -16,7 +16,7 @@ from . import (
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from .linalg import rotations as rotations
-from .parts import contact as contact, terrain as terrain
+from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.actuators import Actuator as Actuator
 from .parts.combinations import FixedTendon as FixedTendon, JointCoupling as JointCoupling, Tendon as Tendon
 from .parts.controller import Controller as Controller

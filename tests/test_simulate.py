@@ -283,6 +283,33 @@ def test_derivatives_with_baumgarte():
     np.testing.assert_allclose(forward, central, rtol=1e-5)
 
 
+def test_derivatives_of_violations_with_baumgarte():
+    """A pin that is moved away from a pendulum by p: Φ = −p (1 + r t) e^(−r t), and its rate p r² t e^(−r t)."""
+    rate, t1 = 5.0, 0.5
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    scene = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    state = mb.assemble(scene)
+
+    def violations(p, adjoint):
+        system = mb.with_parameters(scene, {"pin.point_a": p})
+        options = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(rate), "adjoint": adjoint}
+        y = mb.simulate(system, state, t1=t1, rtol=1e-11, throw=False, **options).ys
+        q, u = y.q[-1], y.u[-1]
+        return jnp.concatenate([system.position_residual(t1, q), system.velocity_residual(t1, q, u)])
+
+    off = jnp.array([0.01, 0.02])
+    reverse = jax.jit(jax.vmap(jax.jacrev(lambda p: violations(p, None))))(off[None])[0]
+    forward = jax.jit(jax.jacfwd(lambda p: violations(p, diffrax.ForwardMode())))(off)
+    value = violations(off, None)
+    decay = np.exp(-rate * t1)
+    sign = np.sign(value[0] / off[0])
+    expected = sign * np.concatenate([(1 + rate * t1) * decay * np.eye(2), -(rate**2) * t1 * decay * np.eye(2)])
+    np.testing.assert_allclose(value, expected @ off, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-12)
+
+
 def test_a_system_without_bodies_has_the_same_views(tmp_path):
     """A train in relative coordinates is neither a scene nor a Lagrangian system."""
     train = mb.mechanisms.longitudinal_train(n=3)

@@ -22,6 +22,7 @@ from ..system import parameters, with_parameters
 from ..trajectory import Trajectory
 from .folders import check_folder, made_folder, write_figures
 from .options import add_parameters
+from .picture import check_picture, show_motion
 from .subject import mechanism_of
 
 # What `run` does: saved times, tolerances of the table, and the fit of one parameter to every other saved time of the
@@ -40,6 +41,7 @@ def add_to(commands: Any) -> None:
     command.add_argument("--rtol", type=float, default=1e-9, help="relative tolerance of a step (default %(default)g)")
     command.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
     command.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
+    command.add_argument("--show", action="store_true", help="write a moving picture as well, and open it in a browser")
     command.set_defaults(command=_run)
     add_parameters(command)
 
@@ -47,6 +49,8 @@ def add_to(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     check_folder(arguments)
     mechanism = mechanism_of(arguments)
+    if arguments.show:
+        check_picture(mechanism.system)
     print(f"{mechanism.name}: {mechanism.description}\n\n{mechanism.system}\n")
 
     trajectory, seconds = _simulate(mechanism, arguments.rtol)
@@ -69,6 +73,8 @@ def _run(arguments: argparse.Namespace) -> None:
     trajectory.save(out / "motion.npz")
     print(f"\nWrote {out / 'motion.npz'}")
     write_figures(out, precision, trajectory)
+    if arguments.show:
+        show_motion(out, trajectory)
 
 
 def _simulate(mechanism: Mechanism, rtol: float) -> tuple[Trajectory, float]:

@@ -11,7 +11,7 @@ A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes th
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from . import checks, fields
+from .shapes import AbstractShape
 from .space import AbstractSpace
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ Velocities = Float[Array, "k v"]
 Wrenches = Float[Array, "k v"]
 
 GROUND = "ground"
+
+# How a picture draws the line of a part.
+PathKind = Literal["rod", "coil", "belt"]
 
 
 class AbstractPart(eqx.Module):
@@ -144,6 +148,7 @@ class AbstractLink(AbstractPart):
     """A part that acts between bodies, `bodies`."""
 
     bodies = _Bodies()
+    path_kind: ClassVar[PathKind] = "rod"
 
     # Names of the coordinates that are angles known up to full turns.
     periodic: ClassVar[frozenset[str]] = frozenset()
@@ -177,6 +182,22 @@ class AbstractLink(AbstractPart):
         for name, own in fields.declarations(type(self)).items():
             if own.is_point and own.body == k and getattr(self, name) is not None:
                 return getattr(self, name)
+        return None
+
+    def shapes(self, space: AbstractSpace, size: float) -> tuple[tuple[int | None, AbstractShape], ...]:
+        """Hook: the shapes by which a picture shows the part, each with the number of the body that it is fixed in,
+        None for the world.
+
+        **Arguments:** `size` [m]: the radius of a bar, to which symbols such as pins are drawn.
+        """
+        del space, size
+        return ()
+
+    def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
+        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"` and `"coil"`
+        between two points, `"belt"` a closed line through any number; None if it shows no line.
+        """
+        del space, poses
         return None
 
 

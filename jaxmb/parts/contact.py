@@ -15,6 +15,7 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
+from .shapes import Ground, marked_ball, wheel
 from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain, distance, outward
 
@@ -198,6 +199,15 @@ class AbstractContact(AbstractPotentialForce):
     def energy(self, space, poses, t):
         single = lambda pose, point, radius: self.normal.energy(self._depth(space.point(pose, point), radius))
         return jnp.sum(self._each(space, single, poses))
+
+    def shapes(self, space, size):
+        n, solid = len(self.bodies), wheel if space.dimension == 2 else marked_ball
+        centres = np.broadcast_to(self.centres, (n, space.dimension))
+        out = [(None, Ground(height=self.terrain.height))]
+        for k, (centre, radius) in enumerate(zip(centres, np.broadcast_to(self.radius, n), strict=True)):
+            if radius > 0:
+                out += [(k, shape) for shape in solid(radius, position=space.in_space(centre))]
+        return tuple(out)
 
     def _each(self, space, single, *of_bodies):
         """`single(…, point, radius)` of every body."""

@@ -1,6 +1,6 @@
 """Forces with the same definition in the plane and in space."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce
-from .space import force_pair, separation, separation_rate
+from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
+from .space import both_points, force_pair, separation, separation_rate
 
 
 class Gravity(AbstractPart):
@@ -50,6 +50,7 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
     point_a: fields.Number = fields.point(body=0, default="mass centre")
     point_b: fields.Number = fields.point(body=1, default="mass centre")
+    path_kind: ClassVar[PathKind] = "coil"
 
     def complete(self, space, poses):
         return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
@@ -67,6 +68,9 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
         d = separation(space, self, poses)
         # ½ k (l − l0)², written so that its derivative at l = 0 is finite.
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
 
 
 class Damper(AbstractPair, AbstractForce):

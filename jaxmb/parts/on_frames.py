@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..linalg.arrays import namespace
 from . import fields
@@ -83,6 +84,20 @@ class AbstractOnFrames(AbstractPart):
     def anchor(self, k):
         point, frame = self.part.anchor(k), self.frames.get(str(k))
         return point if frame is None or point is None else frame.point(point)
+
+    @property
+    def path_kind(self):
+        return self.part.path_kind
+
+    def path(self, space, poses):
+        return self.part.path(space, self._poses(space, poses))
+
+    def shapes(self, space, size):
+        rest = np.asarray(space.ground)
+        moved = lambda k, shape: shape.moved(*space.placement(self.frames[str(k)].pose(space, rest)))
+        return tuple(
+            (k, moved(k, shape) if str(k) in self.frames else shape) for k, shape in self.part.shapes(space, size)
+        )
 
     def _poses(self, space, poses):
         rows = [self.frames[str(k)].pose(space, x) if str(k) in self.frames else x for k, x in enumerate(poses)]

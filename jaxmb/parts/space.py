@@ -14,6 +14,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..linalg.arrays import namespace
+
 Pose = Float[Array, "p"]
 Velocity = Float[Array, "v"]
 Wrench = Float[Array, "v"]
@@ -78,6 +80,15 @@ class AbstractSpace(abc.ABC):
     def normalize(self, pose: Pose) -> Pose:
         """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""
 
+    @abc.abstractmethod
+    def placement(self, pose: Pose) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+        """Position [m] and Euler parameters in space; the plane is z = 0."""
+
+    def in_space(self, v: Point) -> Float[Array, "3"]:
+        """The three components of a vector; the plane is z = 0."""
+        xp = namespace(v)
+        return xp.concatenate([v, xp.zeros(3 - self.dimension, v.dtype)])
+
 
 # Shared by parts between two points: `part` has `point_a` and `point_b` [m], fixed in the first and the second body.
 
@@ -85,6 +96,11 @@ class AbstractSpace(abc.ABC):
 def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Point:
     """World vector [m] from point A to point B."""
     return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
+
+
+def both_points(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Float[Array, "2 d"]:
+    """World positions [m] of point A and point B."""
+    return jnp.stack([space.point(poses[0], part.point_a), space.point(poses[1], part.point_b)])
 
 
 def separation_rate(

@@ -48,6 +48,7 @@ from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
 from .layout import Layout
 from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
+from .picture import picture
 from .quantities import Quantity
 from .reactions import applied_wrenches, reaction
 
@@ -326,6 +327,9 @@ class AbstractBodySystem(AbstractSystem):
         points = attachments(groups, self.layout.bodies)
         poses = jax.vmap(self.poses)(ys.q)
         return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
+
+    def picture(self, ts, ys):
+        return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
 
     def not_finite(self, t, q, u):
         values = self._of_parts(jnp.asarray(t, q.dtype), q, u)

@@ -27,6 +27,7 @@ from ..linalg.jacobian import AbstractJacobian
 from ..parts.series import AbstractSignal
 from .description import Description
 from .design_variables import DesignVariables
+from .picture import Picture
 from .quantities import Quantity, Reaction
 
 if TYPE_CHECKING:
@@ -187,6 +188,13 @@ class AbstractSystem(eqx.Module):
     def outline(self, ys: State) -> dict[str, Float[Array, "times points d"]]:
         """The points that a picture of each body shows along a motion, world axes [m]: its mass centre, and the points
         where joints and forces act on it. Empty for a system without bodies.
+        """
+
+    @abc.abstractmethod
+    def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
+        """The bodies and parts that a picture shows along a motion.
+
+        **Raises:** `ValueError` for a system without bodies.
         """
 
     @abc.abstractmethod

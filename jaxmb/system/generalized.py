@@ -84,6 +84,11 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def outline(self, ys):
         return {}
 
+    def picture(self, ts, ys):
+        raise ValueError(
+            f"A picture shows bodies, and a {type(self).__name__} has none; viz.plot_motion shows its coordinates."
+        )
+
     def check_parameters(self, names):
         for name in self.positive_parameters() & set(names):
             value = self._parameter(name)

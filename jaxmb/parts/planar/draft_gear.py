@@ -1,13 +1,15 @@
 """Couplers between the vehicles of a train."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
 from .. import fields
-from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
+from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce, PathKind
 from ..smooth import quintic, sign
-from ..space import force_pair, separation, separation_rate
+from ..space import both_points, force_pair, separation, separation_rate
 
 
 class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
@@ -52,6 +54,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
     point_a: fields.Number = fields.point(body=0, default="mass centre")
     point_b: fields.Number = fields.point(body=1, default="mass centre")
+    path_kind: ClassVar[PathKind] = "coil"
 
     def validate(self):
         if self.unloading > 1:
@@ -81,6 +84,9 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
 
     def energy(self, space, poses, t):
         return self.stored(norm(separation(space, self, poses)) - self.free_length)
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
 
     def _against(self, stroke, rate):
         engaged, ramp, _ = self._engaged(stroke)

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
-from ...linalg.rotations import norm
+from ...linalg.rotations import norm, rotate_2d
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart
-from ..space import separation
+from ..shapes import pin, sleeve, wheel
+from ..space import both_points, separation
 
 
 def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -39,6 +40,9 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"angle": relative_angle(poses)}
+
+    def shapes(self, space, size):
+        return ((0, pin(space.in_space(self.point_a), size)),)
 
 
 class Fixed(AbstractPlanarPart, AbstractJoint):
@@ -74,6 +78,12 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses), "angle": relative_angle(poses)}
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, pin(space.in_space(self.point_b), size)),)
+
 
 class Prismatic(AbstractPlanarPart, AbstractJoint):
     """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a
@@ -95,6 +105,13 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        axis_b = rotate_2d(-self.angle, self.axis_a)
+        return ((1, sleeve(space.in_space(self.point_b), size, space.in_space(axis_b))),)
 
 
 def _offset(space, part, poses):
@@ -127,6 +144,9 @@ class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     def residual(self, space, poses, t):
         d = separation(space, self, poses)
         return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
 
 
 class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
@@ -200,3 +220,7 @@ class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
     def residual(self, space, poses, t):
         return (self._travel(space, poses) - self.offset)[None]
+
+    def shapes(self, space, size):
+        pinion = wheel(self.radius, 2 * size, space.in_space(self.point_a))
+        return tuple((0, shape) for shape in pinion)

@@ -62,6 +62,11 @@ class PlanarSpace(AbstractSpace):
     def normalize(self, pose):
         return pose
 
+    def placement(self, pose):
+        xp, half = namespace(pose), 0.5 * pose[2]
+        turn = xp.stack([xp.cos(half), xp.zeros_like(half), xp.zeros_like(half), xp.sin(half)])
+        return self.in_space(pose[:2]), turn
+
 
 def _prepared(pose):
     return pose.shape[0] == 5

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractVelocityConstraint
+from ..shapes import sleeve
 
 
 class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
@@ -26,3 +27,6 @@ class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
         along = space.direction(poses[0], self.axis)
         v = space.point_velocity(poses[0], velocities[0], self.point)
         return (along[0] * v[1] - along[1] * v[0])[None]
+
+    def shapes(self, space, size):
+        return ((0, sleeve(space.in_space(self.point), size, space.in_space(self.axis))),)

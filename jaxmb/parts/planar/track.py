@@ -1,7 +1,7 @@
 """Tracks and belts: a closed elastic loop around wheels."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 from ..._types import VectorLike
 from ...linalg.rotations import norm
 from .. import fields
-from ..base import AbstractPlanarPart, AbstractPotentialForce
+from ..base import AbstractPlanarPart, AbstractPotentialForce, PathKind
 from ..forces import generalized_force
+from ..shapes import wheel
 
 
 class Track(AbstractPlanarPart, AbstractPotentialForce):
@@ -44,6 +45,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", kw_only=False)
     free_length: fields.Number = fields.parameter(unit="m", optional=True, kw_only=False)
     radii: fields.Number = fields.parameter(shape=None, unit="m", sign="non-negative", optional=True, kw_only=False)
+    path_kind: ClassVar[PathKind] = "belt"
 
     def __init__(
         self,
@@ -81,14 +83,24 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     def _lines(self, space, poses):
         """From each point to the next."""
-        points = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        points = self._centres(space, poses)
         return jnp.roll(points, -1, axis=0) - points
+
+    def _centres(self, space, poses):
+        return jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
 
     def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Length of the track [m]."""
         d = self._lines(space, poses)
         if self.radii is None:
             return jnp.sum(norm(d))
+        straight, _, turn = self._tangents(d)
+        return jnp.sum(straight) + jnp.dot(self.radii, turn)
+
+    def _tangents(self, d):
+        """Of the straight parts along the lines of centres `d`: lengths, unit vectors, and the angles by which the
+        track turns before each, on a circle.
+        """
         square = jnp.sum(d * d, axis=1)
         more = jnp.roll(self.radii, -1) - self.radii
         straight = jnp.sqrt(square - more**2)
@@ -98,8 +110,30 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         into = jnp.roll(along, 1, axis=0)
         turn = jnp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], jnp.sum(into * along, axis=1))
         # At its ends a track turns by half a turn or more; elsewhere it turns back by less than a quarter.
-        turn = jnp.where(turn < -0.5 * jnp.pi, turn + 2 * jnp.pi, turn)
-        return jnp.sum(straight) + jnp.dot(self.radii, turn)
+        return straight, along, jnp.where(turn < -0.5 * jnp.pi, turn + 2 * jnp.pi, turn)
+
+    def path(self, space, poses):
+        centres = self._centres(space, poses)
+        if self.radii is None:
+            return centres
+        _, along, turn = self._tangents(self._lines(space, poses))
+        # On each circle from the end of one straight part to the start of the next.
+        back = jnp.linspace(1.0, 0.0, 9)[None, :] * turn[:, None]
+        outward = jnp.stack([along[:, 1], -along[:, 0]], axis=1)[:, None, :]
+        c, s = jnp.cos(back), jnp.sin(back)
+        arc = jnp.stack([c * outward[..., 0] + s * outward[..., 1], c * outward[..., 1] - s * outward[..., 0]], axis=2)
+        return (centres[:, None, :] + self.radii[:, None, None] * arc).reshape(-1, 2)
+
+    def shapes(self, space, size):
+        if self.radii is None:
+            return ()
+        circles = zip(self.owners, self.points, self.radii, strict=True)
+        return tuple(
+            (k, shape)
+            for k, point, radius in circles
+            if radius > 0
+            for shape in wheel(radius, position=space.in_space(point))
+        )
 
     def tension(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Tension [N]."""

@@ -15,10 +15,11 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import conjugate, cross, multiply, norm, rotate
+from ...linalg.rotations import conjugate, cross, multiply, norm, rotate, unrotate
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
-from ..space import separation
+from ..shapes import ball, pin, sleeve
+from ..space import both_points, separation
 from .axes import (
     angle,
     cosine_sine,
@@ -70,6 +71,9 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"rotation": rotation_vector(self, poses)}
 
+    def shapes(self, space, size):
+        return ((0, ball(self.point_a, size)),)
+
 
 class Revolute(AbstractSpatialPart, AbstractJoint):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, `u·b`, `v·b`.
@@ -95,6 +99,9 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses)}
+
+    def shapes(self, space, size):
+        return ((0, pin(self.point_a, size, self.axis_a)),)
 
 
 class Universal(AbstractSpatialPart, AbstractJoint):
@@ -141,6 +148,9 @@ class Universal(AbstractSpatialPart, AbstractJoint):
             "angle_a": turn_about(self.axis_a, self.x_a, arm_b),
             "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
         }
+
+    def shapes(self, space, size):
+        return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
 
 
 class Gimbal(AbstractSpatialPart, AbstractJoint):
@@ -214,6 +224,12 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, self.axis_b)),)
+
 
 class Screw(AbstractSpatialPart, AbstractJoint):
     """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
@@ -255,6 +271,12 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, self.axis_b)),)
+
 
 class Prismatic(AbstractSpatialPart, AbstractJoint):
     """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
@@ -280,6 +302,12 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)
 
 
 class Planar(AbstractSpatialPart, AbstractJoint):
@@ -348,6 +376,9 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         d = separation(space, self, poses)
         return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
 
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
 
 class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     """A point of B stays in a plane fixed in A, through A normal to the axis. Rows 1: `a·d`.
@@ -380,3 +411,9 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((1, ball(self.point_b, size)),)

@@ -85,6 +85,9 @@ class SpatialSpace(AbstractSpace):
     def normalize(self, pose):
         return jnp.concatenate([pose[:3], rot.normalize(pose[3:])])
 
+    def placement(self, pose):
+        return pose[:3], pose[3:7]
+
 
 def _prepared(pose):
     return pose.shape[0] == 16

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from ...linalg.rotations import cross, norm
 from .. import fields
 from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
+from ..shapes import Ground, along, marked_ball, sleeve, wheel
 from .axes import perpendiculars
 
 
@@ -35,6 +36,9 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
     def residual(self, space, poses, velocities, t):
         v = space.point_velocity(poses[0], velocities[0], self.point)
         return jnp.dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
+
+    def shapes(self, space, size):
+        return (0, sleeve(self.point, size, self.axis)), (None, Ground(orientation=along(self.normal)))
 
 
 class AbstractDisk(AbstractSpatialPart):
@@ -93,6 +97,10 @@ class DiskContact(AbstractDisk, AbstractConstraint):
         lowest = space.point(poses[0], self.center) + _lowest_rim_point(space, self, poses[0])
         return jnp.dot(self.normal, lowest - self.point)[None]
 
+    def shapes(self, space, size):
+        disc = ((0, shape) for shape in wheel(self.radius, size, self.center, self.axis))
+        return (*disc, (None, Ground(position=self.point, orientation=along(self.normal))))
+
 
 class DiskRolling(AbstractDisk, AbstractVelocityConstraint):
     """A disk whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisk`."""
@@ -144,6 +152,10 @@ class SphereContact(AbstractBall, AbstractConstraint):
     def residual(self, space, poses, t):
         height = jnp.dot(self.normal, space.point(poses[0], self.center) - self.point)
         return (height - self.radius * norm(self.normal))[None]
+
+    def shapes(self, space, size):
+        ground = Ground(position=self.point, orientation=along(self.normal))
+        return *((0, shape) for shape in marked_ball(self.radius, self.center)), (None, ground)
 
 
 class SphereRolling(AbstractBall, AbstractVelocityConstraint):

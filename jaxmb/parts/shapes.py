@@ -1,0 +1,236 @@
+"""Simple shapes, by which a picture shows bodies and parts.
+
+A shape is placed in the frame of a body: `position` [m] of its origin, and `orientation`, Euler parameters from its own
+axes to those of the body. In the plane, z points to the viewer. A shape has no mass and no effect on the motion.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from .._types import VectorLike
+from ..linalg import rotations as rot
+
+Color = tuple[int, int, int]
+STEEL, DARK, GROUND = (150, 155, 162), (64, 68, 76), (176, 170, 158)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class AbstractShape(abc.ABC):
+    """A shape with its place in a body; `color`: red, green and blue from 0 to 255, default that of the body."""
+
+    position: Any = (0.0, 0.0, 0.0)
+    orientation: Any = (1.0, 0.0, 0.0, 0.0)
+    color: Color | None = None
+
+    # Which mesh of unit size the shape is a scaled copy of; "own" for one with vertices of its own.
+    primitive: ClassVar[Literal["box", "sphere", "cylinder", "own", "ground"]]
+
+    def __post_init__(self):
+        for name, size in (("position", 3), ("orientation", 4)):
+            value = np.asarray(getattr(self, name), float)
+            if value.shape != (size,) or not np.all(np.isfinite(value)):
+                raise ValueError(f"{type(self).__name__}: {name} must be {size} finite numbers, got {value.tolist()}.")
+            object.__setattr__(self, name, value)
+        if not np.any(self.orientation):
+            raise ValueError(f"{type(self).__name__}: orientation must not be zero.")
+        object.__setattr__(self, "orientation", self.orientation / np.linalg.norm(self.orientation))
+
+    @property
+    @abc.abstractmethod
+    def scale(self) -> np.ndarray:
+        """Lengths [m] by which the mesh of unit size is stretched along its axes, shape (3,)."""
+
+    def moved(self, position: Any, orientation: Any) -> Self:
+        """The shape in another frame, in which its present one is at a position with an orientation."""
+        moved = position + rot.rotate(orientation, self.position)
+        return dataclasses.replace(self, position=moved, orientation=rot.multiply(orientation, self.orientation))
+
+    def colored(self, color: Color) -> Self:
+        """The shape in this colour, if it has none."""
+        return self if self.color is not None else dataclasses.replace(self, color=color)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Box(AbstractShape):
+    """A cuboid with its centre at the position.
+
+    **Arguments:** `size` [m], shape (3,): its edges.
+    """
+
+    size: VectorLike
+    primitive = "box"
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_lengths(self, size=self.size)
+        if np.shape(self.size) != (3,):
+            raise ValueError(f"Box: size must be three lengths, got {self.size}.")
+
+    @property
+    def scale(self):
+        return np.asarray(self.size, float)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sphere(AbstractShape):
+    """A ball with its centre at the position.
+
+    **Arguments:** `radius` [m].
+    """
+
+    radius: float
+    primitive = "sphere"
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_lengths(self, radius=self.radius)
+
+    @property
+    def scale(self):
+        return np.full(3, float(self.radius))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Cylinder(AbstractShape):
+    """A cylinder along its own z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
+
+    **Arguments:** `radius` [m]; `length` [m].
+    """
+
+    radius: float
+    length: float
+    primitive = "cylinder"
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_lengths(self, radius=self.radius, length=self.length)
+
+    @property
+    def scale(self):
+        return np.array([self.radius, self.radius, self.length], float)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mesh(AbstractShape):
+    """A surface of triangles; `Mesh.read` reads one from a file.
+
+    **Arguments:** `vertices` [m], shape (n, 3), in the shape's own axes; `faces`, shape (m, 3): the vertices of each
+    triangle, counter-clockwise seen from outside.
+    """
+
+    vertices: Any
+    faces: Any
+    primitive = "own"
+
+    def __post_init__(self):
+        super().__post_init__()
+        vertices, faces = np.asarray(self.vertices, float), np.asarray(self.faces, int)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError(
+                f"Mesh: vertices and faces must have shapes (n, 3) and (m, 3), got {vertices.shape} and {faces.shape}."
+            )
+        if not np.all(np.isfinite(vertices)) or faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError("Mesh: vertices must be finite, and faces must be numbers of vertices.")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def scale(self):
+        return np.ones(3)
+
+    @classmethod
+    def read(cls, path: str | Path, *, scale: float = 1.0, **place: Any) -> "Mesh":
+        """From a file that trimesh reads, such as STL, OBJ, PLY or GLB.
+
+        **Arguments:** `scale` [m per unit of the file]; `position`, `orientation` and `color` as of all shapes.
+
+        **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs.
+        """
+        try:
+            import trimesh
+        except ImportError as error:
+            raise ImportError('Mesh.read needs trimesh; install it with: pip install "jaxmb[view]"') from error
+        mesh = trimesh.load_mesh(path)
+        return cls(scale * np.asarray(mesh.vertices), np.asarray(mesh.faces), **place)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ground(AbstractShape):
+    """Ground that reaches as far as the motion; a picture draws the part of it that it shows.
+
+    **Arguments:** `height(place)`: height [m] above the shape's plane z = 0 at the place, shape (2,), in its axes; in
+    the plane above y = 0, shape (1,). None for level ground.
+    """
+
+    height: Callable[[Any], Any] | None = None
+    primitive = "ground"
+
+    @property
+    def scale(self):
+        return np.ones(3)
+
+
+def _check_lengths(shape: AbstractShape, **lengths: Any) -> None:
+    for name, value in lengths.items():
+        if not (np.all(np.isfinite(value)) and np.all(np.asarray(value) > 0)):
+            raise ValueError(f"{type(shape).__name__}: {name} must be positive, got {value}.")
+
+
+def along(axis: VectorLike) -> np.ndarray:
+    """Euler parameters of the shortest turn of the z axis to a direction."""
+    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
+    if z < -1 + 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    half = np.array([1 + z, -y, x, 0.0])
+    return half / np.linalg.norm(half)
+
+
+def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place: Any) -> Cylinder:
+    """A round bar between two points [m] of a body."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    length = float(np.linalg.norm(end - start))
+    return Cylinder(radius, length, position=0.5 * (start + end), orientation=along(end - start), **place)
+
+
+def wheel(
+    radius: float,
+    width: float | None = None,
+    position: VectorLike = (0.0, 0.0, 0.0),
+    axis: VectorLike = (0.0, 0.0, 1.0),
+) -> tuple[AbstractShape, ...]:
+    """A wheel about an axis of a body, with a spoke that shows how it turns; `width` [m], default a third of the
+    radius.
+    """
+    width, turn = radius / 3 if width is None else width, along(axis)
+    disc = Cylinder(radius, width, position=position, orientation=turn)
+    spoke = Box((1.9 * radius, 0.14 * radius, 1.1 * width), position=position, orientation=turn, color=DARK)
+    return disc, spoke
+
+
+def marked_ball(radius: float, position: VectorLike = (0.0, 0.0, 0.0)) -> tuple[AbstractShape, ...]:
+    """A ball with two bands around it that show how it turns."""
+    band = lambda axis: Cylinder(1.005 * radius, 0.1 * radius, position=position, orientation=along(axis), color=DARK)
+    return Sphere(radius, position=position), band((0.0, 0.0, 1.0)), band((1.0, 0.0, 0.0))
+
+
+# Symbols of joints, to the radius of a bar.
+
+
+def pin(point: VectorLike, size: float, axis: VectorLike = (0.0, 0.0, 1.0)) -> Cylinder:
+    """A hinge pin."""
+    return Cylinder(0.8 * size, 3.2 * size, position=point, orientation=along(axis), color=DARK)
+
+
+def ball(point: VectorLike, size: float) -> Sphere:
+    """A ball joint."""
+    return Sphere(1.6 * size, position=point, color=DARK)
+
+
+def sleeve(point: VectorLike, size: float, axis: VectorLike) -> Box:
+    """A block or bush that slides."""
+    return Box((3.2 * size, 3.2 * size, 6.0 * size), position=point, orientation=along(axis), color=DARK)

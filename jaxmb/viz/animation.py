@@ -1,0 +1,150 @@
+"""Moving pictures of motions, as pages that need no network."""
+
+import dataclasses
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..parts.shapes import AbstractShape
+from ..trajectory import Trajectory
+from . import scenery
+from .motion_nodes import Motion, chosen, motion
+from .solids import COLORS
+from .stage import Node, page
+
+Motions = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
+Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
+
+# A motion that lasts for less or more than this [s] is not shown in real time.
+_SHORTEST, _LONGEST = 2.0, 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class MovingPicture:
+    """A moving picture, which notebooks show.
+
+    **Fields:** `html`: a page of its own, complete without a network; `height` [pixels] in a notebook; `frames`: how
+    many times are shown.
+    """
+
+    html: str = dataclasses.field(repr=False)
+    height: int
+    frames: int
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to a file, which any browser opens."""
+        path = Path(path)
+        path.write_text(self.html, encoding="utf-8")
+        return path
+
+    def _repr_html_(self) -> str:
+        # A frame within the output, since a notebook that is exported or sent keeps that and no files beside it.
+        style = f"width: 100%; height: {self.height}px; border: 1px solid #ddd"
+        return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}"></iframe>'
+
+
+def show(
+    trajectory: Motions,
+    *,
+    points: Sequence[str] = (),
+    reactions: Sequence[str] = (),
+    forces: Sequence[str] = (),
+    shapes: Shapes | None = None,
+    frames: int = 400,
+    speed: float | None = None,
+    overlay: bool = False,
+    height: int = 480,
+) -> MovingPicture:
+    """A moving picture of one or several motions, to be seen in a notebook, or saved as a page.
+
+    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of what is shown; the mouse
+    turns, shifts and zooms it. It shows the saved states at their times, with nothing between them: a motion to look
+    at is saved at 30 times a second or more, by `saveat=`.
+
+    Bodies are drawn in the shapes of their parts, such as wheels, as bars from their mass centre to the points where
+    parts act on them, or, where there are none, as the cuboid with their inertia; springs, rods and tracks between
+    their points; terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
+
+    **Arguments:**
+
+    - `trajectory`: a motion of a scene; a list, or a dictionary by name, of several, such as one before and one after a
+        change, or members of a sweep.
+    - `points`: names of bodies (their mass centres), frames and joints that leave a trail.
+    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
+        on the last body of a joint, and on each body of a force element.
+    - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, in place of the default; `"ground"` as
+        well.
+    - `frames`: how many of the saved times are shown at most.
+    - `speed`: of playing, 1 for real time; the default is 1, but for motions that are over within 2 s or last for more
+        than a minute what makes them last so long. The slider shows the time of playing, the picture that of the
+        motion.
+    - `overlay`: show several motions in one place, each in a colour, instead of side by side.
+    - `height` [pixels], in a notebook.
+
+    **Returns:** a `MovingPicture`, of about 0.8 MB and more for long motions of many bodies.
+
+    **Raises:** `ValueError` for unknown names, batches, motions saved at fewer than two times, states that are not
+    finite, and systems without bodies; `ImportError` without viser, which `jaxmb[view]` installs.
+    """
+    for value, name in ((frames - 1, "frames"), (height, "height"), (1 if speed is None else speed, "speed")):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be {'at least 2' if name == 'frames' else 'positive'}.")
+    motions = [
+        motion(name, chosen(own, frames), shapes or {}, COLORS[k % len(COLORS)] if overlay else None)
+        for k, (name, own) in enumerate(_named(trajectory).items())
+    ]
+    forces_of = [_arrows(own, reactions, forces) for own in motions]
+    view = scenery.View.of(motions, overlay)
+    strength = _strength(forces_of)
+    # So that the side of a square of the grid is a round force [N].
+    square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
+    scale = view.cell / square if square else 0.0
+    first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
+    speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
+    played: list[tuple[np.ndarray, Sequence[Node]]] = []
+    for own, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
+        nodes = own.nodes(offset, view.grain, points=points, arrows=arrows, scale=scale)
+        played.append(((own.times - first) / speed, nodes))
+    still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
+    notes = [f"{speed:.3g} × real time"] if speed != 1 else []
+    notes += [f"arrows {square:g} N a square"] if square else []
+    played += [(np.zeros(1), still), ((clock - first) / speed, [scenery.clock(clock, notes, view)])]
+    return MovingPicture(page(played, view.camera), height, max(own.times.size for own in motions))
+
+
+def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
+    """Write a moving picture as a page that any browser opens, also without a network; options as in `show`."""
+    return show(trajectory, **options).save(path)
+
+
+def _named(trajectory: Motions) -> dict[str, Trajectory]:
+    if isinstance(trajectory, Mapping):
+        motions = {str(name): own for name, own in trajectory.items()}
+    elif isinstance(trajectory, Sequence):
+        motions = {str(k): own for k, own in enumerate(trajectory, 1)}
+    else:
+        motions = {"": trajectory}
+    if not motions:
+        raise ValueError("There is no motion to show.")
+    for own in motions.values():
+        if not (hasattr(own, "system") and hasattr(own, "ts")):
+            raise ValueError(f"show takes motions as simulate returns them, got {type(own).__name__}.")
+    return motions
+
+
+def _arrows(own: Motion, reactions: Sequence[str], forces: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    out = {f"reactions/{name}": own.reaction(name) for name in reactions}
+    return out | {f"forces/{name}": own.force(name) for name in forces}
+
+
+def _strength(forces_of: Sequence[Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> float:
+    """The force [N] that the largest arrow exceeds for a tenth of the time."""
+    largest = [
+        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in own.values()], axis=0)
+        for own in forces_of
+        if own
+    ]
+    return float(np.quantile(np.concatenate(largest), 0.9)) if largest else 0.0

@@ -1,0 +1,127 @@
+"""The shapes by which a picture shows bodies: those given, those of their parts, or bars to where parts act."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..linalg.rotations import from_matrix
+from ..parts.base import GROUND
+from ..parts.shapes import DARK, AbstractShape, Box, Color, Mesh, Sphere, cylinder_between
+from ..system.picture import Picture
+
+# Distinct also for colour-blind readers, after Okabe and Ito, darkened for a white background.
+COLORS: tuple[Color, ...] = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 140, 105),
+    (204, 121, 167),
+    (214, 150, 0),
+    (64, 160, 215),
+    (130, 92, 60),
+    (120, 120, 200),
+)
+_GROUND: Color = (125, 125, 125)
+
+Placed = tuple[str, Any]
+
+
+def solids(
+    picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], tint: Color | None
+) -> list[Placed]:
+    """All shapes with the names of the bodies that they are fixed in.
+
+    **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
+    default one for each.
+    """
+    points, width = _attachments(picture), picture.width
+    of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
+    for body, shape in picture.shapes:
+        of_parts[body].append(shape)
+    out: list[Placed] = []
+    for k, name in enumerate(picture.positions):
+        if name in given:
+            own = given[name]
+            own = [own] if isinstance(own, AbstractShape) else list(own)
+        elif name == GROUND:
+            own = [_support(point, picture.up, width) for point in points[name]]
+        else:
+            own = _linkage(points[name], picture.planar, width)
+            if not own and not of_parts[name]:
+                own = _equivalent(*picture.inertias[name], width)
+        color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
+        out += [(name, shape.colored(color)) for shape in (*own, *of_parts[name])]
+    return out
+
+
+def _attachments(picture):
+    """The distinct points of every body where parts act on it."""
+    points: dict[str, dict[tuple, np.ndarray]] = {name: {} for name in picture.positions}
+    for part in picture.parts.values():
+        for body, point in zip(part.bodies, part.points, strict=True):
+            if point is not None:
+                points[body][tuple(np.round(point, 9))] = point
+    return {name: list(own.values()) for name, own in points.items()}
+
+
+def _linkage(points, planar, width):
+    """In the plane a plate through three points and more; else bars from the mass centre to the points, and a ball at
+    the mass centre.
+    """
+    if planar and len(points) > 2:
+        corners = _hull([np.zeros(3), *points])
+        middle = np.mean(corners, axis=0)
+        area = 0.5 * np.sum(_turn(corners, np.roll(corners, -1, axis=0), middle))
+        if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
+            return [_plate(middle, corners, width), Sphere(1.4 * width)]
+    away = [point for point in points if np.linalg.norm(point) > 0.5 * width]
+    bars = [cylinder_between(np.zeros(3), point, width) for point in away]
+    return [*bars, Sphere(1.4 * width)] if bars else []
+
+
+def _hull(points):
+    """The corners of the convex hull of points of the plane, counter-clockwise, by A. M. Andrew's monotone chain."""
+    ascending = sorted(points, key=lambda p: (p[0], p[1]))
+
+    def half(ordered):
+        chain: list[np.ndarray] = []
+        for point in ordered:
+            while len(chain) > 1 and _turn(chain[-1], point, chain[-2]) <= 0:
+                chain.pop()
+            chain.append(point)
+        return chain[:-1]
+
+    return np.array([*half(ascending), *half(ascending[::-1])])
+
+
+def _turn(a, b, origin):
+    """The third component of the product of two arms from an origin, positive for a turn to the left."""
+    a, b = a - origin, b - origin
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _plate(middle, corners, width):
+    """A plate behind the bars, whose outline joins the corners."""
+    n, front, back = len(corners), np.array([0.0, 0.0, -0.8 * width]), np.array([0.0, 0.0, -1.6 * width])
+    rim = np.concatenate([corners + front, corners + back])
+    k, ahead = np.arange(n), np.roll(np.arange(n), -1)
+    face = np.stack([np.full(n, 2 * n), k, ahead], axis=1)
+    sides = np.concatenate([np.stack([k + n, ahead + n, ahead], 1), np.stack([k + n, ahead, k], 1)])
+    return Mesh(np.concatenate([rim, [middle + front]]), np.concatenate([face, sides]))
+
+
+def _support(point, up, width):
+    """A block below a point of the ground."""
+    return Box(np.where(up == 0, 4.0, 2.4) * width, position=point - 1.2 * width * up, color=DARK)
+
+
+def _equivalent(mass, moments, width) -> list[AbstractShape]:
+    """The homogeneous cuboid with a body's mass and moments of inertia; a ball for a point mass."""
+    values, axes = np.linalg.eigh(moments)
+    if values[-1] <= 0:
+        return [Sphere(2.5 * width)]
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    squares = 6.0 * (np.sum(values) - 2.0 * values) / mass
+    size = np.sqrt(np.maximum(squares, (0.5 * width) ** 2))
+    return [Box(size, orientation=np.asarray(from_matrix(axes)))]

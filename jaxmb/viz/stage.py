@@ -1,0 +1,182 @@
+"""A recorded scene of viser: nodes that move, written as one page that needs no server and no network."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .meshes import Triangles
+
+if TYPE_CHECKING:
+    from viser import SceneApi, ViserServer
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A part of the scene that is added once and then changes.
+
+    **Fields:** `add(scene, **first)`: adds it with its properties at the first time and returns viser's handle;
+    `varying`: properties by name, a sequence over the times of its motion.
+    """
+
+    add: Callable[..., Any]
+    varying: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def viser() -> Any:
+    """The package viser, imported when a picture is made.
+
+    **Raises:** `ImportError` naming the extra to install if it is not there.
+    """
+    try:
+        import viser
+        import viser.transforms
+    except ImportError as error:
+        raise ImportError('Moving pictures need viser; install it with: pip install "jaxmb[view]"') from error
+    return viser
+
+
+def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[Node]]], camera: "Camera") -> str:
+    """A page that plays some nodes, each with the times [s] of its motion, from 0 on."""
+    with _server() as server:
+        scene = server.scene
+        scene.set_up_direction(camera.up)
+        camera.place(server.initial_camera)
+        scene.configure_default_lights(True, cast_shadow=camera.shadows)
+        handles = [
+            (times, node, node.add(scene, **{name: values[0] for name, values in node.varying.items()}))
+            for times, own in nodes
+            for node in own
+        ]
+        recording = server.get_scene_serializer()
+        now = 0.0
+        for time in np.unique(np.concatenate([times for times, _ in nodes])):
+            recording.insert_sleep(float(time) - now)
+            now = float(time)
+            for times, node, handle in handles:
+                k = int(np.searchsorted(times, time))
+                if 0 < k < len(times) and times[k] == time:
+                    _update(handle, node.varying, k)
+        # The last state is seen for as long as any other.
+        recording.insert_sleep(now / 100)
+        return recording.as_html()
+
+
+def _update(handle, varying, k):
+    for name, values in varying.items():
+        if not np.array_equal(values[k], values[k - 1]):
+            setattr(handle, name, values[k])
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Where a picture is seen from: vectors in the world [m], the vertical field of view [rad]."""
+
+    position: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+    field_of_view: float
+    shadows: bool
+
+    @property
+    def bottom(self) -> np.ndarray:
+        """A point near the bottom of the picture."""
+        line = self.target - self.position
+        right = np.cross(line, self.up)
+        upwards = np.cross(right, line)
+        height = np.linalg.norm(line) * np.tan(self.field_of_view / 2)
+        return self.target - 0.93 * height * upwards / np.linalg.norm(upwards)
+
+    def place(self, camera: Any) -> None:
+        """Give these numbers to viser's initial camera."""
+        distance = float(np.linalg.norm(self.position - self.target))
+        camera.position, camera.look_at, camera.up = self.position, self.target, self.up
+        camera.fov, camera.near, camera.far = self.field_of_view, 0.01 * distance, 100.0 * distance
+
+
+@contextmanager
+def _server() -> "Iterator[ViserServer]":
+    """A server that records a scene; it listens on this machine only, and nobody connects to it."""
+    # The server announces its address, which is of no use here.
+    import rich
+
+    console = rich.get_console()
+    quiet, console.quiet = console.quiet, True
+    try:
+        server = viser().ViserServer(host="127.0.0.1", verbose=False)
+        try:
+            yield server
+        finally:
+            server.stop()
+    finally:
+        console.quiet = quiet
+
+
+# Kinds of nodes
+
+
+def instances(
+    name: str,
+    mesh: Triangles,
+    positions: Float[np.ndarray, "times n 3"],
+    orientations: Float[np.ndarray, "times n 4"],
+    scales: Float[np.ndarray, "times n 3"],
+    colors: np.ndarray,
+    grain: float,
+) -> Node:
+    """Copies of one mesh; `grain` [m]: the length below which their motion is not seen."""
+
+    def add(scene: "SceneApi", batched_positions, batched_wxyzs, batched_scales):
+        return scene.add_batched_meshes_simple(
+            name,
+            mesh.vertices.astype(np.float32),
+            mesh.faces.astype(np.uint32),
+            batched_wxyzs=batched_wxyzs,
+            batched_positions=batched_positions,
+            batched_scales=batched_scales,
+            batched_colors=colors.astype(np.uint8),
+            lod="off",
+            flat_shading=not mesh.smooth,
+            side="double",
+        )
+
+    varying = {
+        "batched_positions": rounded(positions, grain),
+        "batched_wxyzs": rounded(orientations, 1e-4),
+        "batched_scales": rounded(scales, grain),
+    }
+    return Node(add, varying)
+
+
+def lines(name: str, segments: Float[np.ndarray, "times n 2 3"], color, thickness: float, grain: float) -> Node:
+    """Straight segments; `thickness` in pixels."""
+
+    def add(scene: "SceneApi", points):
+        return scene.add_line_segments(name, points, colors=color, thickness=thickness, thickness_units="screen")
+
+    return Node(add, {"points": rounded(segments, grain)})
+
+
+def arrows(name: str, ends: Float[np.ndarray, "times n 2 3"], color, radius: float, grain: float) -> Node:
+    """Arrows between two points each."""
+
+    def add(scene: "SceneApi", points):
+        return scene.add_arrows(
+            name, points, colors=color, shaft_radius=radius, head_radius=2.6 * radius, head_length=6.5 * radius
+        )
+
+    return Node(add, {"points": rounded(ends, grain)})
+
+
+def label(name: str, texts: Sequence[str], position: np.ndarray, anchor: Any = "bottom-center") -> Node:
+    """A line of text that may change."""
+    return Node(lambda scene, text: scene.add_label(name, text, position=position, anchor=anchor), {"text": texts})
+
+
+def rounded(values: np.ndarray, grain: float) -> np.ndarray:
+    """Single precision, to the power of two below `grain`: such numbers take less room when they are compressed."""
+    unit = 2.0 ** np.floor(np.log2(grain))
+    return (np.round(np.asarray(values) / unit) * unit).astype(np.float32)
