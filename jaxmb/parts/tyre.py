@@ -15,6 +15,7 @@ from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
 from .boundary import check_returns
 from .contact import AbstractNormalLaw
+from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .space import AbstractSpace, Point, Pose
 from .terrain import AbstractTerrain, distance, outward
@@ -52,6 +53,10 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     deflection: fields.Number = fields.internal_state(shape=None, unit="m")
+
+    @abc.abstractmethod
+    def axle(self, space: AbstractSpace) -> Float[Array, "3"]:
+        """The direction of the axle, fixed in the body, for pictures; in the plane it points to the viewer."""
 
     @abc.abstractmethod
     def lowest(self, space: AbstractSpace, pose: Pose, normal_W: Point) -> Point:
@@ -94,6 +99,10 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
 
     def state_sizes(self):
         return {"deflection": 0.1 * jnp.max(self.relaxation_length)}
+
+    def shapes(self, space, size):
+        tyre = wheel(self.radius, axis=self.axle(space), position=space.in_space(self.centre))
+        return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
 
     def _depth(self, space, pose):
         centre = space.point(pose, self.centre)

@@ -1,6 +1,7 @@
 """A tyre on a wheel that rolls in the plane."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..base import AbstractPlanarPart
 from ..tyre import AbstractTyre
@@ -16,6 +17,9 @@ class Tyre(AbstractPlanarPart, AbstractTyre):
 
     **Arguments:** see `AbstractTyre`.
     """
+
+    def axle(self, space):
+        return np.array([0.0, 0.0, 1.0])
 
     def lowest(self, space, pose, normal_W):
         return -self.radius * normal_W

@@ -23,6 +23,9 @@ class Tyre(AbstractSpatialPart, AbstractTyre):
 
     axis: fields.Number = fields.axis(body=0, default=(0.0, 1.0, 0.0))
 
+    def axle(self, space):
+        return self.axis
+
     def lowest(self, space, pose, normal_W):
         axle = space.direction(pose, self.axis)
         up = cross(axle, cross(normal_W, axle))
