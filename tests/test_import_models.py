@@ -2,6 +2,7 @@
 
 import importlib.metadata
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,7 +95,9 @@ def cassie(*parts, joints=()):
     """The robot with its motors held by springs, and with balls at the ends of its soles."""
     model = importers.sdf(path_of(*CASSIE), ignore="collisions")
     motors = [f"{side}-{joint}-op" for side in ("left", "right") for joint in ("roll", "yaw", "pitch", "knee", "foot")]
-    held = [mb.JointSpring(f"{own} hold", f"{own}.angle", stiffness=400.0, damping=10.0) for own in motors]
+    # Feet have little inertia, and would be stiff on springs as strong as the others.
+    gains = lambda own: {"stiffness": 20.0, "damping": 0.2} if "foot" in own else {"stiffness": 400.0, "damping": 10.0}
+    held = [mb.JointSpring(f"{own} hold", f"{own}.angle", **gains(own)) for own in motors]
     scene = model.scene
     scene = mb.Scene(
         scene.bodies, joints=[*scene.joints, *joints], forces=[*scene.forces, *held, *parts], frames=scene.frames
@@ -103,7 +106,7 @@ def cassie(*parts, joints=()):
 
 
 def soles(model, system, state):
-    """Contacts at the ends of the feet with a floor that is 5 mm below them."""
+    """Contacts at the ends of the feet with a floor that is 2 mm below them."""
     motions = dict(zip(system.body_names, np.asarray(system.poses(state.q)), strict=True))
     centres = {body.name: np.asarray(body.centre) for body in model.scene.bodies}
     balls, lowest = [], np.inf
@@ -116,34 +119,46 @@ def soles(model, system, state):
                 lowest = min(lowest, (pose[:3] + matrix(pose[3:]) @ (at - centres[shape.body]))[2] - radius)
                 balls.append((shape.body, at, radius))
     law = {"normal": contact.Linear(4e4), "damping": 400.0, "friction": contact.Coulomb(0.8, transition_speed=0.05)}
-    floor = terrain.Flat(level=lowest - 0.005)
+    floor = terrain.Flat(level=lowest - 0.002)
     return [
         spatial.Contact(f"sole {k}", body, centres=at, radius=radius, terrain=floor, **law)
         for k, (body, at, radius) in enumerate(balls)
     ]
 
 
-def test_cassie_hangs_is_released_and_lands_on_its_springs():
+@pytest.fixture(scope="module")
+def landing():
+    """Cassie with its feet above a floor, and its equilibrium while its pelvis was held."""
     hold = spatial.Fixed("hold", "ground", "pelvis", point=(0.0, 0.0, 1.01))
     model, hanging = cassie(joints=[hold])
     assert {item.name for item in hanging.implied} == {"left-foot-op", "right-foot-op"}
     start = mb.equilibrium(hanging)
     _, system = cassie(*soles(model, hanging, start))
+    return system, start
+
+
+def test_cassie_hangs_is_released_and_lands_on_its_springs(landing):
+    system, start = landing
     assert system.nu - system.velocity_rank == 18
-    ts = np.linspace(0.0, 0.1, 11)
-    motion = mb.simulate(system, start, t1=0.1, rtol=1e-8, saveat=ts)
+    motion = mb.simulate(system, start, t1=0.05, rtol=1e-8, saveat=np.linspace(0.0, 0.05, 7))
     height = motion["pelvis"].position[:, 2]
-    np.testing.assert_allclose(height[1], height[0] - 9.81 * 0.01**2 / 2, rtol=0, atol=1e-3)
+    assert height[-1] < height[0] - 5e-3
     assert np.max(motion.constraint_violation) < 1e-12
     # The heel springs yield where the feet have touched the floor.
     spring = motion["left-tarsus-spring-joint"].angle
-    assert np.max(np.abs(spring - spring[0])) > 1e-3
+    assert spring[-1] - spring[0] > 5e-3
 
-    def angle(stiffness, rtol=1e-9):
-        changed = mb.with_parameters(system, {"left-tarsus-spring-joint spring.stiffness": stiffness})
-        return mb.simulate(changed, start, t1=0.06, rtol=rtol)["left-tarsus-spring-joint"].angle[-1]
 
-    _, slope = jax.jit(lambda k: jax.jvp(angle, (k,), (jnp.ones(()),)))(jnp.asarray(1250.0))
-    value = jax.jit(lambda k: angle(k, 1e-11))
-    difference = (value(jnp.asarray(1255.0)) - value(jnp.asarray(1245.0))) / 10.0
+def test_the_motion_of_cassie_by_the_rate_of_a_spring(landing):
+    system, start = landing
+    name = "left-tarsus-spring-joint"
+
+    def angle(stiffness, rtol, adjoint=None):
+        changed = mb.with_parameters(system, {f"{name} spring.stiffness": stiffness})
+        ts = np.linspace(0.0, 0.01, 7)
+        return mb.simulate(changed, start, t1=0.01, rtol=rtol, saveat=ts, adjoint=adjoint)[name].angle[-1]
+
+    forward = lambda k: angle(k, 1e-9, diffrax.ForwardMode())
+    _, slope = jax.jvp(forward, (jnp.asarray(1250.0),), (jnp.ones(()),))
+    difference = (angle(jnp.asarray(1260.0), 1e-11) - angle(jnp.asarray(1240.0), 1e-11)) / 20.0
     assert slope == pytest.approx(float(difference), rel=1e-4)

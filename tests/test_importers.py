@@ -122,9 +122,15 @@ def small_tree():
     return file(bodies, more, '<option gravity="0 1 -9"/>')
 
 
+@pytest.mark.long
 def test_a_small_tree_moves_as_in_mujoco():
     """Hinge, slide and free joints, springs, dampers, armature, reference values, tendons and actuators."""
     check_dynamics(importers.mjcf(small_tree()))
+
+
+def test_a_pendulum_with_armature_moves_as_in_mujoco():
+    joint = '<joint name="hip" axis="0 1 1" armature=".02" stiffness="2" springref="10"/>'
+    check_dynamics(importers.mjcf(file(rod("arm", joint))), 3)
 
 
 @pytest.mark.long

@@ -23,7 +23,7 @@ from .notes import Notes
 
 # The time in which a compliant stop stops a joint [s], if the file gives none: MuJoCo's default.
 STOP_TIME = 0.02
-# The share of a joint's range over which a stop sets in, and the share of its rate scale over which friction does.
+# The share of a joint's range over which a stop sets in.
 _ROUNDING = 1e-3
 
 
@@ -106,11 +106,9 @@ class _Builder:
         found = chains.joint_of(joints, a, b, name)
         if found is None:
             kinds = ", ".join(f"{joint.kind} {joint.name!r}" for joint in joints)
-            self.notes.refuse(
-                "joints",
-                joints[0].name,
+            self.notes.refused.append(
                 f"{joints[0].where}{b.name!r} has several joints in succession, {kinds}, that make no universal, "
-                "gimbal, cylindrical or planar joint: put a link with mass between them",
+                "gimbal, cylindrical or planar joint: put a link with mass between them."
             )
             return
         if len(joints) > 1 and found.parts:
@@ -197,7 +195,7 @@ class _Builder:
         if turns and upper - lower >= 2 * np.pi:
             self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
             return
-        own = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
+        own: dict[str, Any] = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
         self.forces.append(
             JointStop(
                 self._named(f"{name} stop"),
@@ -249,7 +247,7 @@ class _Builder:
                 continue
             other, other_offset = self._coordinate(coupling.other, "couplings", coupling.name)
             if other is not None:
-                own = {"zero": zero, "other_zero": coupling.other_zero - other_offset}
+                own: dict[str, Any] = {"zero": zero, "other_zero": coupling.other_zero - other_offset}
                 powers = np.trim_zeros(coupling.coefficients, "b")
                 own["coefficients"] = powers if powers.size else np.zeros(1)
                 self.joints.append(JointCoupling(self._named(coupling.name, "coupling"), name, other, **own))
@@ -282,7 +280,11 @@ class _Builder:
 
     def _of_tendon(self, tendon, coordinate, offset):
         if tendon.stiffness or tendon.damping:
-            own = {"stiffness": tendon.stiffness, "damping": tendon.damping, "free": tendon.free - offset}
+            own: dict[str, Any] = {
+                "stiffness": tendon.stiffness,
+                "damping": tendon.damping,
+                "free": tendon.free - offset,
+            }
             self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
             self._friction(tendon.name, coordinate, tendon.friction)

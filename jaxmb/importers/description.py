@@ -145,7 +145,7 @@ class Shape:
     orientation: Any
     size: tuple[float, ...] = ()
     file: str = ""
-    colour: tuple[float, float, float, float] = (0.5, 0.5, 0.5, 1.0)
+    colour: tuple[float, ...] = (0.5, 0.5, 0.5, 1.0)
     collides: bool = False
 
 

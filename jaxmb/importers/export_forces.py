@@ -72,7 +72,7 @@ class _Writer:
         tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
         if tendon is None and (joint is None or joint.type == "ball"):
             return False
-        element = tendon if joint is None else self.tree.elements[joint.name]
+        element: Any = tendon if joint is None else self.tree.elements[joint.name]
         stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))
         total = before + stiffness
@@ -113,7 +113,7 @@ class _Writer:
         if joint is None and coordinate not in self.tendons:
             return False
         target = {"tendon": coordinate.split(".")[0]} if joint is None else {"joint": joint.name}
-        element = ElementTree.SubElement(self.sections["actuator"], "general", name=part.name, **target)
+        element = ElementTree.SubElement(self.sections["actuator"], "general", attrib=target | {"name": part.name})
         element.set("gear", numbers(own.gear))
         element.set("gaintype", "affine")
         element.set("gainprm", numbers(own.gain))

@@ -36,7 +36,8 @@ class Part:
 
     def point(self, k: int) -> np.ndarray:
         """The part's point on its k-th body, in the world [m]."""
-        return np.asarray(SPACE.point(self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])))
+        pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
+        return pose[:3] + matrix(pose[3:7]) @ point
 
     def direction(self, field: str, k: int = 0) -> np.ndarray:
         """A direction of the part that is fixed in its k-th body, in the world."""
@@ -69,14 +70,14 @@ class Node:
 
 @dataclasses.dataclass
 class Loop:
-    """Equality constraints, tags with attributes."""
+    """Equality constraints: tags, each with its attributes."""
 
     name: str
-    equalities: list[tuple[str, dict[str, str]]]
+    equalities: Any
 
     def write(self, section: Any) -> None:
         for tag, attributes in self.equalities:
-            ElementTree.SubElement(section, tag, **attributes)
+            ElementTree.SubElement(section, tag, attrib=attributes)
 
 
 @dataclasses.dataclass

@@ -21,7 +21,7 @@ from .description import (
     matrix,
 )
 from .mjcf_actuators import read_actuators
-from .mjcf_file import compiled
+from .mjcf_file import compiled, load_mujoco
 from .mjcf_refusals import refuse_unknown
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
@@ -44,8 +44,8 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     "jaxmb[import]"`.
     """
     notes = Notes(checked_ignore(ignore))
-    model, file = compiled(source, notes)
-    import mujoco
+    mujoco = load_mujoco()
+    model, file = compiled(mujoco, source, notes)
 
     refuse_unknown(mujoco, model, notes)
     data = mujoco.MjData(model)
@@ -168,7 +168,8 @@ def _read_equalities(mujoco, model, names, machine, notes):
         if kind == kinds.mjEQ_JOINT:
             other = names.joint(two) if two >= 0 else None
             zeros = [float(model.qpos0[model.jnt_qposadr[j]]) if j >= 0 else 0.0 for j in (one, two)]
-            machine.couplings.append(Coupling(name, names.joint(one), other, data[:5], *zeros))
+            own = Coupling(name, names.joint(one), other, data[:5], zero=zeros[0], other_zero=zeros[1])
+            machine.couplings.append(own)
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
             machine.loops.append(_loop(mujoco, model, names, name, k, data))
         else:
@@ -183,7 +184,7 @@ def _loop(mujoco, model, names, name, k, data):
         a, b = (names("body", model.site_bodyid[site]) for site in (one, two))
         turns = [matrix(model.site_quat[site]) for site in (one, two)]
         points = [np.array(model.site_pos[site]) for site in (one, two)]
-        return Loop(name, a, b, *points, turns[0] @ turns[1].T if weld else None)
+        return Loop(name, a, b, points[0], points[1], turns[0] @ turns[1].T if weld else None)
     a, b = names("body", one), names("body", two)
     if weld:
         return Loop(name, a, b, data[3:6], data[0:3], matrix(data[6:10]))

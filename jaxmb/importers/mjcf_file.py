@@ -9,14 +9,13 @@ from .notes import Notes
 from .source import file_name, is_text
 
 
-def compiled(source: Any, notes: Notes) -> tuple[Any, str]:
+def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
     """MuJoCo's model of a path, a text or an `MjSpec`, and what messages call it.
 
     Materials and textures, and meshes that are missing, are left out, and `notes` say so.
 
     **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that an inertia comes from.
     """
-    mujoco = _mujoco()
     file = file_name(source)
     is_path = isinstance(source, os.PathLike | str) and not is_text(source)
     if is_path and not Path(source).is_file():
@@ -41,7 +40,11 @@ def _specification(mujoco, source):
     return mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
 
 
-def _mujoco():
+def load_mujoco() -> Any:
+    """MuJoCo.
+
+    **Raises:** `ImportError` where it is not installed.
+    """
     try:
         import mujoco
     except ImportError as error:

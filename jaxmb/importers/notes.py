@@ -13,7 +13,7 @@ LEAVABLE = (
     "couplings",
     "damping",
     "friction",
-    "joints",
+    "gearboxes",
     "limits",
     "loops",
     "meshes",
@@ -46,7 +46,7 @@ class Notes:
             if word and word in self.ignore:
                 self.used.add(word)
                 sentence = f"Left out, as ignore={word!r} asks: {kind}"
-                self.say(f"{sentence} of {{}}." if name else f"{sentence}.", *[name][: bool(name)])
+                self.say(f"{sentence} ({{}})." if name else f"{sentence}.", *[name][: bool(name)])
                 return True
         return False
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from .build import build
-from .description import GROUND, Joint, Link, Machine, Shape, roll_pitch_yaw
+from .description import GROUND, Joint, Kind, Link, Machine, Shape, roll_pitch_yaw
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
 from .source import file_name, text_of
 from .xml_tree import Element, parse
 
-_KINDS = {
+_KINDS: dict[str, Kind] = {
     "revolute": "hinge",
     "continuous": "hinge",
     "prismatic": "slide",
@@ -172,7 +172,7 @@ def _read_joint(element, machine, notes):
         if kind in ("gearbox", "screw", "revolute2"):
             for child in element.children:
                 child.read = True
-            notes.refuse("joints", name, f"{element.where}joint {name!r} is of type {kind!r}")
+            notes.refuse("gearboxes", name, f"{element.where}joint {name!r} is of type {kind!r}")
             return
         raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
     ends = []
@@ -194,7 +194,7 @@ def _read_joint(element, machine, notes):
         second = Joint(f"{name} 2", "hinge", between, ends[1], point, where=element.where)
         pairs = list(zip((first, second), axes, strict=True))
     else:
-        joint = Joint(name, _KINDS[kind], *ends, point, where=element.where)
+        joint = Joint(name, _KINDS[kind], ends[0], ends[1], point, where=element.where)
         pairs = [(joint, axes[0] if axes else None)]
     for joint, axis in pairs:
         if axis is not None:

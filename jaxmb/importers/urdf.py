@@ -8,13 +8,19 @@ from typing import Any, Literal
 import numpy as np
 
 from .build import build
-from .description import GROUND, Coupling, Joint, Link, Machine, Shape, roll_pitch_yaw
+from .description import GROUND, Coupling, Joint, Kind, Link, Machine, Shape, roll_pitch_yaw
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
 from .source import file_name, text_of
 from .xml_tree import Element, parse
 
-_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fixed": "fixed", "floating": "free"}
+_KINDS: dict[str, Kind] = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "fixed": "fixed",
+    "floating": "free",
+}
 # Elements that do not act on the motion.
 _EFFECTLESS = {"material", "transmission", "verbose", "name"}
 
@@ -137,7 +143,7 @@ def _read_joint(element, machine):
     length = np.linalg.norm(direction)
     if length == 0 and kind not in ("fixed", "floating"):
         raise ValueError(f"{element.where}the axis of joint {name!r} is zero.")
-    joint = Joint(name, _KINDS.get(kind, "hinge"), *ends, where=element.where)
+    joint = Joint(name, _KINDS.get(kind, "hinge"), ends[0], ends[1], where=element.where)
     joint.axis = direction / length if length else direction
     dynamics, limit = element.first("dynamics"), element.first("limit")
     if dynamics is not None:
