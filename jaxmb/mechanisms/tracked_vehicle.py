@@ -12,8 +12,10 @@ from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
+from ..states.assembly import assemble
 from ..states.equilibrium import equilibrium
 from ..system import parameters, with_parameters
+from ._shoe_track import Shoes, circulation, shoe_track
 from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
@@ -27,6 +29,7 @@ def tracked_vehicle(
     *,
     n_wheels: int = 5,
     units: Literal[1, 2] = 1,
+    track: Literal["loop", "shoes"] | Shoes = "loop",
     speed: float = 5.0,
     torque: float = 3000.0,
     terrain: AbstractTerrain | None = None,
@@ -86,6 +89,7 @@ def tracked_vehicle(
         raise ValueError(f"tracked_vehicle needs n_wheels ≥ 1, got {n_wheels}.")
     if units not in (1, 2):
         raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
+    shoes = Shoes() if track == "shoes" else None if track == "loop" else track
     if pivots is None:
         pivots = _PIVOTS if n_wheels == 5 else np.linspace(_PIVOTS[0], _PIVOTS[-1], n_wheels)
     pivots = np.asarray(pivots, float)
@@ -99,7 +103,7 @@ def tracked_vehicle(
     wheels = range(1, n_wheels + 1)
 
     bodies, joints, forces = [], [], []
-    place = np.array([0.0, radius + drop - pivots[0, 1]])
+    place = np.array([0.0, radius + drop - pivots[0, 1] + (0.0 if shoes is None else shoes.height)])
     for p in PREFIXES[:units]:
         hull = f"{p}hull"
         bodies.append(planar.Body(hull, mass=hull_mass, inertia=hull_inertia, position=place))
@@ -120,9 +124,27 @@ def tracked_vehicle(
                 planar.TorsionalSpringDamper(f"{p}bar{k}", *pair, **bar),
                 planar.BumpStop(f"{p}stop{k}", *pair, **stop),
             ]
-        path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
-        forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
-        driven = (hull, *(f"{p}wheel{k}" for k in wheels))
+        if shoes is None:
+            path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
+            forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
+            driven = (hull, *(f"{p}wheel{k}" for k in wheels))
+        else:
+            own, pins, laws = shoe_track(
+                shoes,
+                p,
+                place=place,
+                sprocket=np.asarray(sprocket, float),
+                idler=np.asarray(idler, float),
+                wheels=place + pivots + reach,
+                radius=radius,
+                stiffness=track_stiffness,
+                pretension=pretension,
+                friction=friction,
+                speed=transition_speed,
+                damping=ground_damping,
+            )
+            bodies, joints, forces = [*bodies, *own], [*joints, *pins], [*forces, *laws]
+            driven = (hull, f"{p}sprocket")
         forces.append(Force(f"{p}drive", driven, _drive, parameters={"torque": torque}))
         place = place + np.asarray(hitch_rear) - np.asarray(hitch_front)
     if units == 2:
@@ -130,24 +152,28 @@ def tracked_vehicle(
         joints.append(planar.Revolute("hitch", *pair, point_a=hitch_rear, point_b=hitch_front))
         bend = {"stiffness": hitch_stiffness, "damping": hitch_damping, "free_angle": 0.0}
         forces.append(planar.TorsionalSpringDamper("hitch_spring", *pair, **bend))
-    road = WheelContact(
-        "road",
-        [body.name for body in bodies if "wheel" in body.name],
-        terrain=Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
-        normal=contact.Linear(ground_stiffness),
-        friction=contact.Coulomb(friction, transition_speed=transition_speed),
-        radius=radius,
-        damping=ground_damping,
-    )
+    ground = {
+        "terrain": Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
+        "friction": contact.Coulomb(friction, transition_speed=transition_speed),
+    }
+    if shoes is None:
+        tyres = [body.name for body in bodies if "wheel" in body.name]
+        soil = {"normal": contact.Linear(ground_stiffness), "damping": ground_damping}
+        forces.append(WheelContact("road", tyres, radius=radius, **soil, **ground))
+    else:
+        soles = [body.name for body in bodies if "shoe" in body.name]
+        soil = {"normal": contact.Linear(ground_stiffness / 2), "damping": shoes.ground_damping / 2}
+        for name, x in (("road", shoes.pitch / 4), ("road_behind", -shoes.pitch / 4)):
+            forces.append(planar.Contact(name, soles, centres=(x, -shoes.height / 2), **soil, **ground))
     return build(
         "tracked_vehicle",
-        Scene(bodies, joints=joints, forces=[*forces, road, Gravity((0.0, -gravity))]),
+        Scene(bodies, joints=joints, forces=[*forces, Gravity((0.0, -gravity))]),
         t1=1.5,
         observe=_observe,
         description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
         references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
-        start=lambda system, guess: _rolling(system, guess, speed),
+        start=lambda system, guess: _rolling(system, guess, speed, shoes),
     )
 
 
@@ -157,7 +183,7 @@ def _drive(poses, velocities, t, p):
     return jnp.zeros((n + 1, 3), poses.dtype).at[:, 2].set(moments)
 
 
-def _rolling(system, guess, speed):
+def _rolling(system, guess, speed, shoes):
     """In static equilibrium without drive, moving forward with wheels that roll."""
     drives = [name for name in parameters(system) if name.endswith("drive.torque")]
     still = with_parameters(system, dict.fromkeys(drives, 0.0))
