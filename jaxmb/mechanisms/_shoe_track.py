@@ -6,12 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
+from .._types import State
+from ..linalg.rotations import norm
 from ..parts import contact
+from ..simulate import simulate
+from ..states.assembly import assemble
+from ..system import parameters, with_parameters
+from .ride import PREFIXES
 
 # Distance [m] of the tensioner's fixed end before the idler in its design position.
 _TENSIONER = 0.5
 # How far [m] the idler may stand from its design position to fit a number of shoes.
 _REACH = 0.2
+# How long [s] a vehicle comes to rest before it starts, and the number of steps that this may take.
+_SETTLING, _STEPS = 1.0, 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Shoes:
     rim_stiffness: float = 3e6
     sprocket_friction: float = 2.0
     ground_damping: float = 2e3
-    pin_damping: float = 10.0
+    pin_damping: float = 2.0
     tensioner_damping: float = 1e4
 
 
@@ -113,22 +121,52 @@ def shoe_track(
     return bodies, joints, forces
 
 
-def circulation(shoes, q, u, speed):
-    """Velocities [m/s, rad/s] of the shoes of a track, from their poses, in which it runs through its own shape at a
-    `speed`, backwards along the ground, on top of velocities u; both of shape (shoes, 3).
+def running(system, guess, speed):
+    """The state in which a vehicle on tracks of shoes has come to rest, nearly, and then moves forward, with wheels
+    that roll and shoes that lie on the ground.
+
+    Without drive, shoes hang down and vehicle and tracks lose their motion in a second. Dry friction is regularised,
+    so that they go on to creep: of equilibria in which friction holds the shoes there are many.
     """
-    along = jnp.stack([jnp.cos(q[:, 2]), jnp.sin(q[:, 2])], axis=1)
+    names, known = system.body_names, parameters(system)
+    q = simulate(undriven(system), guess, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
+    discs = {name: known[f"{name}_rim.radius"] for name in names if f"{name}_rim.radius" in known}
+    radii = jnp.stack([discs.get(name, jnp.ones(())) for name in names])
+    turn = jnp.where(np.array([name in discs for name in names]), -speed / radii, 0.0)
+    u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
+    for p in PREFIXES:
+        own = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
+        if own.size:
+            u = u.at[own].add(_circulation(q.reshape(-1, 3)[own], speed))
+    return assemble(system, State(q, u.reshape(-1)))
+
+
+def undriven(system):
+    """A vehicle without torque of its drives."""
+    drives = [name for name in parameters(system) if name.endswith("drive.torque")]
+    return with_parameters(system, dict.fromkeys(drives, 0.0))
+
+
+def _circulation(poses, speed):
+    """Velocities of a track's shoes that run through its own shape at a speed [m/s], backwards along the ground, from
+    their poses; both of shape (shoes, 3).
+    """
+    turn = lambda v: jnp.stack([-v[:, 1], v[:, 0]], axis=1)
+    along = jnp.stack([jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])], axis=1)
     at_pin = along + jnp.roll(along, -1, axis=0)
-    at_pin = -speed * at_pin / jnp.sqrt(jnp.sum(at_pin**2, axis=1, keepdims=True))
+    at_pin *= -speed / norm(at_pin)[:, None]
     before = jnp.roll(at_pin, 1, axis=0)
-    turn = along[:, 0] * (at_pin - before)[:, 1] - along[:, 1] * (at_pin - before)[:, 0]
-    return u + jnp.concatenate([0.5 * (at_pin + before), turn[:, None] / shoes.pitch], axis=1)
+    # The shoe's pins are as far apart as its neighbours' middles.
+    pitch = norm(poses[1, :2] - poses[0, :2])
+    rate = jnp.sum(turn(along) * (at_pin - before), axis=1) / pitch
+    return jnp.concatenate([0.5 * (at_pin + before), rate[:, None]], axis=1)
 
 
 def _laid(shoes, sprocket, idler, wheels, radius):
     """How far the idler stands behind its design position, and the pins of the taut loop, counter-clockwise."""
-    half = shoes.height / 2
-    radii = np.array([shoes.sprocket_radius, shoes.idler_radius, *[radius] * len(wheels)]) + half
+    radii = np.array([shoes.sprocket_radius, shoes.idler_radius, *[radius] * len(wheels)]) + shoes.height / 2
+    # Around sprocket and idler shoes touch with their middle, and pins stand farther out.
+    radii[:2] = np.hypot(radii[:2], shoes.pitch / 2)
 
     def loop(offset):
         return _Loop(np.array([sprocket, idler - np.array([offset, 0.0]), *wheels]), radii)

@@ -12,10 +12,9 @@ from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
-from ..states.assembly import assemble
 from ..states.equilibrium import equilibrium
-from ..system import parameters, with_parameters
-from ._shoe_track import Shoes, circulation, shoe_track
+from ..system import parameters
+from ._shoe_track import Shoes, running, shoe_track, undriven
 from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
@@ -173,7 +172,7 @@ def tracked_vehicle(
         description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
         references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
-        start=lambda system, guess: _rolling(system, guess, speed, shoes),
+        start=lambda system, guess: (_rolling if shoes is None else running)(system, guess, speed),
     )
 
 
@@ -183,11 +182,9 @@ def _drive(poses, velocities, t, p):
     return jnp.zeros((n + 1, 3), poses.dtype).at[:, 2].set(moments)
 
 
-def _rolling(system, guess, speed, shoes):
+def _rolling(system, guess, speed):
     """In static equilibrium without drive, moving forward with wheels that roll."""
-    drives = [name for name in parameters(system) if name.endswith("drive.torque")]
-    still = with_parameters(system, dict.fromkeys(drives, 0.0))
-    rest = equilibrium(still, guess, fix={"hull.x": 0.0})
+    rest = equilibrium(undriven(system), guess, fix={"hull.x": 0.0})
     wheels = np.array(["wheel" in name for name in system.body_names])
     turn = jnp.where(wheels, -speed / parameters(system)["road.radius"], 0.0)
     u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
