@@ -50,13 +50,6 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     def share(self, place: Vector, *surface: Array) -> Number:
         """Fraction of the force, from 0 to 1, where the disc's centre is at a point of the other body's frame."""
 
-    def complete(self, space, poses):
-        if len(self.bodies) < 2:
-            raise ValueError(
-                f"{self.label}: bodies must name the disc's body and then at least one other, got {len(self.bodies)}."
-            )
-        return self
-
     def wrenches(self, space, poses, velocities, t):
         centre = space.point(poses[0], self.centre)
         travel = space.point_velocity(poses[0], velocities[0], self.centre)
@@ -103,8 +96,13 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return jnp.broadcast_to(value, (len(self.bodies) - 1, *shape))
 
     def _check_rows(self, **shapes):
+        n = len(self.bodies) - 1
+        if n < 1:
+            raise ValueError(
+                f"{self.label}: bodies must name the disc's body and then at least one other, got {n + 1}."
+            )
         for field, shape in shapes.items():
-            given, n = getattr(self, field).shape, len(self.bodies) - 1
+            given = getattr(self, field).shape
             if given not in (shape, (n, *shape)):
                 raise ValueError(f"{self.label}: {field} must have shape {shape} or {(n, *shape)}, got {given}.")
 
@@ -134,16 +132,14 @@ class PlateContact(AbstractBodyContact):
     end: fields.Number = fields.parameter(shape=None, unit="m")
     edge: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
 
-    def __check_init__(self):
-        self._check_rows(start=(2,), end=(2,))
-
     def validate(self):
+        self._check_rows(start=(2,), end=(2,))
         start, end = self.surfaces()
         shortest = float(jnp.min(norm(end - start)))
         if not 0 < 2 * self.edge <= shortest:
             raise ValueError(
-                f"{self.label}: edge must be at most half as long as a plate, got {float(self.edge):g} m and a plate of "
-                f"{shortest:g} m between start and end."
+                f"{self.label}: edge must be at most half as long as a plate, got {float(self.edge):g} m, with "
+                f"{shortest:g} m from start to end."
             )
 
     def surfaces(self):
@@ -182,7 +178,7 @@ class DiscContact(AbstractBodyContact):
     radii: fields.Number = fields.length(shape=None, sign="non-negative")
     centres: fields.Number = fields.parameter(shape=None, unit="m", default=(0.0, 0.0))
 
-    def __check_init__(self):
+    def validate(self):
         self._check_rows(radii=(), centres=(2,))
 
     def surfaces(self):
