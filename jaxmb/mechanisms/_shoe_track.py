@@ -51,6 +51,12 @@ class Shoes:
     pin_damping: float = 2.0
     tensioner_damping: float = 1e4
 
+    def __post_init__(self):
+        # With other numbers no track can be laid; those of bodies and forces are checked there.
+        for name in ("pitch", "height", "sprocket_radius", "idler_radius"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"Shoes: {name} must be positive and finite, got {getattr(self, name)!r}.")
+
 
 def shoe_track(
     shoes, prefix, *, place, sprocket, idler, wheels, radius, stiffness, pretension, friction, speed, damping

@@ -67,19 +67,26 @@ def tracked_vehicle(
     It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
     right pair; x is forward, y up.
 
+    With `track="shoes"` every shoe is a body. Shoes on pins run in a closed loop around a sprocket, which is driven,
+    an idler on a tensioner and the wheels, and touch these and the ground by compliant contact with friction; with n
+    shoes there are n + 6 + 2 n_wheels degrees of freedom. The shoes are laid around the discs without sag, hang down
+    and come nearly to rest by a simulation without drive, and start to run at the vehicle's speed.
+
     Source: the kind of vehicle of R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension
     Reduction in Analysis of Constrained Dynamic Systems", J. Mech. Design 104(1), 1982, with 13 and 24 degrees of
     freedom; dimensions and masses close to those of the M113 model of Project Chrono. The reference values were
     computed in minimal coordinates by a Runge–Kutta method of order 8.
 
-    **Arguments:** `n_wheels` ≥ 1; `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, with
-    its reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²],
-    of the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
+    **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with the numbers of such a track;
+    `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its
+    reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²], of
+    the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
     below its pivot in the design position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull;
     torsion bars [N m/rad, N m s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad]
-    from there [N m/rad³]; track, of the length of the design position [N, N/m]; ground [N/m, N s/m]; `friction` with
-    its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and damping [N m/rad, N m s/rad];
-    `gravity` [m/s²].
+    from there [N m/rad³]; track, of the length of the design position [N, N/m], of shoes by their tensioner; ground
+    under each wheel or shoe [N/m], with its damping [N s/m] under wheels, which with shoes acts between these and the
+    discs in them; `friction` with its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and
+    damping [N m/rad, N m s/rad]; `gravity` [m/s²].
 
     **Labels:** `x`, `y` [m], `phi` [rad] of the hull, `a1`, … [rad] of the arms from their design position, upwards
     negative; of the towed unit `rear_x`, ….
@@ -88,7 +95,12 @@ def tracked_vehicle(
         raise ValueError(f"tracked_vehicle needs n_wheels ≥ 1, got {n_wheels}.")
     if units not in (1, 2):
         raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
-    shoes = Shoes() if track == "shoes" else None if track == "loop" else track
+    shoes = {"loop": None, "shoes": Shoes()}.get(track, track) if isinstance(track, str) else track
+    # A concrete class: what stands for all numbers of a track has no other form.
+    if not (shoes is None or isinstance(shoes, Shoes)) or track is None:
+        raise ValueError(f"tracked_vehicle: track must be 'loop', 'shoes' or Shoes(...), got {track!r}.")
+    if shoes is not None and not track_stiffness > 0:
+        raise ValueError(f"tracked_vehicle(track='shoes') needs a track_stiffness > 0, got {track_stiffness}.")
     if pivots is None:
         pivots = _PIVOTS if n_wheels == 5 else np.linspace(_PIVOTS[0], _PIVOTS[-1], n_wheels)
     pivots = np.asarray(pivots, float)
@@ -164,12 +176,13 @@ def tracked_vehicle(
         soil = {"normal": contact.Linear(ground_stiffness / 2), "damping": shoes.ground_damping / 2}
         for name, x in (("road", shoes.pitch / 4), ("road_behind", -shoes.pitch / 4)):
             forces.append(planar.Contact(name, soles, centres=(x, -shoes.height / 2), **soil, **ground))
+    kind = "an elastic track" if shoes is None else "a track of shoes"
     return build(
         "tracked_vehicle",
         Scene(bodies, joints=joints, forces=[*forces, Gravity((0.0, -gravity))]),
         t1=1.5,
         observe=_observe,
-        description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
+        description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in {kind}, over a bump.",
         references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
         start=lambda system, guess: (_rolling if shoes is None else running)(system, guess, speed),
