@@ -136,15 +136,24 @@ def running(system, guess, speed):
     """
     names, known = system.body_names, parameters(system)
     q = simulate(undriven(system), guess, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
-    discs = {name: known[f"{name}_rim.radius"] for name in names if f"{name}_rim.radius" in known}
+    discs = {name: _rolling_radius(name, known) for name in names if f"{name}_rim.radius" in known}
     radii = jnp.stack([discs.get(name, jnp.ones(())) for name in names])
     turn = jnp.where(np.array([name in discs for name in names]), -speed / radii, 0.0)
     u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
     for p in PREFIXES:
         own = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
         if own.size:
-            u = u.at[own].add(_circulation(q.reshape(-1, 3)[own], speed))
+            pitch = -2 * known[f"{p}idler_rim.start"][0]
+            u = u.at[own].add(_circulation(q.reshape(-1, 3)[own], speed, pitch))
     return assemble(system, State(q, u.reshape(-1)))
+
+
+def _rolling_radius(name, known):
+    """Distance per angle [m/rad] that a disc's track runs: straight under wheels, and around sprocket and idler as a
+    polygon whose sides touch the disc with their middle.
+    """
+    radius, (start, height) = known[f"{name}_rim.radius"], known[f"{name}_rim.start"]
+    return radius if "wheel" in name else -start / jnp.arctan2(-start, radius + height)
 
 
 def undriven(system):
@@ -153,17 +162,15 @@ def undriven(system):
     return with_parameters(system, dict.fromkeys(drives, 0.0))
 
 
-def _circulation(poses, speed):
+def _circulation(poses, speed, pitch):
     """Velocities of a track's shoes that run through its own shape at a speed [m/s], backwards along the ground, from
-    their poses; both of shape (shoes, 3).
+    their poses, both of shape (shoes, 3), and their pitch [m].
     """
     turn = lambda v: jnp.stack([-v[:, 1], v[:, 0]], axis=1)
     along = jnp.stack([jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])], axis=1)
     at_pin = along + jnp.roll(along, -1, axis=0)
     at_pin *= -speed / norm(at_pin)[:, None]
     before = jnp.roll(at_pin, 1, axis=0)
-    # The shoe's pins are as far apart as its neighbours' middles.
-    pitch = norm(poses[1, :2] - poses[0, :2])
     rate = jnp.sum(turn(along) * (at_pin - before), axis=1) / pitch
     return jnp.concatenate([0.5 * (at_pin + before), rate[:, None]], axis=1)
 
