@@ -135,7 +135,9 @@ def running(system, guess, speed):
     so that they go on to creep: of equilibria in which friction holds the shoes there are many.
     """
     names, known = system.body_names, parameters(system)
-    q = simulate(undriven(system), guess, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
+    still = undriven(system)
+    start = assemble(still, State(guess.q, jnp.zeros_like(guess.u)))
+    q = simulate(still, start, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
     discs = {name: _rolling_radius(name, known) for name in names if f"{name}_rim.radius" in known}
     radii = jnp.stack([discs.get(name, jnp.ones(())) for name in names])
     turn = jnp.where(np.array([name in discs for name in names]), -speed / radii, 0.0)
