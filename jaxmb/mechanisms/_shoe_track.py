@@ -1,6 +1,7 @@
 """A track of shoes on pins around a sprocket, road wheels and an idler on a tensioner."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -85,11 +86,11 @@ def shoe_track(
 
     half = (shoes.pitch / 2, 0.0)
     spring = 4 * stiffness
-    joints = [
+    joints: list[Any] = [
         planar.Revolute(f"{p}final_drive", hull, f"{p}sprocket", point_a=sprocket, point_b=(0.0, 0.0)),
         planar.PointOnLine(f"{p}slide", hull, f"{p}idler", point_a=idler, point_b=(0.0, 0.0), axis_a=(1.0, 0.0)),
     ]
-    forces = [
+    forces: list[Any] = [
         # The idler moves by half of what it gives to the loop, against the tension of both strands.
         planar.SpringDamper(
             f"{p}tensioner",

@@ -18,6 +18,8 @@ from ..smooth import ramp, step
 
 Number = Float[Array, ""]
 Vector = Float[Array, "2"]
+# The numbers that describe a surface.
+Surface = tuple[Array, ...]
 
 
 class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
@@ -39,42 +41,42 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
 
     @abc.abstractmethod
-    def surfaces(self) -> tuple[Array, ...]:
+    def surfaces(self) -> Surface:
         """Numbers that describe the surfaces, with a row for each of the other bodies."""
 
     @abc.abstractmethod
-    def distance(self, place: Vector, *surface: Array) -> Number:
+    def distance(self, place: Vector, surface: Surface) -> Number:
         """Distance [m] of a point from the surface, both in the frame of the other body."""
 
     @abc.abstractmethod
-    def share(self, place: Vector, *surface: Array) -> Number:
+    def share(self, place: Vector, surface: Surface) -> Number:
         """Fraction of the force, from 0 to 1, where the disc's centre is at a point of the other body's frame."""
 
     def wrenches(self, space, poses, velocities, t):
         centre = space.point(poses[0], self.centre)
         travel = space.point_velocity(poses[0], velocities[0], self.centre)
         own = lambda *other: self._pair(space, poses[0], velocities[0], centre, travel, *other)
-        on_disc, on_others = jax.vmap(own)(poses[1:], velocities[1:], *self.surfaces())
+        on_disc, on_others = jax.vmap(own)(poses[1:], velocities[1:], self.surfaces())
         return jnp.concatenate([jnp.sum(on_disc, axis=0, keepdims=True), on_others])
 
     def energy(self, space, poses, t):
         centre = space.point(poses[0], self.centre)
-        own = lambda pose, *surface: self._energy(space.body_point(pose, centre), *surface)
-        return jnp.sum(jax.vmap(own)(poses[1:], *self.surfaces()))
+        own = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
+        return jnp.sum(jax.vmap(own)(poses[1:], self.surfaces()))
 
-    def _depth(self, place, *surface):
+    def _depth(self, place, surface):
         """Depth of the disc's deepest point, smoothed."""
-        return ramp(self.radius - self.distance(place, *surface), self.smoothing)
+        return ramp(self.radius - self.distance(place, surface), self.smoothing)
 
-    def _energy(self, place, *surface):
-        return self.share(place, *surface) * self.normal.energy(self._depth(place, *surface))
+    def _energy(self, place, surface):
+        return self.share(place, surface) * self.normal.energy(self._depth(place, surface))
 
-    def _pair(self, space, disc, disc_velocity, centre, travel, pose, velocity, *surface):
+    def _pair(self, space, disc, disc_velocity, centre, travel, pose, velocity, surface):
         """Wrenches on the disc's body and on another one."""
         place = space.body_point(pose, centre)
-        elastic = -space.direction(pose, jax.grad(self._energy)(place, *surface))
-        normal = space.direction(pose, jax.grad(self.distance)(place, *surface))
-        share, depth = self.share(place, *surface), self._depth(place, *surface)
+        elastic = -space.direction(pose, jax.grad(self._energy)(place, surface))
+        normal = space.direction(pose, jax.grad(self.distance)(place, surface))
+        share, depth = self.share(place, surface), self._depth(place, surface)
         engaged = share * step(depth / self.damping_depth)
         relative = travel - space.point_velocity(pose, velocity, place)
         # Normal forces pass through the centre, so that they have the same wrench there as at the deepest point.
@@ -145,12 +147,12 @@ class PlateContact(AbstractBodyContact):
     def surfaces(self):
         return self._rows(self.start, (2,)), self._rows(self.end, (2,))
 
-    def distance(self, place, start, end):
-        (_, across), _ = _along(place, start, end)
+    def distance(self, place, surface):
+        (_, across), _ = _along(place, *surface)
         return jnp.abs(across)
 
-    def share(self, place, start, end):
-        (past, _), length = _along(place, start, end)
+    def share(self, place, surface):
+        (past, _), length = _along(place, *surface)
         fade = lambda inside: step(0.5 * (inside / self.edge + 1.0))
         return fade(past) * fade(length - past)
 
@@ -184,9 +186,10 @@ class DiscContact(AbstractBodyContact):
     def surfaces(self):
         return self._rows(self.radii, ()), self._rows(self.centres, (2,))
 
-    def distance(self, place, radius, centre):
+    def distance(self, place, surface):
+        radius, centre = surface
         return norm(place - centre) - radius
 
-    def share(self, place, radius, centre):
-        del radius, centre
+    def share(self, place, surface):
+        del surface
         return jnp.ones((), place.dtype)
