@@ -99,6 +99,14 @@ def track():
     return Example(planar.Track("Track", path, pretension=3.0, stiffness=20.0), [own], "stiffness", (), (hold_2d(own),))
 
 
+def touching(cls, parameter, **options):
+    """Contact of a disc on a body with something that is fixed in the ground."""
+    own = body_2d(f"{cls.__name__} body", velocity=(0.5, 0.2), angular_velocity=1.0)
+    laws = {name: value for name, value in GROUND_2D.items() if name != "terrain"}
+    part = cls(cls.__name__, (own.name, "ground"), centre=(0.05, 0.02), **laws, **options)
+    return Example(part, [own], parameter, (), (hold_2d(own),))
+
+
 def turn(t, p):
     """From rest and without a push, so that there is an equilibrium at the start."""
     return p["start"] + p["rate"] * t**3
@@ -178,6 +186,9 @@ PLANAR = [
     track(),
     on_body_2d(planar.Contact, "normal.stiffness", **GROUND_2D),
     on_body_2d(planar.Tyre, "slip_stiffness", **TYRE_2D),
+    # The disc moves along the plate's end.
+    touching(planar.PlateContact, "start", start=(0.4, -0.06), end=(2.0, 0.1), edge=0.3),
+    touching(planar.DiscContact, "radii", radii=0.5, centres=(0.5, -0.55)),
 ]
 
 

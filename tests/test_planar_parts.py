@@ -259,6 +259,11 @@ def test_knife_edge():
 
 def springs(damping):
     points = {"point_a": POINT_A, "point_b": POINT_B}
+    laws = {
+        "normal": contact.Linear(30.0),
+        "friction": contact.Coulomb(0.4 * damping, transition_speed=0.5),
+        "damping": 0.5 * damping,
+    }
     return {
         "SpringDamper": planar.SpringDamper(
             "F", "a", "b", stiffness=30.0, damping=2.0 * damping, free_length=0.4, **points
@@ -284,6 +289,12 @@ def springs(damping):
             smoothing=0.3,
             free_length=0.4,
             **points,
+        ),
+        "PlateContact": planar.PlateContact(
+            "F", ("a", "b"), radius=2.0, centre=POINT_A, start=(1.3, -0.4), end=(2.5, 0.3), edge=0.6, **laws
+        ),
+        "DiscContact": planar.DiscContact(
+            "F", ("a", "b"), radius=2.0, centre=POINT_A, radii=0.7, centres=POINT_B, **laws
         ),
     }
 

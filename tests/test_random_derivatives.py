@@ -156,6 +156,8 @@ PLANAR_FORCES = named(
     "DraftGear",
     "Track",
     "Contact",
+    "PlateContact",
+    "DiscContact",
 )
 SPATIAL_FORCES = named(
     "spatial",

@@ -4,6 +4,7 @@ from typing import Any
 
 from ..parts.names import unknown
 from . import ride as ride
+from ._shoe_track import Shoes as Shoes
 from .andrews import andrews as andrews
 from .appell_hamel import appell_hamel as appell_hamel
 from .benenti import benenti as benenti

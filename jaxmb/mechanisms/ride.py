@@ -1,4 +1,4 @@
-"""Ride comfort, suspension travel and wheel loads of a motion of `tracked_vehicle`.
+"""Ride comfort, suspension travel, wheel loads and track tension of a motion of `tracked_vehicle`.
 
 `unit` is 1 for the leading carrier and 2 for the towed one.
 """
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import VectorLike
+from ..linalg.rotations import norm
 from ..system import parameters
 from ..trajectory import Trajectory
 from .observe import point_acceleration
@@ -39,5 +40,23 @@ def arm_travel(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "times 
 
 
 def wheel_loads(trajectory: Trajectory) -> Float[Array, "times wheels"]:
-    """Vertical forces [N] of the ground on the wheels, those of the leading carrier first, damping included."""
+    """Vertical forces [N] of the ground, or of the shoes of a track, on the wheels, those of the leading carrier first,
+    damping included.
+    """
+    rims = [name for name in trajectory.system.force_names() if name.endswith("_rim") and "wheel" in name]
+    if rims:
+        return jnp.stack([trajectory.forces[name][..., 0, 1] for name in rims], axis=-1)
     return trajectory.forces["road"][:, :, 1]
+
+
+def track_tension(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "times pins"]:
+    """Forces [N] in the pins of a track of shoes, counter-clockwise: at the start from the front over the top.
+
+    **Raises:** `ValueError` if the track has no shoes.
+    """
+    own = f"{PREFIXES[unit - 1]}pin"
+    rows = [k for k, (name, _) in enumerate(trajectory.system.rows) if name.startswith(own)]
+    if not rows:
+        raise ValueError('track_tension needs the pins of shoes: tracked_vehicle(track="shoes").')
+    forces = trajectory.multipliers[..., jnp.array(rows)]
+    return norm(forces.reshape(*forces.shape[:-1], -1, 2))

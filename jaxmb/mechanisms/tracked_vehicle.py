@@ -13,7 +13,8 @@ from ..parts.functions import Force
 from ..parts.terrain import AbstractTerrain, Bump
 from ..scene import Scene
 from ..states.equilibrium import equilibrium
-from ..system import parameters, with_parameters
+from ..system import parameters
+from ._shoe_track import Shoes, running, shoe_track, undriven
 from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
@@ -27,6 +28,7 @@ def tracked_vehicle(
     *,
     n_wheels: int = 5,
     units: Literal[1, 2] = 1,
+    track: Literal["loop", "shoes"] | Shoes = "loop",
     speed: float = 5.0,
     torque: float = 3000.0,
     terrain: AbstractTerrain | None = None,
@@ -65,19 +67,26 @@ def tracked_vehicle(
     It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
     right pair; x is forward, y up.
 
+    With `track="shoes"` every shoe is a body. Shoes on pins run in a closed loop around a sprocket, which is driven,
+    an idler on a tensioner and the wheels, and touch these and the ground by compliant contact with friction; with n
+    shoes there are n + 6 + 2 n_wheels degrees of freedom. The shoes are laid around the discs without sag, hang down
+    and come nearly to rest by a simulation without drive, and start to run at the vehicle's speed.
+
     Source: the kind of vehicle of R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension
     Reduction in Analysis of Constrained Dynamic Systems", J. Mech. Design 104(1), 1982, with 13 and 24 degrees of
     freedom; dimensions and masses close to those of the M113 model of Project Chrono. The reference values were
     computed in minimal coordinates by a Runge–Kutta method of order 8.
 
-    **Arguments:** `n_wheels` ≥ 1; `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, with
-    its reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²],
-    of the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
+    **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with the numbers of such a track;
+    `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its
+    reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²], of
+    the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
     below its pivot in the design position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull;
     torsion bars [N m/rad, N m s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad]
-    from there [N m/rad³]; track, of the length of the design position [N, N/m]; ground [N/m, N s/m]; `friction` with
-    its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and damping [N m/rad, N m s/rad];
-    `gravity` [m/s²].
+    from there [N m/rad³]; track, of the length of the design position [N, N/m], of shoes by their tensioner; ground
+    under each wheel or shoe [N/m], with its damping [N s/m] under wheels, which with shoes acts between these and the
+    discs in them; `friction` with its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and
+    damping [N m/rad, N m s/rad]; `gravity` [m/s²].
 
     **Labels:** `x`, `y` [m], `phi` [rad] of the hull, `a1`, … [rad] of the arms from their design position, upwards
     negative; of the towed unit `rear_x`, ….
@@ -86,6 +95,12 @@ def tracked_vehicle(
         raise ValueError(f"tracked_vehicle needs n_wheels ≥ 1, got {n_wheels}.")
     if units not in (1, 2):
         raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
+    shoes = {"loop": None, "shoes": Shoes()}.get(track, track) if isinstance(track, str) else track
+    # A concrete class: what stands for all numbers of a track has no other form.
+    if not (shoes is None or isinstance(shoes, Shoes)) or track is None:
+        raise ValueError(f"tracked_vehicle: track must be 'loop', 'shoes' or Shoes(...), got {track!r}.")
+    if shoes is not None and not track_stiffness > 0:
+        raise ValueError(f"tracked_vehicle(track='shoes') needs a track_stiffness > 0, got {track_stiffness}.")
     if pivots is None:
         pivots = _PIVOTS if n_wheels == 5 else np.linspace(_PIVOTS[0], _PIVOTS[-1], n_wheels)
     pivots = np.asarray(pivots, float)
@@ -99,7 +114,7 @@ def tracked_vehicle(
     wheels = range(1, n_wheels + 1)
 
     bodies, joints, forces = [], [], []
-    place = np.array([0.0, radius + drop - pivots[0, 1]])
+    place = np.array([0.0, radius + drop - pivots[0, 1] + (0.0 if shoes is None else shoes.height)])
     for p in PREFIXES[:units]:
         hull = f"{p}hull"
         bodies.append(planar.Body(hull, mass=hull_mass, inertia=hull_inertia, position=place))
@@ -120,9 +135,27 @@ def tracked_vehicle(
                 planar.TorsionalSpringDamper(f"{p}bar{k}", *pair, **bar),
                 planar.BumpStop(f"{p}stop{k}", *pair, **stop),
             ]
-        path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
-        forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
-        driven = (hull, *(f"{p}wheel{k}" for k in wheels))
+        if shoes is None:
+            path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
+            forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
+            driven = (hull, *(f"{p}wheel{k}" for k in wheels))
+        else:
+            own, pins, laws = shoe_track(
+                shoes,
+                p,
+                place=place,
+                sprocket=np.asarray(sprocket, float),
+                idler=np.asarray(idler, float),
+                wheels=place + pivots + reach,
+                radius=radius,
+                stiffness=track_stiffness,
+                pretension=pretension,
+                friction=friction,
+                speed=transition_speed,
+                damping=ground_damping,
+            )
+            bodies, joints, forces = [*bodies, *own], [*joints, *pins], [*forces, *laws]
+            driven = (hull, f"{p}sprocket")
         forces.append(Force(f"{p}drive", driven, _drive, parameters={"torque": torque}))
         place = place + np.asarray(hitch_rear) - np.asarray(hitch_front)
     if units == 2:
@@ -130,24 +163,29 @@ def tracked_vehicle(
         joints.append(planar.Revolute("hitch", *pair, point_a=hitch_rear, point_b=hitch_front))
         bend = {"stiffness": hitch_stiffness, "damping": hitch_damping, "free_angle": 0.0}
         forces.append(planar.TorsionalSpringDamper("hitch_spring", *pair, **bend))
-    road = WheelContact(
-        "road",
-        [body.name for body in bodies if "wheel" in body.name],
-        terrain=Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
-        normal=contact.Linear(ground_stiffness),
-        friction=contact.Coulomb(friction, transition_speed=transition_speed),
-        radius=radius,
-        damping=ground_damping,
-    )
+    ground = {
+        "terrain": Bump(start=4.0, length=1.5, peak=0.12) if terrain is None else terrain,
+        "friction": contact.Coulomb(friction, transition_speed=transition_speed),
+    }
+    if shoes is None:
+        tyres = [body.name for body in bodies if "wheel" in body.name]
+        soil = {"normal": contact.Linear(ground_stiffness), "damping": ground_damping}
+        forces.append(WheelContact("road", tyres, radius=radius, **soil, **ground))
+    else:
+        soles = [body.name for body in bodies if "shoe" in body.name]
+        soil = {"normal": contact.Linear(ground_stiffness / 2), "damping": shoes.ground_damping / 2}
+        for name, x in (("road", shoes.pitch / 4), ("road_behind", -shoes.pitch / 4)):
+            forces.append(planar.Contact(name, soles, centres=(x, -shoes.height / 2), **soil, **ground))
+    kind = "an elastic track" if shoes is None else "a track of shoes"
     return build(
         "tracked_vehicle",
-        Scene(bodies, joints=joints, forces=[*forces, road, Gravity((0.0, -gravity))]),
+        Scene(bodies, joints=joints, forces=[*forces, Gravity((0.0, -gravity))]),
         t1=1.5,
         observe=_observe,
-        description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in an elastic track, over a bump.",
+        description=f"Tracked vehicle, {units} x {n_wheels} sprung road wheels in {kind}, over a bump.",
         references=References.load(f"tracked_vehicle_{units}"),
         fix={"hull.x": 0.0},
-        start=lambda system, guess: _rolling(system, guess, speed),
+        start=lambda system, guess: (_rolling if shoes is None else running)(system, guess, speed),
     )
 
 
@@ -159,9 +197,7 @@ def _drive(poses, velocities, t, p):
 
 def _rolling(system, guess, speed):
     """In static equilibrium without drive, moving forward with wheels that roll."""
-    drives = [name for name in parameters(system) if name.endswith("drive.torque")]
-    still = with_parameters(system, dict.fromkeys(drives, 0.0))
-    rest = equilibrium(still, guess, fix={"hull.x": 0.0})
+    rest = equilibrium(undriven(system), guess, fix={"hull.x": 0.0})
     wheels = np.array(["wheel" in name for name in system.body_names])
     turn = jnp.where(wheels, -speed / parameters(system)["road.radius"], 0.0)
     u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)

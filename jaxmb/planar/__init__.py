@@ -11,6 +11,7 @@ from ..parts.planar.bodies import (
     disc as disc,
     rod as rod,
 )
+from ..parts.planar.body_contact import DiscContact as DiscContact, PlateContact as PlateContact
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.planar.drivers import Driver as Driver
 from ..parts.planar.forces import (

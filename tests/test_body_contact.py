@@ -1,0 +1,205 @@
+"""Contact between bodies: against closed forms, against contact with terrain, and at the ends of plates."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.parts import contact, terrain
+from jaxmb.parts.planar.kinematics import PLANE
+
+LAWS = {
+    "normal": contact.Linear(4e4),
+    "friction": contact.Coulomb(0.6, transition_speed=0.2),
+    "damping": 300.0,
+    "smoothing": 1e-3,
+}
+SHARP = {"normal": contact.Linear(4e4), "smoothing": 1e-9}
+
+
+def plate(bodies=("disc", "plate"), **options):
+    return planar.PlateContact("touch", bodies, radius=0.2, **({"start": (-1.0, 0.0), "end": (1.0, 0.0)} | options))
+
+
+def states(rng, k):
+    return jnp.asarray(rng.normal(size=(k, 3)))
+
+
+def test_a_plate_in_the_ground_is_a_slope_of_terrain():
+    """And from below as from above."""
+    pose, velocity = jnp.array([[0.3, 0.1, 0.7]]), jnp.array([[1.0, -0.5, 2.0]])
+    slope = planar.Contact("soil", "disc", terrain=terrain.Slope(0.2), radius=0.2, **LAWS).resolve(PLANE, pose)
+    expected = slope.wrenches(PLANE, pose, velocity, 0.0)[0]
+    both, still = jnp.concatenate([pose, jnp.zeros((1, 3))]), jnp.zeros((1, 3))
+    for ends in ({"start": (-5.0, -1.0), "end": (5.0, 1.0)}, {"start": (5.0, 1.0), "end": (-5.0, -1.0)}):
+        part = plate(**ends, **LAWS).resolve(PLANE, both)
+        found = part.wrenches(PLANE, both, jnp.concatenate([velocity, still]), 0.0)
+        np.testing.assert_allclose(found[0], expected, rtol=1e-12)
+        np.testing.assert_allclose(part.energy(PLANE, both, 0.0), slope.energy(PLANE, pose, 0.0), rtol=1e-12)
+
+
+def test_plates_in_line_bear_as_one():
+    """Wherever a disc is, and whichever body they are of: its wrench is that of one long plate."""
+    ends = np.array([-1.0, -0.2, 0.3, 1.0])
+    names = ("disc", "first", "second", "third")
+    three = planar.PlateContact(
+        "three",
+        names,
+        radius=0.2,
+        start=np.stack([ends[:-1], np.zeros(3)], axis=1),
+        end=np.stack([ends[1:], np.zeros(3)], axis=1),
+        edge=0.25,
+        **LAWS,
+    )
+    one = plate(edge=0.25, **LAWS)
+    own = [part.resolve(PLANE, np.zeros((k, 3))) for part, k in ((three, 4), (one, 2))]
+    moving, still = jnp.array([1.0, -0.3, 2.0]), jnp.zeros((4, 3))
+
+    @jax.jit
+    @jax.vmap
+    def wrenches(place):
+        poses, velocities = still.at[0].set(place), still.at[0].set(moving)
+        return [part.wrenches(PLANE, poses[: len(part.bodies)], velocities[: len(part.bodies)], 0.0) for part in own]
+
+    places = [(x, y, 0.4) for x in np.linspace(-0.7, 0.7, 15) for y in (0.19, 0.1, -0.15)]
+    found, expected = wrenches(jnp.array(places))
+    assert np.all(np.abs(expected[:, 0, 1]) > 100.0)
+    np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=1e-9 * 4e4)
+    np.testing.assert_allclose(jnp.sum(found[:, 1:], axis=1), expected[:, 1], rtol=0, atol=1e-9 * 4e4)
+
+
+def test_the_force_is_twice_differentiable_over_the_end_of_a_plate():
+    part = plate(edge=0.1, **LAWS).resolve(PLANE, jnp.zeros((2, 3)))
+    force = lambda x: part.wrenches(PLANE, jnp.zeros((2, 3)).at[0, 0].set(x).at[0, 1].set(0.15), jnp.ones((2, 3)), 0.0)
+    x = jnp.linspace(0.85, 1.15, 2001)
+    value, slope, curvature = (jax.jit(jax.vmap(f))(x) for f in (force, jax.jacfwd(force), jax.hessian(force)))
+    assert np.all(np.asarray(value)[-300:] == 0.0)
+    h = float(x[1] - x[0])
+    # Jumps would show as differences that do not become small with the distance.
+    assert np.max(np.abs(np.diff(value, axis=0))) <= 1.1 * h * np.max(np.abs(slope))
+    assert np.max(np.abs(np.diff(slope, axis=0))) <= 1.1 * h * np.max(np.abs(curvature))
+
+
+def collision(part, place, velocity=(0.0, -3.0)):
+    """Disc and target of 2 kg and 5 kg, without weight; the disc comes down."""
+    disc = planar.Body("disc", mass=2.0, inertia=0.04, position=place, velocity=velocity)
+    other = planar.Body("plate", mass=5.0, inertia=0.5)
+    return mb.Scene([disc, other], forces=[part]).compile()
+
+
+@pytest.mark.parametrize(
+    "part, gap",
+    [
+        (plate(**SHARP), 0.05),
+        (planar.DiscContact("touch", ("disc", "plate"), radius=0.2, radii=0.1, **SHARP), 0.05),
+    ],
+    ids=["plate", "disc"],
+)
+def test_a_disc_bounces_off_a_free_body(part, gap):
+    """It flies, swings for half a period of both masses on the spring, and flies off: all in closed form."""
+    reach = 0.2 + (0.1 if isinstance(part, planar.DiscContact) else 0.0)
+    system = collision(part, (0.0, reach + gap))
+    frequency = np.sqrt(4e4 * (1 / 2.0 + 1 / 5.0))
+    touch, free = gap / 3.0, gap / 3.0 + np.pi / frequency
+    middle = touch + 0.3 * np.pi / frequency
+    times = np.array([touch / 2, middle, free + 0.01])
+    sol = mb.simulate(
+        system, mb.assemble(system), t1=times[-1], rtol=1e-10, saveat=times, solver=diffrax.Dopri8(), dt0=1e-4
+    )
+    # The mass centre goes on; the distance is that of free flight, of the swing, and of the flight back.
+    centre = (2.0 * (reach + gap) - 2.0 * 3.0 * times) / 7.0
+    swing = 3.0 / frequency * np.sin(frequency * (middle - touch))
+    distance = reach + np.array([gap / 2, -swing, 3.0 * 0.01])
+    np.testing.assert_allclose(sol["disc"].position[:, 1], centre + 5 / 7 * distance, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(sol["plate"].position[:, 1], centre - 2 / 7 * distance, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(sol["disc"].velocity[-1], [0.0, 9.0 / 7.0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(sol["plate"].velocity[-1], [0.0, -12.0 / 7.0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(sol.linear_momentum, np.tile([0.0, -6.0], (3, 1)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(sol.energy, 9.0, rtol=1e-7)
+
+
+def test_a_disc_rolls_down_a_wedge_that_is_free_to_slide():
+    """After its slip has settled it gains `g sin α / (3/2 − m cos²α / (m + M))` along the wedge's slope, which recoils
+    so that the momentum along the ground stays zero.
+    """
+    m, M, radius, angle, g = 2.0, 5.0, 0.2, 0.3, 9.81
+    down = np.array([-np.cos(angle), -np.sin(angle)])
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    disc = planar.Body("disc", mass=m, inertia=planar.disc(m, radius), position=(radius - 5e-4) * normal - 0.3 * down)
+    wedge = planar.Body("plate", mass=M, inertia=1.0, angle=angle)
+    rail = planar.Prismatic("rail", "ground", "plate", point=(0.0, 0.0), axis=(1.0, 0.0))
+    laws = {"friction": contact.Coulomb(0.6, transition_speed=0.02), "damping": 300.0, "damping_depth": 1e-4}
+    scene = mb.Scene([disc, wedge], joints=[rail], forces=[plate(**(SHARP | laws)), mb.Gravity((0.0, -g))])
+    system = scene.compile()
+    sol = mb.simulate(system, mb.assemble(system), t1=0.5, rtol=1e-9, saveat=np.array([0.3, 0.5]))
+    gain = g * np.sin(angle) / (1.5 - m * np.cos(angle) ** 2 / (m + M))
+    recoil = m * np.cos(angle) / (m + M) * gain
+    change = lambda of: np.asarray(of[1] - of[0]) / 0.2
+    np.testing.assert_allclose(change(sol["plate"].velocity), [recoil, 0.0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(change(sol["disc"].velocity), gain * down + [recoil, 0.0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(change(sol["disc"].angular_velocity), gain / radius, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(sol.linear_momentum[:, 0], 0.0, atol=1e-10)
+    # The friction that rolling takes, along the slope.
+    np.testing.assert_allclose(sol.forces["touch"][:, 0, :2] @ down, -0.5 * m * gain, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["plate", "disc"])
+def test_derivatives_of_an_oblique_collision_with_friction(kind):
+    """Forward mode, reverse mode and differences, under `jit` and `vmap`."""
+    laws = LAWS | {"smoothing": 5e-3}
+    part = plate(**laws)
+    if kind == "disc":
+        part = planar.DiscContact("touch", ("disc", "plate"), radius=0.2, radii=0.1, **laws)
+    system = collision(part, (0.04, 0.35), (1.0, -3.0))
+    names = ("touch.normal.stiffness", "touch.radius", "touch.friction.coefficient", "disc.mass")
+    start = jnp.stack([mb.parameters(system)[name] for name in names])
+
+    def end(share, dt, adjoint):
+        """At steps that do not depend on anything."""
+        own = mb.with_parameters(system, dict(zip(names, start * (1.0 + share), strict=True)))
+        steps = {"solver": diffrax.Dopri8(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": dt}
+        y = mb.simulate(own, system.guess, t1=0.1, max_steps=1024, adjoint=adjoint, **steps).ys
+        return jnp.cos(jnp.arange(12.0)) @ jnp.concatenate([y.q[-1], y.u[-1]])
+
+    still, unit = jnp.zeros(4), jnp.eye(4)
+    along = lambda s, d, dt: jax.jvp(lambda s: end(s, dt, diffrax.ForwardMode()), (s,), (d,))
+    forward = jit_quickly(jax.vmap(along, (0, 0, None)))
+    _, found = forward(jnp.zeros((4, 4)), unit, 2e-4)
+    reverse = jit_quickly(jax.grad(lambda s: end(s, 2e-4, None)))(still)
+    h = 1e-3
+    value = lambda k: np.asarray(forward(k * h * unit, unit, 1e-4)[0])
+    difference = (8 * (value(1) - value(-1)) - (value(2) - value(-2))) / (12 * h)
+    assert np.all(np.abs(found) > 1e-3)
+    np.testing.assert_allclose(reverse, found, rtol=1e-9)
+    np.testing.assert_allclose(found, difference, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "part, message",
+    [
+        (lambda: plate(("disc",), **SHARP), "the disc's body and then at least one other"),
+        (
+            lambda: plate(edge=1.1, **SHARP),
+            "edge must be at most half as long as a plate, got 1.1 m, with 2 m",
+        ),
+        (lambda: plate(start=(1.0, 0.0), **SHARP), "with 0 m from start to end"),
+        (lambda: plate(start=(0.0, 0.0, 0.0), **SHARP), r"start must have shape \(2,\) or \(1, 2\), got \(3,\)"),
+        (lambda: plate(normal=3.0), "normal must be a law from jaxmb.contact"),
+        (
+            lambda: planar.DiscContact("touch", ("a", "b", "c"), radius=0.1, radii=(1.0, 1.0, 1.0), **SHARP),
+            r"radii must have shape \(\) or \(2,\), got \(3,\)",
+        ),
+        (
+            lambda: planar.DiscContact("touch", ("a", "b"), radius=0.1, radii=-1.0, **SHARP),
+            "radii must be non-negative",
+        ),
+    ],
+)
+def test_what_cannot_touch_is_refused(part, message):
+    with pytest.raises(ValueError, match=f"'touch': .*{message}"):
+        own = part()
+        own.resolve(PLANE, jnp.zeros((len(own.bodies), 3)))
