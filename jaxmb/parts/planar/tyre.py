@@ -1,7 +1,6 @@
 """A tyre on a wheel that rolls in the plane."""
 
 import jax.numpy as jnp
-import numpy as np
 
 from ..base import AbstractPlanarPart
 from ..tyre import AbstractTyre
@@ -19,7 +18,7 @@ class Tyre(AbstractPlanarPart, AbstractTyre):
     """
 
     def axle(self, space):
-        return np.array([0.0, 0.0, 1.0])
+        return jnp.array([0.0, 0.0, 1.0])
 
     def lowest(self, space, pose, normal_W):
         return -self.radius * normal_W
