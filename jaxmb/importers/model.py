@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from .._types import State
+from ..parts.shapes import AbstractShape
 from ..scene import Scene
 from .description import Shape
+from .pictures import pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +28,7 @@ class ImportedModel:
     - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
         `simulate(..., inputs=)`.
     - `states`: the named states of the file, such as keyframes of MJCF, for `assemble`.
-    - `shapes`: what the links look like, for a picture.
+    - `shapes`: what the links look like, as the file says; see `pictures`.
     """
 
     name: str
@@ -37,6 +39,11 @@ class ImportedModel:
     states: Mapping[str, State] = dataclasses.field(default_factory=dict)
     shapes: tuple[Shape, ...] = ()
     locate: Callable[[np.ndarray, np.ndarray], State] | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def pictures(self) -> dict[str, tuple[AbstractShape, ...]]:
+        """What the bodies look like, for `viz.show(trajectory, shapes=model.pictures)`. Meshes need `jaxmb[view]`."""
+        return pictures(self.shapes)
 
     def state(self, qpos: Any, qvel: Any = None) -> State:
         """The state of the bodies at MuJoCo's coordinates and velocities, for models from MJCF.
