@@ -152,6 +152,8 @@ class _Builder:
                     free=joint.free - offset,
                 )
             )
+        if "springs" in wanted:
+            self._shortest(joint)
         if "armature" in wanted:
             self._rotor(joint.name, coordinate, joint.armature)
         if "friction" in wanted:
@@ -159,6 +161,12 @@ class _Builder:
         if "limits" in wanted:
             inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
             self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
+
+    def _shortest(self, joint):
+        if joint.kind == "hinge" and joint.limits is None:
+            self.notes.say(
+                "Springs and servos of hinges without limits take the shortest way, up to half a turn: {}.", joint.name
+            )
 
     def _of_ball(self, joint, a, b, coordinate, wanted):
         if joint.kind == "free" and "damping" in wanted:
@@ -319,6 +327,9 @@ class _Builder:
                     **ranges,
                 )
             )
+            for joint in self.machine.joints:
+                if joint.name == actuator.of and (actuator.gain[1] or actuator.bias[1]):
+                    self._shortest(joint)
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
                     "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "

@@ -54,6 +54,8 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     listed = ", ".join(f"{number} {what}" for what, number in effectless.items() if number)
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {listed}.")
+    if np.any(model.key_ctrl) or np.any(model.key_act):
+        notes.say("Controls of keyframes are not read: give them with the parameters in `controls`.")
     if model.neq:
         notes.say("Equalities hold exactly: their solref and solimp have no effect.")
     moved = np.flatnonzero(model.body_mocapid >= 0)
