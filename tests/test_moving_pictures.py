@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pages import Page
+from test_every_part import SPACES, compiled as built
 
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
@@ -330,8 +331,27 @@ def test_the_command_opens_a_page_where_there_is_a_screen(pendulum, monkeypatch,
 
 
 @pytest.mark.long
-def test_a_motion_that_was_simulated(tmp_path):
-    """Padding after the end, a run backwards in time, and frames of a batch."""
+@pytest.mark.parametrize("space", SPACES)
+def test_every_part_has_its_picture(space):
+    """Shapes and lines are finite, and lines between two points meet the anchors of the part."""
+    for example in SPACES[space]:
+        system = built(example)
+        still = at_rest(system)
+        picture = system.picture(still.ts, still.ys)
+        assert all(np.all(np.isfinite(shape.position)) for _, shape in picture.shapes), example.part.name
+        for name, line in picture.paths.items():
+            assert np.all(np.isfinite(line.points)), name
+            if line.kind != "belt":
+                part = picture.parts[name]
+                for k, (body, point) in enumerate(zip(part.bodies, part.points, strict=True)):
+                    turn = rot.rotate(picture.orientations[body][0], point)
+                    assert np.allclose(line.points[0, k], picture.positions[body][0] + turn), name
+        assert "/clock" in Page(viz.show(still).html).names()
+
+
+@pytest.mark.long
+def test_a_motion_that_was_simulated():
+    """All steps, forwards and backwards in time."""
     body = spatial.Body("top", mass=1.0, inertia=np.diag([0.1, 0.1, 0.05]), position=(0.0, 0.1, 0.5))
     ball = spatial.Spherical("foot", "ground", "top", point=(0.0, 0.0, 0.0))
     system = mb.Scene([body], joints=[ball], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()

@@ -106,7 +106,8 @@ def show(
     speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
     played: list[tuple[np.ndarray, Sequence[Node]]] = []
     for own, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
-        nodes = own.nodes(offset, view.grain, points=points, arrows=arrows, scale=scale)
+        drawn = {"points": points, "arrows": arrows, "scale": scale, "thickness": 0.0035 * view.size}
+        nodes = own.nodes(offset, view.grain, **drawn)
         played.append(((own.times - first) / speed, nodes))
     still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []

@@ -115,8 +115,11 @@ class Motion:
         points: Sequence[str],
         arrows: Mapping[str, tuple[np.ndarray, np.ndarray]],
         scale: float,
+        thickness: float,
     ) -> list[stage.Node]:
-        """All nodes, moved by an offset [m]; `arrows`: points and forces by name, drawn with `scale` [m/N]."""
+        """All nodes, moved by an offset [m]; `arrows`: points and forces by name, drawn with `scale` [m/N] and with
+        shafts of the radius `thickness` [m].
+        """
         prefix = f"/{self.name}" if self.name else ""
         out = self._solids(prefix, offset, grain) + self._paths(prefix, offset, grain)
         if self.picture.planar:
@@ -128,7 +131,7 @@ class Motion:
         for name, (start, force) in arrows.items():
             color = _REACTION if name.startswith("reactions") else _FORCE
             ends = np.stack([start, start + scale * force], axis=2) + offset
-            out.append(stage.arrows(f"{prefix}/{name}", ends, color, 0.5 * self.picture.width, grain))
+            out.append(stage.arrows(f"{prefix}/{name}", ends, color, thickness, grain))
         return out
 
     def _solids(self, prefix, offset, grain):

@@ -147,8 +147,8 @@ def _mesh(ground, own, planar):
     """The mesh of the ground below a motion, in the ground's axes."""
     low, high = own.bounds
     if planar:
-        width = own.picture.width
-        return meshes.strip(ground, *_wider(low, high, 0.08), 6 * width, 3 * width)
+        depth = 0.02 * float(np.max(high - low))
+        return meshes.strip(ground, *_wider(low, high, 0.08), depth, 3 * own.picture.width)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
     turned = (corners - ground.position) @ rotation_matrix(ground.orientation)
     return meshes.sheet(ground, *_wider(turned.min(axis=0), turned.max(axis=0), 0.25))
