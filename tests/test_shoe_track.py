@@ -112,7 +112,7 @@ def test_statics():
     on_others = sum(sol.forces[f"{disc}_rim"][:, 0, 1] for disc in ("sprocket", "idler"))
     np.testing.assert_allclose(np.mean((on_wheels + on_others)[last]), carried, rtol=2e-3)
 
-    tension = np.mean(ride.track_tension(sol)[last], axis=0)
+    tension = np.mean(np.asarray(ride.track_tension(sol))[last], axis=0)
     shoes, discs = bodies(sol, "shoe"), {kind: bodies(sol, kind) for kind in RADII}
     along = np.stack([np.cos(shoes[..., 2]), np.sin(shoes[..., 2])], axis=-1)
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)

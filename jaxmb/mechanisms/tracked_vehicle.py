@@ -1,5 +1,6 @@
 """Tracked vehicles with sprung road wheels in the plane, one or two coupled."""
 
+import dataclasses
 from typing import Literal
 
 import jax.numpy as jnp
@@ -96,8 +97,7 @@ def tracked_vehicle(
     if units not in (1, 2):
         raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
     shoes = {"loop": None, "shoes": Shoes()}.get(track, track) if isinstance(track, str) else track
-    # A concrete class: what stands for all numbers of a track has no other form.
-    if not (shoes is None or isinstance(shoes, Shoes)) or track is None:
+    if track != "loop" and not dataclasses.is_dataclass(shoes):
         raise ValueError(f"tracked_vehicle: track must be 'loop', 'shoes' or Shoes(...), got {track!r}.")
     if shoes is not None and not track_stiffness > 0:
         raise ValueError(f"tracked_vehicle(track='shoes') needs a track_stiffness > 0, got {track_stiffness}.")
