@@ -136,7 +136,8 @@ class Shape:
     **Fields:** `kind`: `"box"`, `"sphere"`, `"cylinder"`, `"capsule"`, `"ellipsoid"`, `"plane"` or `"mesh"`; `body`, a
     body of the scene or `"ground"`; `position` [m], shape (3,), and `orientation`, Euler parameters, in the body's
     frame; `size` [m]: half edges of a box, radius and half length of a cylinder or capsule, radii; scales of a mesh;
-    `file` of a mesh; `colour`, red, green, blue and opacity in [0, 1]; `collides`: whether it is there for collisions.
+    `file` of a mesh, or its `vertices` [m] and `faces` in the shape's axes; `colour`, red, green, blue and opacity in
+    [0, 1]; `collides`: whether it is there for collisions.
     """
 
     kind: str
@@ -147,6 +148,8 @@ class Shape:
     file: str = ""
     colour: tuple[float, ...] = (0.5, 0.5, 0.5, 1.0)
     collides: bool = False
+    vertices: Any = None
+    faces: Any = None
 
 
 @dataclasses.dataclass

@@ -229,10 +229,15 @@ def _read_shapes(mujoco, model, names, machine):
         kind = _SHAPES.get(int(model.geom_type[k]))
         if kind is None:
             continue
-        file = ""
+        file, vertices, faces = "", None, None
         if kind == "mesh":
-            start = model.mesh_pathadr[model.geom_dataid[k]]
+            mesh = model.geom_dataid[k]
+            start = model.mesh_pathadr[mesh]
             file = model.paths[start : model.paths.find(b"\0", start)].decode() if start >= 0 else ""
+            # As MuJoCo places it, in the mesh's principal axes.
+            of_mesh = lambda first, count, rows, m=mesh: np.array(rows[first[m] : first[m] + count[m]])
+            vertices = of_mesh(model.mesh_vertadr, model.mesh_vertnum, model.mesh_vert)
+            faces = of_mesh(model.mesh_faceadr, model.mesh_facenum, model.mesh_face)
         machine.shapes.append(
             Shape(
                 kind,
@@ -243,6 +248,8 @@ def _read_shapes(mujoco, model, names, machine):
                 file,
                 tuple(map(float, model.geom_rgba[k])),
                 bool(model.geom_contype[k] or model.geom_conaffinity[k]),
+                vertices,
+                faces,
             )
         )
 

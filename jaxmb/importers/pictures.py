@@ -49,6 +49,8 @@ def _picture(shape: Shape) -> tuple[AbstractShape, ...]:
         return (dataclasses.replace(_UNIT_BALL, vertices=_UNIT_BALL.vertices * np.asarray(size), **place),)
     if shape.kind == "plane":
         return (Ground(**place),)
+    if shape.vertices is not None:
+        return (Mesh(shape.vertices, shape.faces, **place),)
     if not Path(shape.file).is_file():
         return ()
     mesh = Mesh.read(shape.file, **place)
