@@ -102,7 +102,7 @@ def _width(length, parts):
             if point is not None and body != GROUND:
                 reach[body] = max(reach.get(body, 0.0), float(np.linalg.norm(point)))
     typical = float(np.median([own for own in reach.values() if own > 0] or [length]))
-    return min(0.02 * length, 0.07 * typical)
+    return min(0.024 * length, 0.08 * typical)
 
 
 def _paths(system, group, ts, ys) -> dict[str, Line]:
