@@ -133,7 +133,7 @@ def test_statics():
     idler = discs["idler"][last, 0] - bodies(sol, "hull")[last, 0]
     known = mb.parameters(system)
     push = known["tensioner.stiffness"] * (known["tensioner.free_length"] - (-1.824 + 0.5 - idler[:, 0]))
-    assert 2 * hanging == pytest.approx(np.mean(push), rel=0.05)
+    assert 2 * hanging == pytest.approx(float(np.mean(push)), rel=0.05)
     assert 1e4 < hanging < 2e4
 
 
