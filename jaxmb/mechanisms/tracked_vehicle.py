@@ -1,7 +1,7 @@
 """Tracked vehicles with sprung road wheels in the plane, one or two coupled."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -96,9 +96,10 @@ def tracked_vehicle(
         raise ValueError(f"tracked_vehicle needs n_wheels ≥ 1, got {n_wheels}.")
     if units not in (1, 2):
         raise ValueError(f"tracked_vehicle: units must be 1 or 2, got {units!r}.")
-    shoes = {"loop": None, "shoes": Shoes()}.get(track, track) if isinstance(track, str) else track
-    if track != "loop" and not dataclasses.is_dataclass(shoes):
+    if track not in ("loop", "shoes") and not dataclasses.is_dataclass(track):
         raise ValueError(f"tracked_vehicle: track must be 'loop', 'shoes' or Shoes(...), got {track!r}.")
+    forms: dict[Any, Any] = {"loop": None, "shoes": Shoes()}
+    shoes = forms.get(track, track)
     if shoes is not None and not track_stiffness > 0:
         raise ValueError(f"tracked_vehicle(track='shoes') needs a track_stiffness > 0, got {track_stiffness}.")
     if pivots is None:
