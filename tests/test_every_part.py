@@ -22,13 +22,12 @@ from jaxmb.parts import (
     AbstractConstraint,
     AbstractForce,
     AbstractNonIdeal,
-    AbstractTendon,
     AbstractVelocityConstraint,
     contact,
     terrain,
 )
 
-CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound, AbstractTendon)
+CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
 
 
 @dataclasses.dataclass
@@ -266,7 +265,7 @@ def coupled():
 
 
 FUNCTIONS = [
-    of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1),
+    of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
     of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
     of_joint(mb.JointActuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
     coupled(),

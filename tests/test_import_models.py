@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_importers import OFF, check_dynamics
+from test_importers import OFF, check_dynamics, random_states
 
 import jaxmb as mb
 from jaxmb import contact, importers, spatial, terrain
@@ -58,6 +58,25 @@ def test_a_urdf_tree_moves_as_in_mujoco():
     system, again = model.scene.compile(), check_dynamics(other, 20)
     assert sorted(system.body_names) == sorted(again.body_names)
     np.testing.assert_allclose(np.sort(system.mass), np.sort(again.mass), rtol=1e-12)
+
+
+def test_equalities_are_those_of_mujoco():
+    """The residuals of its own test model: connect and weld, between bodies and between sites, and a polynomial."""
+    imported = importers.mjcf(path_of("newton", "newton/tests/assets/constraints.xml"), ignore=OFF)
+    model = imported.locate.model
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    system, data = imported.scene.compile(), mujoco.MjData(model)
+    state = mb.assemble(system)
+    assert np.max(np.abs(system.position_residual(0.0, state.q))) < 1e-12
+    names = [name for name, _ in system.rows]
+    for q, v in random_states(model, 5, scale=0.3):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(model, data)
+        residual = np.asarray(system.position_residual(0.0, imported.state(q, v).q))
+        for k, (name, rows) in enumerate((("c_site", 3), ("connect", 3), ("w_site", 3), ("weld", 3), ("joint", 1))):
+            theirs = data.efc_pos[(data.efc_type == 0) & (data.efc_id == k)][:rows]
+            own = residual[names.index(name) :][:rows]
+            assert np.linalg.norm(own) == pytest.approx(np.linalg.norm(theirs), rel=1e-10), name
 
 
 def gripper():

@@ -42,11 +42,13 @@ def kinds(model):
 
 
 def random_states(model, count, *, scale=1.0, seed=0):
-    """MuJoCo's coordinates and velocities."""
+    """MuJoCo's coordinates, of joints with limits between these, and velocities."""
     random = np.random.default_rng(seed)
+    limited = np.flatnonzero(model.jnt_limited & (model.jnt_type >= 2))
     for _ in range(count):
         q = model.qpos0.copy()
         mujoco.mj_integratePos(model, q, scale * random.normal(size=model.nv), 1.0)
+        q[model.jnt_qposadr[limited]] = random.uniform(*model.jnt_range[limited].T)
         yield q, random.normal(size=model.nv)
 
 

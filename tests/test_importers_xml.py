@@ -138,6 +138,10 @@ def test_a_planar_joint():
         ),
         (robot(link("a"), link("a")), "The text:3: link 'a' is there twice"),
         (robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "a", "b")), "'b' is the child of several joints"),
+        (
+            robot(link("a"), link("b"), joint("j", "a", "b", inside="<limit lower='1' upper='0'/>")),
+            "The text:4: the limits of joint 'j' must increase",
+        ),
         (robot("<link name='a'>"), "The text:3: mismatched tag"),
         (robot("<xacro:include filename='x'/>"), "run xacro on it"),
         (

@@ -56,7 +56,7 @@ def urdf(
     machine = Machine(root.attributes.get("name", "robot"), np.asarray(gravity, float))
     for element in root.all("link"):
         _read_link(element, machine)
-    joints = [_read_joint(element, machine) for element in root.all("joint")]
+    joints = [_read_joint(element, machine, notes) for element in root.all("joint")]
     _place(machine, joints, base, root)
     for joint, element, _ in joints:
         machine.joints.append(joint)
@@ -125,7 +125,7 @@ def _read_shape(element, link, machine):
     machine.shapes.append(own)
 
 
-def _read_joint(element, machine):
+def _read_joint(element, machine, notes):
     """A joint, its element, and place and rotation of its frame in the parent link."""
     name, kind = element.need("name"), element.need("type")
     if kind not in (*_KINDS, "planar"):
@@ -150,9 +150,13 @@ def _read_joint(element, machine):
         joint.damping = dynamics.attribute_number("damping")
         joint.friction = dynamics.attribute_number("friction")
     if limit is not None and kind in ("revolute", "prismatic"):
-        joint.limits = (limit.attribute_number("lower"), limit.attribute_number("upper"))
-        if not joint.limits[0] < joint.limits[1]:
-            raise ValueError(f"{limit.where}the limits of joint {name!r} must increase, got {joint.limits}.")
+        lower, upper = limit.attribute_number("lower"), limit.attribute_number("upper")
+        if lower > upper:
+            raise ValueError(f"{limit.where}the limits of joint {name!r} must increase, got {lower} and {upper}.")
+        if lower == upper:
+            notes.say("Limits that leave no range are taken for none: {}.", name)
+        else:
+            joint.limits = (lower, upper)
     return joint, element, _origin(element)
 
 
