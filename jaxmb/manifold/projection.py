@@ -20,6 +20,7 @@ from ..system import AbstractSystem
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
+from .motion_jacobian import motion_jacobian
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
 
@@ -56,10 +57,6 @@ class Projection(AbstractManifold):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
             return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
-        if solver.solves_implicitly:
-            raise ValueError(
-                f"Projection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() with it."
-            )
         _check_multistep(system, formulation)
         return ProjectionTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
 
@@ -126,10 +123,14 @@ class ProjectionTerm(AbstractManifoldTerm):
 
     def evaluate(self, t, y, chart, args):
         system, y = self.system, State(self.system.normalize(y.q), y.u)
+        if system.velocity_rows == 0:
+            return ManifoldEvaluation(y, self.vf(t, y, args), chart, jnp.array(False), None)
         projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
         return ManifoldEvaluation(y, self._field(t, y, projector), chart, jnp.array(False), projector)
 
     def project_near(self, t, y, linearized_at, args):
+        if self.system.velocity_rows == 0:
+            return self.evaluate(t, y, linearized_at.chart, args)
         metric_at = lambda y: self.system.inertia(t, y.q, y.u)
         y, projector, iterations, failed = project_in_metric(
             self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
@@ -142,6 +143,15 @@ class ProjectionTerm(AbstractManifoldTerm):
         free = projector.metric.solve(system.force(t, y.q, y.u))
         udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
         return State(system.rates(t, y.q, y.u), udot)
+
+    def project_cold(self, t, y, chart, args):
+        if self.system.velocity_rows == 0:
+            return self.evaluate(t, y, chart, args)
+        return super().project_cold(t, y, chart, args)
+
+    def jacobian(self, t, y, args):
+        # A property of all systems of bodies.
+        return motion_jacobian(self.system, t, y) if self.system.has_bodies else None
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)

@@ -100,6 +100,45 @@ class Linearization(eqx.Module):
     spectrum: Complex[Array, " free"]
     renewals: Int[Array, ""]
 
+    # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
+    @property
+    def patience(self) -> int:
+        return 2 + self.spectrum.size // 2
+
+    @property
+    def slow(self) -> float:
+        return _SLOW
+
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        return inverses_of(self.rate[free], self.acceleration[free], a, b)
+
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        del a, b
+        zeros = jnp.zeros((free.size, free.size), self.state.dtype)
+        return Inverses(zeros, zeros, zeros[0, 0], zeros)
+
+    def observed(self, inverses: "Inverses", anew: Bool[Array, ""]) -> "Linearization":
+        del inverses, anew
+        return self
+
+    def moved(self, change: Float[Array, " free"]) -> Float[Array, " n"]:
+        return self.state @ change
+
+    def correction(self, inverses: "Inverses", offset, f, g, along, b, free):
+        # The stiffest part of g is combined with f: both are large and nearly cancel.
+        mismatch = g[free] - self.rate[free] @ along[free]
+        without = inverses.p @ (offset[free] - b * mismatch) - inverses.p_rate @ f[free]
+        change = inverses.c @ without
+        corrected = f - self.rate @ change
+        g = g + self.rate @ (corrected - along)[free] - self.acceleration @ change
+        return change, without, corrected, g
+
+    def errors(self, inverses: "Inverses", changes: Float[Array, "formulas n"], free: Int[Array, " free"]):
+        errors = changes[:, free] @ (self.state @ inverses.p).T
+        if free.size < changes.shape[1]:
+            errors = errors + (changes - changes[:, free] @ self.state.T)
+        return errors
+
 
 def linearize(
     field: Field,
@@ -249,20 +288,14 @@ def solve(
     none, one = jnp.zeros((), jnp.int32), jnp.ones((), past.dtype)
 
     def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
-        (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
+        (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.moved(carry.change), has_aux=True)
         along = carry.end.f
         g = push(jnp.ones_like(t), along)[1]
-        # The stiffest part of g is combined with f: both are large and nearly cancel.
-        mismatch = g[free] - matrix.rate[free] @ along[free]
-        without = inverses.p @ ((y - past)[free] - b * mismatch) - inverses.p_rate @ f[free]
-        change = inverses.c @ without
-        corrected = f - matrix.rate @ change
-        g = g + matrix.rate @ (corrected - along)[free] - matrix.acceleration @ change
-        now = jnp.maximum(size(matrix.state @ change), size(matrix.state @ without))
+        change, without, corrected, g = matrix.correction(inverses, y - past, f, g, along, b, free)
+        now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
         return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
-    # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
-    patience = 2 + free.size // 2
+    patience = matrix.patience
     far = jnp.maximum(_FAR * (size(before[0]) + size(a * before[1])), 1.0)
 
     def proceed(carry: _Iterate) -> Bool[Array, ""]:
@@ -276,24 +309,24 @@ def solve(
         anew = (matrix.renewals > 0) | (k > 0)
         renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start, rate), old.renewals)
         matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
-        inverses = inverses_of(matrix.rate[free], matrix.acceleration[free], a, b)
+        inverses = matrix.inverses(a, b, free)
+        matrix = matrix.observed(inverses, anew)
         first = _Iterate(nothing._replace(y=start, f=rate), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol
-        slow = (last.iterations > 2) & (last.rate > _SLOW)
+        slow = (last.iterations > 2) & (last.rate > matrix.slow)
         renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
         renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
         matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
         # A matrix is not computed for the same state again.
         farther = jnp.where(anew, last.end.y, start)
-        nearest = jnp.where(last.rate < 1, last.end.y - matrix.state @ last.change, farther)
+        nearest = jnp.where(last.rate < 1, last.end.y - matrix.moved(last.change), farther)
         finite = jnp.isfinite(last.size)
         place = jnp.where(finite, nearest, before[0]), jnp.where(finite, last.end.f, before[1])
         work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
         return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
-    zeros = jnp.zeros((free.size, free.size), past.dtype)
-    inverses = Inverses(zeros, zeros, zeros[0, 0], zeros)
+    inverses = matrix.no_inverses(a, b, free)
     carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
     k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)

@@ -20,6 +20,7 @@ from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
+from ._structured import StructuredLinearization, differentiable as differentiable_projection, structured
 from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
@@ -55,7 +56,7 @@ class HermiteState(eqx.Module):
     history: History
     slope: Float[Array, " m"]
     order_index: Int[Array, ""]
-    matrix: Linearization
+    matrix: Linearization | StructuredLinearization
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
@@ -201,9 +202,7 @@ class Hermite(AbstractMultistep):
             raise ValueError(
                 "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
             )
-        none = jnp.zeros((flat.size, free.size), flat.dtype)
-        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
-        matrix = Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
+        matrix = self._no_matrix(terms, t0, y0, args, free)
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         if before is None:
@@ -220,6 +219,19 @@ class Hermite(AbstractMultistep):
         index = jnp.asarray(1, np.int32)
         sizes = self._first_sizes(flat, f, before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
+
+    @staticmethod
+    def _no_matrix(terms, t, y, args, free) -> Linearization | StructuredLinearization:
+        """Zeros, and that the first step computes its own."""
+        flat = ravel(y)
+        known = eqx.filter_eval_shape(structured, terms, t, flat, y, args)
+        if known is not None:
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), known)
+            first = zeros.direction + jnp.asarray(terms.direction).astype(flat.dtype), jnp.asarray(1, jnp.int32)
+            return eqx.tree_at(lambda matrix: (matrix.direction, matrix.renewals), zeros, first)
+        none = jnp.zeros((flat.size, free.size), flat.dtype)
+        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
+        return Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
 
     @staticmethod
     def _memory(state):
@@ -252,8 +264,12 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         latest = before, state.slope[-n:]
-        newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like)
-        y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
+        newton = self._newton(terms, field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like, args)
+        if isinstance(newton.matrix, StructuredLinearization):
+            solved = newton.matrix, newton.inverses
+            y, f, g = differentiable_projection(newton.end[:3], field, t1, past, a, b, *solved)
+        else:
+            y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
         chart, broke = newton.end.rest
 
         ends = coefficients.past @ history.differences[:, :n]
@@ -337,10 +353,13 @@ class Hermite(AbstractMultistep):
         }
         return y1, estimate, dense_info, new_state, failed
 
-    def _newton(self, field, t, h, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
+    def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
-        renew = lambda y, rate: linearize(field, t, y, rate, h, free)
+        if isinstance(matrix, StructuredLinearization):
+            renew = lambda y, rate: structured(freeze(terms), t, y, like, args)
+        else:
+            renew = lambda y, rate: linearize(field, t, y, rate, h, free)
         return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
@@ -354,9 +373,7 @@ class Hermite(AbstractMultistep):
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = changes[:, free] @ (matrix.state @ inverses.p).T
-        if free.size < changes.shape[1]:
-            errors = errors + (changes - changes[:, free] @ matrix.state.T)
+        errors = matrix.errors(inverses, changes, free)
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     @property
