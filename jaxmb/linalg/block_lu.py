@@ -125,18 +125,16 @@ def _dense_inverse(blocks, order):
 def _inverse(a):
     """Inverses of blocks (b, b, w), by Gauss–Jordan elimination on the diagonal."""
     size = a.shape[0]
-    rows = np.arange(size)
+    number = np.arange(size)
 
     def sweep(k, a):
-        row = lax.dynamic_index_in_dim(a, k, 0, keepdims=False)
-        column = lax.dynamic_index_in_dim(a, k, 1, keepdims=False)
-        pivot = 1 / lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        here = (rows == k)[:, None]
-        row = jnp.where(here, pivot, row * pivot)
-        column = jnp.where(here, jnp.zeros_like(column), column)
-        own = jnp.where(here[:, :, None], jnp.zeros_like(a), jnp.where(here[None], jnp.zeros_like(a), a))
-        out = own - column[:, None] * row[None]
-        return jnp.where(here[:, :, None], row[None], out)
+        row, column = (lax.dynamic_slice_in_dim(a, k, 1, axis) for axis in (0, 1))
+        pivot = 1 / lax.dynamic_slice_in_dim(row, k, 1, 1)
+        in_row, in_column = (number == k)[:, None, None], (number == k)[None, :, None]
+        zero = jnp.zeros((), a.dtype)
+        row = jnp.where(in_column, pivot, row * pivot)
+        swept = jnp.where(in_column, zero, a) - column * row
+        return jnp.where(in_row, row, swept)
 
     return lax.fori_loop(0, size, sweep, a)
 

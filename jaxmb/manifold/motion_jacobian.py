@@ -159,7 +159,9 @@ class MotionResolvent(AbstractResolvent):
         turns = jnp.repeat(jnp.max(scaled[:, d:], axis=1, keepdims=True), more, axis=1)
         poses = jnp.concatenate([scaled[:, :d], turns], axis=1).ravel()
         places = layout.coordinate_place, layout.velocity_place
-        return jnp.concatenate([unchecked_take(w, place) for w, place in zip((poses, root.ravel()), places, strict=True)])
+        return jnp.concatenate(
+            [unchecked_take(w, place) for w, place in zip((poses, root.ravel()), places, strict=True)]
+        )
 
 
 def motion_jacobian(system: RigidBodySystem, t: Scalar, y: State) -> MotionJacobian:

@@ -110,9 +110,7 @@ def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Ev
     return _raveled(term, out, flat.dtype)
 
 
-def field_jacobian(
-    term: Any, t: Any, flat: Array, like: PyTree[Array], args: Args
-) -> AbstractFieldJacobian | None:
+def field_jacobian(term: Any, t: Any, flat: Array, like: PyTree[Array], args: Args) -> AbstractFieldJacobian | None:
     """The derivative of a vector field that knows its structure, in the direction of time of the term; else None."""
     manifold = _manifold(term)
     return None if manifold is None else manifold.jacobian(t * term.direction, unravel_like(like, flat), args)

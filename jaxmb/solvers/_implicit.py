@@ -53,9 +53,11 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 
 
 def probed_derivatives(
-    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None
+    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
 ) -> Derivatives:
-    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known."""
+    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known;
+    `along`: whether to take differences along the manifold only, where a projection returns to it.
+    """
     eps = jnp.finfo(y.dtype).eps
     size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
     signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
@@ -65,8 +67,8 @@ def probed_derivatives(
     def at(y, _):
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
-        _, (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
-        return y + aside, (Derivatives(state, f, g, rest), slope)
+        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
+        return y + (lax.stop_gradient(move) if along else aside), (Derivatives(state, f, g, rest), slope)
 
     _, (both, slopes) = lax.scan(at, y, None, length=2)
     f = lax.stop_gradient(both.f)

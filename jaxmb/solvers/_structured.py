@@ -52,9 +52,9 @@ class StructuredInverses(eqx.Module):
     def solve(self, x: Float[Array, " n"], rates: Float[Array, " n"] | None = None) -> Any:
         """`(1 - a J - b J²)⁻¹ (x + (a + b J) rates)` of tangent vectors, and J times that."""
         real, imaginary = jnp.real(self.r), jnp.imag(self.r)
-        load = lax.complex(jnp.ones_like(real), -real / imaginary) * x
+        load = lax.complex(x, -real / imaginary * x)
         if rates is not None:
-            load = load + lax.complex(self.a, -(real**2 - imaginary**2) / imaginary) * rates
+            load = load + lax.complex(self.a * rates, -(real**2 - imaginary**2) / imaginary * rates)
         solved = self.resolvent.solve(load)
         return jnp.real(solved), jnp.real((solved - load) / self.r)
 
@@ -62,7 +62,7 @@ class StructuredInverses(eqx.Module):
         """The transpose of `solve`, without rates."""
         real, imaginary = jnp.real(self.r), jnp.imag(self.r)
         solved = self.resolvent.transpose_solve(x.astype(self.r.dtype))
-        return jnp.real(lax.complex(jnp.ones_like(real), -real / imaginary) * solved)
+        return jnp.real(solved) + real / imaginary * jnp.imag(solved)
 
 
 class StructuredLinearization(eqx.Module):
@@ -147,9 +147,10 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
     size = lambda x: jnp.sqrt(jnp.sum(jnp.real(x * jnp.conj(x)))) + floor
     basis = jnp.zeros((m + 1, n), start.dtype).at[0].set(start / size(start).astype(start.dtype))
 
-    def extend(carry, k):
-        basis = carry
-        x = weights * inverses.resolvent.solve(basis[k] / weights)
+    scale = weights.astype(start.dtype)
+
+    def extend(basis, k):
+        x = scale * inverses.resolvent.solve(basis[k] / scale)
         column = jnp.zeros(m + 1, x.dtype)
         # Twice is enough.
         for _ in range(2):
@@ -228,7 +229,9 @@ def _differentiable_jvp(primals, tangents):
     return (y, f, g), (dstate, drate, dheld + along(drate)[1])
 
 
-def _iterate(apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]) -> Array:
+def _iterate(
+    apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]
+) -> Array:
     """The solution of a linear equation by generalized conjugate residuals."""
     n, dtype = load.size, load.dtype
     target = _RESIDUAL * jnp.sqrt(jnp.sum(load**2))

@@ -189,20 +189,20 @@ class Hermite(AbstractMultistep):
     def _initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
         field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
+        free = free_components(terms, flat, chart)
+        matrix = self._no_matrix(terms, t0, y0, args, free)
         if before is None:
             size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
-            first = probed_derivatives(field, t0, flat, size)
+            first = probed_derivatives(field, t0, flat, size, along=_is_structured(matrix))
         else:
             first = derivatives(field, t0, flat)
         chart, failed = first.rest
         # The NaN reaches the error estimate, so the step is rejected.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
-        free = free_components(terms, flat, chart)
         if free.size == 0:
             raise ValueError(
                 "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
             )
-        matrix = self._no_matrix(terms, t0, y0, args, free)
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         if before is None:
@@ -265,7 +265,7 @@ class Hermite(AbstractMultistep):
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         latest = before, state.slope[-n:]
         newton = self._newton(terms, field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like, args)
-        if isinstance(newton.matrix, StructuredLinearization):
+        if _is_structured(newton.matrix):
             solved = newton.matrix, newton.inverses
             y, f, g = differentiable_projection(newton.end[:3], field, t1, past, a, b, *solved)
         else:
@@ -356,7 +356,7 @@ class Hermite(AbstractMultistep):
     def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
-        if isinstance(matrix, StructuredLinearization):
+        if _is_structured(matrix):
             renew = lambda y, rate: structured(freeze(terms), t, y, like, args)
         else:
             renew = lambda y, rate: linearize(field, t, y, rate, h, free)
@@ -395,6 +395,10 @@ class Hermite(AbstractMultistep):
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
+
+
+def _is_structured(matrix: Linearization | StructuredLinearization) -> bool:
+    return isinstance(matrix, StructuredLinearization)
 
 
 def _ladder(past_points: tuple[int, ...]) -> np.ndarray:

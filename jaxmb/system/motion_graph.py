@@ -106,7 +106,12 @@ def _motion_order(
     # Blocks of pairs, of joints on bodies, their transposes, identities of joints, and a zero.
     pairs, most = len(places), 0 if joints is None else joints.bodies.shape[1]
     across = len(of_joints) * most
-    block = {(b, a): pairs + across + k * most + own.index(b) for k, own in enumerate(of_joints) for a in [ground + k] for b in own}
+    block = {
+        (b, a): pairs + across + k * most + own.index(b)
+        for k, own in enumerate(of_joints)
+        for a in [ground + k]
+        for b in own
+    }
     source = dict(places)
     for (body, joint), place in block.items():
         source[joint, body] = place - across
