@@ -131,11 +131,12 @@ def dense_resolvent(system, y, x, r):
     """The same equations with dense matrices, from the whole system's functions."""
     t, (q, u) = 0.0, (y.q, y.u)
     A, M = system.jacobian(t, q, u), system.inertia(t, q, u)
-    udot, multipliers = mb.formulations.accelerations(system, mb.formulations.Multipliers(), t, q, u)
+    _, multipliers = mb.formulations.accelerations(system, mb.formulations.Multipliers(), t, q, u)
     force = lambda q, u: system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
     N = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
     K, D = jax.jacfwd(force, (0, 1))(q, u)
-    K, mass, m = K @ N, M.product(jnp.eye(system.nu)), A.shape[0]
+    mass, m = M.product(jnp.eye(system.nu)), A.shape[0]
+    K, D, N, mass, A = map(np.asarray, (K @ N, D, N, mass, A))
     top = np.concatenate([mass - r * D - r**2 * K, A.T], axis=1)
     matrix = np.concatenate([top, np.concatenate([A, np.zeros((m, m))], axis=1)])
     move = np.linalg.lstsq(N, x[: system.nq])[0]

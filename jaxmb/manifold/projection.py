@@ -51,9 +51,9 @@ class Projection(AbstractManifold):
     inverse of the step. Newton's matrix leaves out how directions of joints and forces change in a step, so it takes up
     to a third more iterations than with `Partition`; derivatives are those of the exact equations.
 
-    **Arguments:** `newton_tol`: with `Adams` and `Hermite`, size of the last Newton correction of positions relative to the system's
-    size, default tied to the tolerance of integration; one more correction is made with the factor of the state it led
-    to.
+    **Arguments:** `newton_tol`: with `Adams` and `Hermite`, size of the last Newton correction of positions relative to
+    the system's size, default tied to the tolerance of integration; one more correction is made with the factor of the
+    state it led to.
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)
@@ -102,8 +102,8 @@ def _check_multistep(system, formulation, solver):
     """Refuse systems and formulations that one factor of `A M⁻¹ Aᵀ` does not serve."""
     if not system.positive_definite_mass:
         raise ValueError(
-            f"Projection with {solver} needs the inverse of the mass matrix, which is singular in these velocities; use "
-            "Partition()."
+            f"Projection with {solver} needs the inverse of the mass matrix, which is singular in these velocities; "
+            "use Partition()."
         )
     if not formulation.takes_blocks:
         raise ValueError(
@@ -117,8 +117,8 @@ def _check_multistep(system, formulation, solver):
         )
     if not (system.ideal_on_velocities and system.linear):
         raise ValueError(
-            f"Projection with {solver} takes constraints that are ideal, bind positions or velocities, and are linear in "
-            "velocities; use Partition()."
+            f"Projection with {solver} takes constraints that are ideal, bind positions or velocities, and are linear "
+            "in velocities; use Partition()."
         )
 
 

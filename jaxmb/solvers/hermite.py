@@ -20,8 +20,8 @@ from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._multistep import AbstractMultistep, tolerances_of
-from ._structured import StructuredLinearization, differentiable as differentiable_projection, structured
 from ._order import GAIN, LOWER, choose_order, growth_factors
+from ._structured import StructuredLinearization, differentiable as differentiable_projection, structured
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
 from .controller import ControllerState

@@ -1,10 +1,9 @@
 """Derivatives of a scene's forces with respect to positions and velocities, part by part.
 
-A part acts on its own bodies only, so its derivatives are a small matrix of blocks; parts of one type are differentiated
-together.
+A part acts on its own bodies only, so its derivatives are a small matrix of blocks; parts of one type are
+differentiated together.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
