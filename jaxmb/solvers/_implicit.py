@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from ._damping import eigenvalues
 from ._lanes import cond_of_any_lane
+from ._linearization import AbstractLinearization
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -88,8 +89,8 @@ def _warn():
     )
 
 
-class Linearization(eqx.Module):
-    """How a state and its derivatives in time change with the free components.
+class Linearization(AbstractLinearization):
+    """Full matrices: how a state and its derivatives in time change with the free components.
 
     **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held; `spectrum`:
     the eigenvalues of J, the free rows of `rate`; `renewals`: the number of next steps that must compute their own
@@ -232,8 +233,8 @@ class Solved(NamedTuple):
 
     end: Derivatives
     converged: Bool[Array, ""]
-    matrix: Linearization
-    inverses: Inverses
+    matrix: AbstractLinearization
+    inverses: Any
     work: Int[Array, "2"]
 
 
@@ -258,10 +259,10 @@ def solve(
     predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
     before: tuple[Float[Array, " n"], Float[Array, " n"]],
     free: Int[Array, " free"],
-    matrix: Linearization,
+    matrix: AbstractLinearization,
     size: Callable[[Array], Any],
     tol: float,
-    renew: Callable[[Float[Array, " n"], Float[Array, " n"]], Linearization],
+    renew: Callable[[Float[Array, " n"], Float[Array, " n"]], Any],
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 

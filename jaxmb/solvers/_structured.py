@@ -24,6 +24,7 @@ from ._damping import eigenvalues
 from ._evaluation import field_jacobian, freeze
 from ._implicit import Field
 from ._lanes import cond_of_any_lane
+from ._linearization import AbstractLinearization
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 
 # Steps of Arnoldi's method for the spectrum.
@@ -64,8 +65,8 @@ class StructuredInverses(eqx.Module):
         return jnp.real(solved) + real / imaginary * jnp.imag(solved)
 
 
-class StructuredLinearization(eqx.Module):
-    """What `Linearization` is for a full matrix; changes are those of the whole state.
+class StructuredLinearization(AbstractLinearization):
+    """A matrix that knows its structure; the unknowns are all components of the state.
 
     **Fields:** the `jacobian` J of the term; `direction` of time; `spectrum`: eigenvalues of J of the size of those
     that formulas may amplify; `renewals`: the number of next steps that must compute their own matrix.

@@ -19,6 +19,7 @@ from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
+from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
 from ._structured import StructuredLinearization, differentiable as differentiable_projection, structured
@@ -56,7 +57,7 @@ class HermiteState(eqx.Module):
     history: History
     slope: Float[Array, " m"]
     order_index: Int[Array, ""]
-    matrix: Linearization | StructuredLinearization
+    matrix: AbstractLinearization
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
@@ -221,7 +222,7 @@ class Hermite(AbstractMultistep):
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
 
     @staticmethod
-    def _no_matrix(terms, t, y, args, free) -> Linearization | StructuredLinearization:
+    def _no_matrix(terms, t, y, args, free) -> AbstractLinearization:
         """Zeros, and that the first step computes its own."""
         flat = ravel(y)
         known = eqx.filter_eval_shape(structured, terms, t, flat, y, args)
@@ -397,7 +398,7 @@ class Hermite(AbstractMultistep):
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
 
 
-def _is_structured(matrix: Linearization | StructuredLinearization) -> bool:
+def _is_structured(matrix: AbstractLinearization) -> bool:
     return isinstance(matrix, StructuredLinearization)
 
 

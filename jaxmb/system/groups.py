@@ -151,7 +151,7 @@ class AbstractConstraintGroup(eqx.Module):
         """Wrenches of the constraints on their bodies, `Aᵀ λ` body by body."""
 
     @abc.abstractmethod
-    def stiffness(
+    def wrench_derivatives(
         self,
         t: Scalar,
         poses: Float[Array, "b_ground p"],
@@ -230,7 +230,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         _, pull = jax.vjp(lambda x: at(t).residual(self._space, x, t), x)
         return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
-    def stiffness(self, t, poses, velocities, multipliers):
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
         del velocities
         single = lambda at, x, own: _along_moves(self._space, lambda x: self._wrench(t, at, x, own), x)
         return self._map(single, poses, more=(multipliers,))
@@ -277,7 +277,7 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
     def _wrench(self, t, at, x, v, multipliers):
         return jax.vjp(lambda w: at(t).residual(self._space, x, w, t), v)[1](multipliers)[0]
 
-    def stiffness(self, t, poses, velocities, multipliers):
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
         single = lambda at, x, v, own: _along_moves(self._space, lambda x: self._wrench(t, at, x, v, own), x)
         return self._map(single, poses, velocities, more=(multipliers,))
 
@@ -370,8 +370,8 @@ class ServoGroup(AbstractConstraintGroup):
     def wrenches(self, t, poses, velocities, multipliers):
         return self.program.wrenches(t, poses, velocities, multipliers)
 
-    def stiffness(self, t, poses, velocities, multipliers):
-        return self.program.stiffness(t, poses, velocities, multipliers)
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        return self.program.wrench_derivatives(t, poses, velocities, multipliers)
 
     def acceleration(self, t, poses, velocities, accelerations):
         second = self.program.acceleration(t, poses, velocities, accelerations)

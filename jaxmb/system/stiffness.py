@@ -33,7 +33,7 @@ def contributions(
     for g in system.joints:
         own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
         row += own.size
-        stiffness.append(_by_pairs(g.stiffness(t, poses, velocities, own)))
+        stiffness.append(_by_pairs(g.wrench_derivatives(t, poses, velocities, own)))
         damping.append(jnp.zeros_like(stiffness[-1]))
     gyroscopic = system.gyroscopic_damping(u)
     stiffness.append(jnp.zeros_like(gyroscopic))
