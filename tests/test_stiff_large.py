@@ -284,3 +284,18 @@ def test_size_decides():
         assert isinstance(default_manifold(system, hermite, None), implicit)
         assert isinstance(default_manifold(system, adams, None), explicit)
         assert ("no dense Newton matrix with Hermite" in str(system)) == (implicit is Projection)
+
+
+@pytest.mark.parametrize("n, most", [(100, 40), (1000, 40)])
+def test_levels_of_a_chain(n, most):
+    """Bodies that share a spring and a hinge with the next, by cyclic reduction and not from an end on."""
+    bodies, pairs = tuple((k,) for k in range(n)), tuple((k - 1, k) for k in range(1, n))
+    neighbours = [set() for _ in range(2 * n)]
+    for joint, own in enumerate([bodies[0], *pairs], n):
+        neighbours[joint].update(own)
+        for a in own:
+            neighbours[a].update({joint, *own} - {a})
+    after = [*([()] * n), *bodies]
+    order = order_nodes(neighbours, 3, after=after, every_bound=True)
+    assert order.levels <= most
+    assert order.blocks <= 10 * n

@@ -101,6 +101,11 @@ class Hermite(AbstractMultistep):
     causes that, unless `past_points` has no A-stable alternative. With large steps, implicit formulas damp components
     that should grow: no step covers more than two e-foldings of them.
 
+    A term that knows the structure of its Jacobian (`AbstractManifoldTerm.jacobian`) makes a step cost what solving with
+    that structure costs. Of its eigenvalues sixteen are then known, by Arnoldi's method: those near the inverse of the
+    step, where lightly damped vibrations and growing components are found first. One such vibration among very many
+    components that are damped well may be missed; the error estimate then keeps steps short.
+
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
     implicit function theorem, with the exact Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but
@@ -358,7 +363,7 @@ class Hermite(AbstractMultistep):
         size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
         if _is_structured(matrix):
-            renew = lambda y, rate: structured(freeze(terms), t, y, like, args)
+            renew = lambda y, rate: structured(freeze(terms), t, y, like, freeze(args))
         else:
             renew = lambda y, rate: linearize(field, t, y, rate, h, free)
         return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)

@@ -101,7 +101,7 @@ def _motion_order(
             neighbours[body].add(joint)
     widest = size if joints is None else max(size, joints.rows.shape[1])
     after = [*([()] * ground), *_bodies_before(of_joints, ground)]
-    nodes = order_nodes(neighbours, widest, after=after)
+    nodes = order_nodes(neighbours, widest, after=after, every_bound=True)
 
     # Blocks of pairs, of joints on bodies, their transposes, identities of joints, and a zero.
     pairs, most = len(places), 0 if joints is None else joints.bodies.shape[1]
