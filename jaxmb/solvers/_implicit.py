@@ -8,7 +8,7 @@ them f and g, follow from the constraints.
 import functools
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -102,6 +102,8 @@ class Linearization(AbstractLinearization):
     acceleration: Float[Array, "n free"]
     spectrum: Complex[Array, " free"]
     renewals: Int[Array, ""]
+
+    is_structured: ClassVar[bool] = False
 
     # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
     @property

@@ -16,7 +16,8 @@ class AbstractLinearization(eqx.Module):
     """How a state and its derivatives in time change with the unknowns of a step `y = past + a f + b g`.
 
     **Fields:** `spectrum`: eigenvalues of the derivative J of the field; `renewals`: the number of next steps that must
-    compute their own linearisation.
+    compute their own linearisation; `is_structured`: whether the unknowns are all components of the state, which is
+    then projected on the manifold.
 
     `free` are the indices of the unknowns among the components of the state, and `inverses` what `inverses(a, b, free)`
     returns.
@@ -24,6 +25,7 @@ class AbstractLinearization(eqx.Module):
 
     spectrum: AbstractVar[Complex[Array, " k"]]
     renewals: AbstractVar[Int[Array, ""]]
+    is_structured: AbstractVar[bool]
 
     @property
     @abc.abstractmethod

@@ -12,7 +12,7 @@ Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (gene
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -76,6 +76,7 @@ class StructuredLinearization(AbstractLinearization):
     direction: Float[Array, ""]
     spectrum: Complex[Array, " k"]
     renewals: Int[Array, ""]
+    is_structured: ClassVar[bool] = True
 
     @property
     def patience(self) -> int:

@@ -22,7 +22,7 @@ from ._interpolation import MultistepInterpolation, RateInterpolation, StateInte
 from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
-from ._structured import StructuredLinearization, differentiable as differentiable_projection, structured
+from ._structured import differentiable as differentiable_projection, structured
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
 from .controller import ControllerState
@@ -101,9 +101,9 @@ class Hermite(AbstractMultistep):
     causes that, unless `past_points` has no A-stable alternative. With large steps, implicit formulas damp components
     that should grow: no step covers more than two e-foldings of them.
 
-    A term that knows the structure of its Jacobian (`AbstractManifoldTerm.jacobian`) makes a step cost what solving with
-    that structure costs. Of its eigenvalues sixteen are then known, by Arnoldi's method: those near the inverse of the
-    step, where lightly damped vibrations and growing components are found first. One such vibration among very many
+    A term that knows the structure of its Jacobian (`AbstractManifoldTerm.jacobian`) makes a step cost what solving
+    with that structure costs. Of its eigenvalues sixteen are known, by Arnoldi's method: those near the inverse of the
+    step, where lightly damped vibrations and growing components are found first. One such vibration among many
     components that are damped well may be missed; the error estimate then keeps steps short.
 
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
@@ -199,7 +199,7 @@ class Hermite(AbstractMultistep):
         matrix = self._no_matrix(terms, t0, y0, args, free)
         if before is None:
             size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
-            first = probed_derivatives(field, t0, flat, size, along=_is_structured(matrix))
+            first = probed_derivatives(field, t0, flat, size, along=matrix.is_structured)
         else:
             first = derivatives(field, t0, flat)
         chart, failed = first.rest
@@ -271,7 +271,7 @@ class Hermite(AbstractMultistep):
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         latest = before, state.slope[-n:]
         newton = self._newton(terms, field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like, args)
-        if _is_structured(newton.matrix):
+        if newton.matrix.is_structured:
             solved = newton.matrix, newton.inverses
             y, f, g = differentiable_projection(newton.end[:3], field, t1, past, a, b, *solved)
         else:
@@ -362,7 +362,7 @@ class Hermite(AbstractMultistep):
     def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
-        if _is_structured(matrix):
+        if matrix.is_structured:
             renew = lambda y, rate: structured(freeze(terms), t, y, like, freeze(args))
         else:
             renew = lambda y, rate: linearize(field, t, y, rate, h, free)
@@ -401,10 +401,6 @@ class Hermite(AbstractMultistep):
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
-
-
-def _is_structured(matrix: AbstractLinearization) -> bool:
-    return isinstance(matrix, StructuredLinearization)
 
 
 def _ladder(past_points: tuple[int, ...]) -> np.ndarray:
