@@ -220,8 +220,6 @@ def test_combinations(pendulum):
     state = mb.assemble(pendulum)
     with pytest.raises(ValueError, match="Partition needs a solver that knows charts"):
         mb.simulate(pendulum, state, t1=0.1, solver=diffrax.Tsit5(), manifold=mb.manifold.Partition())
-    with pytest.raises(ValueError, match="Projection needs Adams or a Runge–Kutta solver"):
-        mb.simulate(pendulum, state, t1=0.1, manifold=mb.manifold.Projection(), solver=mb.solvers.Hermite())
     with pytest.raises(ValueError, match="coordinates and"):
         mb.simulate(pendulum, mb.State(jnp.zeros(2), jnp.zeros(3)), t1=0.1)
     with pytest.raises(ValueError, match="MultistepController"):

@@ -400,7 +400,8 @@ def dry_friction():
     ("build", "options", "message"),
     [
         (redundant, {}, r"only 3 are independent.*Partition\(\)"),
-        (ring, {"solver": mb.solvers.Hermite()}, "Projection needs Adams"),
+        (pendulum_on_paper, {"solver": mb.solvers.Hermite()}, r"Projection with Hermite needs a scene.*Partition\(\)"),
+        (dry_friction, {"solver": mb.solvers.Hermite()}, "Projection with Hermite takes constraints that are ideal"),
         (ring, {"formulation": Poincare()}, r"Projection with Adams finds accelerations by Multipliers\(\)"),
         (skater, {}, "linear in velocities"),
         (dry_friction, {}, "ideal"),

@@ -26,6 +26,8 @@ _DENSE_STEP = 0.15
 _DENSE_FLOP = 0.0003
 # The largest number of nodes that are left for a dense matrix.
 _LARGEST_REST = 400
+# So many levels are executed in one stage, and avoided where all bounds on the degree are tried.
+_MOST_LEVELS = 128
 _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 
 
@@ -76,18 +78,26 @@ class NodeOrder:
 
 
 def order_nodes(
-    neighbours: Sequence[Iterable[int]], size: int, *, after: Sequence[Iterable[int]] | None = None
+    neighbours: Sequence[Iterable[int]],
+    size: int,
+    *,
+    after: Sequence[Iterable[int]] | None = None,
+    every_bound: bool = False,
 ) -> NodeOrder:
     """An order of elimination of the nodes of a graph, of the lowest estimated cost.
 
     **Arguments:** `neighbours` of each node, without itself; `size` of a block; `after`: the nodes that must be
-    eliminated before each node.
+    eliminated before each node; `every_bound`: whether to try orders that eliminate nodes of higher degrees at once
+    even if one of low degrees exists, which may follow a chain from its end and take a level for each node.
     """
     tries = []
     for cap in _CAPS:
         tries.append(_eliminate([set(own) for own in neighbours], size, cap, after))
-        if cap >= tries[-1][3]:
+        if cap >= tries[-1][3] and not every_bound:
             break
+    if every_bound:
+        # On other machines than that of the estimate, steps that wait for each other cost more.
+        tries = [tried for tried in tries if len(tried[1]) <= _MOST_LEVELS] or tries
     cost, levels, rest, _ = min(tries, key=lambda tried: tried[0])
     return _laid_out(neighbours, levels, rest, size, cost)
 
@@ -206,9 +216,14 @@ def _cut(levels, size, most=3):
             (sum(-(-n // w) for n in widths[a:b]) * (_STEP + w * _FLOP * _step_flops(d, size)), w) for w in _LANES
         )
 
+    if count > _MOST_LEVELS:
+        most = 1
+        starts = [count]
+    else:
+        starts = range(1, count + 1)
     best = {(0, 0): (0.0, [])}
     for stages in range(1, most + 1):
-        for b in range(1, count + 1):
+        for b in starts:
             options = []
             for a in range(b):
                 before = best.get((stages - 1, a))

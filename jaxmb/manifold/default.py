@@ -15,10 +15,11 @@ def default_manifold(
     system: AbstractSystem, solver: diffrax.AbstractSolver, formulation: AbstractFormulation | None
 ) -> AbstractManifold:
     """The policy that suits a system, a solver, and a formulation if one is given."""
+    implicit = isinstance(solver, AbstractMultistep) and solver.solves_implicitly
     if system.acceleration_rows == 0:
-        return Unconstrained()
+        return Projection() if implicit and system.implicit_in_blocks else Unconstrained()
     if not isinstance(solver, AbstractMultistep):
         return Projection()
     # Block elimination serves multipliers only: it singles out no independent columns.
     in_blocks = system.elimination is not None and (formulation is None or formulation.takes_blocks)
-    return Projection() if in_blocks and not solver.solves_implicitly else Partition()
+    return Projection() if in_blocks and (system.implicit_in_blocks or not implicit) else Partition()

@@ -19,7 +19,8 @@ from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .impulse import after_impulse
-from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
+from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
+from .motion_jacobian import motion_jacobian
 from .orthogonal_projection import project, project_in_metric, project_normalized
 from .vector_field import VectorField
 
@@ -30,8 +31,8 @@ _ALLOWED = 8.0
 
 
 class Projection(AbstractManifold):
-    """Integrate all coordinates and velocities with any diffrax Runge–Kutta solver or with `Adams`, and project every
-    step on the constraints.
+    """Integrate all coordinates and velocities with any diffrax Runge–Kutta solver, with `Adams` or with `Hermite`, and
+    project every step on the constraints.
 
     With a Runge–Kutta solver the projection is the smallest change in the coordinates' scales, first of the
     configuration, then of the velocities. A first-same-as-last derivative is kept across it: the difference is of the
@@ -41,12 +42,18 @@ class Projection(AbstractManifold):
     positions, velocities and accelerations. The elimination follows the graph of joints: for chains, trees and local
     loops a step takes time and memory in proportion to the number of joints. Constraints must be ideal and linear in
     velocities. Rows that others imply are left out where a scene is large enough for sparse elimination, the same ones
-    throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs independent coordinates, which a
-    projection does not single out.
+    throughout a motion; in smaller scenes no row may be redundant.
 
-    **Arguments:** `newton_tol`: with `Adams`, size of the last Newton correction of positions relative to the system's
-    size, default tied to the tolerance of integration; one more correction is made with the factor of the state it led
-    to.
+    With `Hermite` it is the same projection, of every iterate of Newton's method. The matrix of a scene has blocks for
+    bodies that share a force or a joint, and is eliminated along with the joints in an order that their graph
+    determines: for trains, cables, trees and local loops a step takes time in proportion to the number of bodies. Of
+    the eigenvalues, which decide what formulas and steps are stable, those are found that matter: some near the
+    inverse of the step. Newton's matrix leaves out how directions of joints and forces change in a step, so it takes up
+    to a third more iterations than with `Partition`; derivatives are those of the exact equations.
+
+    **Arguments:** `newton_tol`: with `Adams` and `Hermite`, size of the last Newton correction of positions relative to
+    the system's size, default tied to the tolerance of integration; one more correction is made with the factor of the
+    state it led to.
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)
@@ -56,18 +63,19 @@ class Projection(AbstractManifold):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
             return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
-        if solver.solves_implicitly:
+        _check_multistep(system, formulation, type(solver).__name__)
+        if solver.solves_implicitly and (not system.has_bodies or system.nz):
             raise ValueError(
-                f"Projection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() with it."
+                f"Projection with {type(solver).__name__} needs a scene of bodies, whose graph orders its equations, "
+                "without internal states; use Partition()."
             )
-        _check_multistep(system, formulation)
         return ProjectionTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
 
     def default_formulation(self, system):
         return all_rows_formulation(system)
 
     def correction(self, interpolated):
-        return project_normalized if interpolated else None
+        return _returned if interpolated else None
 
     def statistics(self, solver_state):
         return {}
@@ -79,33 +87,38 @@ class Projection(AbstractManifold):
         return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
 
 
+def _returned(system, t, y):
+    """An interpolated state, returned to the constraints."""
+    return project_normalized(system, t, y) if system.velocity_rows else normalize_state(system, t, y)
+
+
 @eqx.filter_jit
 def _violated(system, t, y):
     """Whether redundant rows are violated at a state on the others."""
     return violation_of_dropped_rows(system, t, y, row_sizes(system, t, y)) > _ALLOWED * jnp.finfo(y.q.dtype).eps ** 0.5
 
 
-def _check_multistep(system, formulation):
+def _check_multistep(system, formulation, solver):
     """Refuse systems and formulations that one factor of `A M⁻¹ Aᵀ` does not serve."""
     if not system.positive_definite_mass:
         raise ValueError(
-            "Projection with Adams needs the inverse of the mass matrix, which is singular in these velocities; use "
-            "Partition()."
+            f"Projection with {solver} needs the inverse of the mass matrix, which is singular in these velocities; "
+            "use Partition()."
         )
     if not formulation.takes_blocks:
         raise ValueError(
-            f"Projection with Adams finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
+            f"Projection with {solver} finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
             "the formulation out, or use Partition()."
         )
     if system.elimination is None and system.acceleration_rank < system.acceleration_rows:
         raise ValueError(
             f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and "
-            "Projection with Adams drops none; use Partition()."
+            f"Projection with {solver} drops none; use Partition()."
         )
     if not (system.ideal_on_velocities and system.linear):
         raise ValueError(
-            "Projection with Adams takes constraints that are ideal, bind positions or velocities, and are linear in "
-            "velocities; use Partition()."
+            f"Projection with {solver} takes constraints that are ideal, bind positions or velocities, and are linear "
+            "in velocities; use Partition()."
         )
 
 
@@ -126,10 +139,14 @@ class ProjectionTerm(AbstractManifoldTerm):
 
     def evaluate(self, t, y, chart, args):
         system, y = self.system, State(self.system.normalize(y.q), y.u)
+        if system.velocity_rows == 0:
+            return ManifoldEvaluation(y, self.vf(t, y, args), chart, jnp.array(False), None)
         projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
         return ManifoldEvaluation(y, self._field(t, y, projector), chart, jnp.array(False), projector)
 
     def project_near(self, t, y, linearized_at, args):
+        if self.system.velocity_rows == 0:
+            return self.evaluate(t, y, linearized_at.chart, args)
         metric_at = lambda y: self.system.inertia(t, y.q, y.u)
         y, projector, iterations, failed = project_in_metric(
             self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
@@ -142,6 +159,16 @@ class ProjectionTerm(AbstractManifoldTerm):
         free = projector.metric.solve(system.force(t, y.q, y.u))
         udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
         return State(system.rates(t, y.q, y.u), udot)
+
+    def project_cold(self, t, y, chart, args):
+        if self.system.velocity_rows == 0:
+            return self.evaluate(t, y, chart, args)
+        return super().project_cold(t, y, chart, args)
+
+    def jacobian(self, t, y, args):
+        # Asked for by implicit solvers only, which `prepare` admits for scenes of bodies.
+        system: Any = self.system
+        return motion_jacobian(system, t, y)
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)

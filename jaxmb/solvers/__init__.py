@@ -5,4 +5,9 @@ from ._multistep import AbstractMultistep as AbstractMultistep
 from .adams import Adams as Adams, AdamsState as AdamsState
 from .controller import ControllerState as ControllerState, MultistepController as MultistepController
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
-from .manifold_term import AbstractManifoldTerm as AbstractManifoldTerm, ManifoldEvaluation as ManifoldEvaluation
+from .manifold_term import (
+    AbstractFieldJacobian as AbstractFieldJacobian,
+    AbstractManifoldTerm as AbstractManifoldTerm,
+    AbstractResolvent as AbstractResolvent,
+    ManifoldEvaluation as ManifoldEvaluation,
+)

@@ -14,7 +14,7 @@ from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around ter
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .manifold_term import AbstractFieldJacobian, AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):
@@ -108,6 +108,12 @@ def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Ev
         return _evaluate_plain(term, t, flat, like, args)
     out = manifold.project_near(t * term.direction, unravel_like(like, flat), before.of_manifold, args)
     return _raveled(term, out, flat.dtype)
+
+
+def field_jacobian(term: Any, t: Any, flat: Array, like: PyTree[Array], args: Args) -> AbstractFieldJacobian | None:
+    """The derivative of a vector field that knows its structure, in the direction of time of the term; else None."""
+    manifold = _manifold(term)
+    return None if manifold is None else manifold.jacobian(t * term.direction, unravel_like(like, flat), args)
 
 
 def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: Args) -> Any:

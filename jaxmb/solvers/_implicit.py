@@ -8,7 +8,7 @@ them f and g, follow from the constraints.
 import functools
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from ._damping import eigenvalues
 from ._lanes import cond_of_any_lane
+from ._linearization import AbstractLinearization
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -53,9 +54,11 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 
 
 def probed_derivatives(
-    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None
+    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
 ) -> Derivatives:
-    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known."""
+    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known;
+    `along`: whether to take differences along the manifold only, where a projection returns to it.
+    """
     eps = jnp.finfo(y.dtype).eps
     size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
     signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
@@ -65,8 +68,8 @@ def probed_derivatives(
     def at(y, _):
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
-        _, (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
-        return y + aside, (Derivatives(state, f, g, rest), slope)
+        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
+        return y + (lax.stop_gradient(move) if along else aside), (Derivatives(state, f, g, rest), slope)
 
     _, (both, slopes) = lax.scan(at, y, None, length=2)
     f = lax.stop_gradient(both.f)
@@ -86,8 +89,8 @@ def _warn():
     )
 
 
-class Linearization(eqx.Module):
-    """How a state and its derivatives in time change with the free components.
+class Linearization(AbstractLinearization):
+    """Full matrices: how a state and its derivatives in time change with the free components.
 
     **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held; `spectrum`:
     the eigenvalues of J, the free rows of `rate`; `renewals`: the number of next steps that must compute their own
@@ -99,6 +102,47 @@ class Linearization(eqx.Module):
     acceleration: Float[Array, "n free"]
     spectrum: Complex[Array, " free"]
     renewals: Int[Array, ""]
+
+    is_structured: ClassVar[bool] = False
+
+    # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
+    @property
+    def patience(self) -> int:
+        return 2 + self.spectrum.size // 2
+
+    @property
+    def slow(self) -> float:
+        return _SLOW
+
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        return inverses_of(self.rate[free], self.acceleration[free], a, b)
+
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        del a, b
+        zeros = jnp.zeros((free.size, free.size), self.state.dtype)
+        return Inverses(zeros, zeros, zeros[0, 0], zeros)
+
+    def observed(self, inverses: "Inverses", anew: Bool[Array, ""]) -> "Linearization":
+        del inverses, anew
+        return self
+
+    def moved(self, change: Float[Array, " free"]) -> Float[Array, " n"]:
+        return self.state @ change
+
+    def correction(self, inverses: "Inverses", offset, f, g, along, b, free):
+        # The stiffest part of g is combined with f: both are large and nearly cancel.
+        mismatch = g[free] - self.rate[free] @ along[free]
+        without = inverses.p @ (offset[free] - b * mismatch) - inverses.p_rate @ f[free]
+        change = inverses.c @ without
+        corrected = f - self.rate @ change
+        g = g + self.rate @ (corrected - along)[free] - self.acceleration @ change
+        return change, without, corrected, g
+
+    def errors(self, inverses: "Inverses", changes: Float[Array, "formulas n"], free: Int[Array, " free"]):
+        errors = changes[:, free] @ (self.state @ inverses.p).T
+        if free.size < changes.shape[1]:
+            errors = errors + (changes - changes[:, free] @ self.state.T)
+        return errors
 
 
 def linearize(
@@ -191,8 +235,8 @@ class Solved(NamedTuple):
 
     end: Derivatives
     converged: Bool[Array, ""]
-    matrix: Linearization
-    inverses: Inverses
+    matrix: AbstractLinearization
+    inverses: Any
     work: Int[Array, "2"]
 
 
@@ -217,10 +261,10 @@ def solve(
     predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
     before: tuple[Float[Array, " n"], Float[Array, " n"]],
     free: Int[Array, " free"],
-    matrix: Linearization,
+    matrix: AbstractLinearization,
     size: Callable[[Array], Any],
     tol: float,
-    renew: Callable[[Float[Array, " n"], Float[Array, " n"]], Linearization],
+    renew: Callable[[Float[Array, " n"], Float[Array, " n"]], Any],
 ) -> Solved:
     """Solve `y = past + a f + b g` for the free components by Newton's method.
 
@@ -249,20 +293,14 @@ def solve(
     none, one = jnp.zeros((), jnp.int32), jnp.ones((), past.dtype)
 
     def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
-        (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.state @ carry.change, has_aux=True)
+        (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.moved(carry.change), has_aux=True)
         along = carry.end.f
         g = push(jnp.ones_like(t), along)[1]
-        # The stiffest part of g is combined with f: both are large and nearly cancel.
-        mismatch = g[free] - matrix.rate[free] @ along[free]
-        without = inverses.p @ ((y - past)[free] - b * mismatch) - inverses.p_rate @ f[free]
-        change = inverses.c @ without
-        corrected = f - matrix.rate @ change
-        g = g + matrix.rate @ (corrected - along)[free] - matrix.acceleration @ change
-        now = jnp.maximum(size(matrix.state @ change), size(matrix.state @ without))
+        change, without, corrected, g = matrix.correction(inverses, y - past, f, g, along, b, free)
+        now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
         return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
 
-    # A new matrix costs about as much as half an iteration per column, and two or three iterations follow.
-    patience = 2 + free.size // 2
+    patience = matrix.patience
     far = jnp.maximum(_FAR * (size(before[0]) + size(a * before[1])), 1.0)
 
     def proceed(carry: _Iterate) -> Bool[Array, ""]:
@@ -276,24 +314,24 @@ def solve(
         anew = (matrix.renewals > 0) | (k > 0)
         renewed = lambda old: eqx.tree_at(lambda m: m.renewals, renew(start, rate), old.renewals)
         matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
-        inverses = inverses_of(matrix.rate[free], matrix.acceleration[free], a, b)
+        inverses = matrix.inverses(a, b, free)
+        matrix = matrix.observed(inverses, anew)
         first = _Iterate(nothing._replace(y=start, f=rate), jnp.zeros(free.size, past.dtype), one * jnp.inf, one, none)
         last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
         converged = last.size <= tol
-        slow = (last.iterations > 2) & (last.rate > _SLOW)
+        slow = (last.iterations > 2) & (last.rate > matrix.slow)
         renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
         renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
         matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
         # A matrix is not computed for the same state again.
         farther = jnp.where(anew, last.end.y, start)
-        nearest = jnp.where(last.rate < 1, last.end.y - matrix.state @ last.change, farther)
+        nearest = jnp.where(last.rate < 1, last.end.y - matrix.moved(last.change), farther)
         finite = jnp.isfinite(last.size)
         place = jnp.where(finite, nearest, before[0]), jnp.where(finite, last.end.f, before[1])
         work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
         return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
-    zeros = jnp.zeros((free.size, free.size), past.dtype)
-    inverses = Inverses(zeros, zeros, zeros[0, 0], zeros)
+    inverses = matrix.no_inverses(a, b, free)
     carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
     k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
     return Solved(end, k == _DONE, matrix, inverses, work)

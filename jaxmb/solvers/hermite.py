@@ -19,8 +19,10 @@ from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
+from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of
 from ._order import GAIN, LOWER, choose_order, growth_factors
+from ._structured import differentiable as differentiable_projection, structured
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
 from .controller import ControllerState
@@ -55,7 +57,7 @@ class HermiteState(eqx.Module):
     history: History
     slope: Float[Array, " m"]
     order_index: Int[Array, ""]
-    matrix: Linearization
+    matrix: AbstractLinearization
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
@@ -98,6 +100,11 @@ class Hermite(AbstractMultistep):
     chosen only for steps at which no eigenvalue of the Jacobian (computed whenever Newton's method needs a new one)
     causes that, unless `past_points` has no A-stable alternative. With large steps, implicit formulas damp components
     that should grow: no step covers more than two e-foldings of them.
+
+    A term that knows the structure of its Jacobian (`AbstractManifoldTerm.jacobian`) makes a step cost what solving
+    with that structure costs. Of its eigenvalues sixteen are known, by Arnoldi's method: those near the inverse of the
+    step, where lightly damped vibrations and growing components are found first. One such vibration among many
+    components that are damped well may be missed; the error estimate then keeps steps short.
 
     Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
@@ -188,22 +195,20 @@ class Hermite(AbstractMultistep):
     def _initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
         field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
+        free = free_components(terms, flat, chart)
+        matrix = self._no_matrix(terms, t0, y0, args, free)
         if before is None:
             size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
-            first = probed_derivatives(field, t0, flat, size)
+            first = probed_derivatives(field, t0, flat, size, along=matrix.is_structured)
         else:
             first = derivatives(field, t0, flat)
         chart, failed = first.rest
         # The NaN reaches the error estimate, so the step is rejected.
         f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
-        free = free_components(terms, flat, chart)
         if free.size == 0:
             raise ValueError(
                 "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
             )
-        none = jnp.zeros((flat.size, free.size), flat.dtype)
-        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
-        matrix = Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
         z, slope = self._recorded(flat, f, first.g)
         history = start(family, t0, z, slope, t1 - t0)
         if before is None:
@@ -220,6 +225,19 @@ class Hermite(AbstractMultistep):
         index = jnp.asarray(1, np.int32)
         sizes = self._first_sizes(flat, f, before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
+
+    @staticmethod
+    def _no_matrix(terms, t, y, args, free) -> AbstractLinearization:
+        """Zeros, and that the first step computes its own."""
+        flat = ravel(y)
+        known = eqx.filter_eval_shape(structured, terms, t, flat, y, args)
+        if known is not None:
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), known)
+            first = zeros.direction + jnp.asarray(terms.direction).astype(flat.dtype), jnp.asarray(1, jnp.int32)
+            return eqx.tree_at(lambda matrix: (matrix.direction, matrix.renewals), zeros, first)
+        none = jnp.zeros((flat.size, free.size), flat.dtype)
+        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
+        return Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
 
     @staticmethod
     def _memory(state):
@@ -252,8 +270,12 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         latest = before, state.slope[-n:]
-        newton = self._newton(field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like)
-        y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
+        newton = self._newton(terms, field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like, args)
+        if newton.matrix.is_structured:
+            solved = newton.matrix, newton.inverses
+            y, f, g = differentiable_projection(newton.end[:3], field, t1, past, a, b, *solved)
+        else:
+            y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
         chart, broke = newton.end.rest
 
         ends = coefficients.past @ history.differences[:, :n]
@@ -337,10 +359,13 @@ class Hermite(AbstractMultistep):
         }
         return y1, estimate, dense_info, new_state, failed
 
-    def _newton(self, field, t, h, past, a, b, predicted, before, free, matrix, scale, like) -> Solved:
+    def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
         size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
-        renew = lambda y, rate: linearize(field, t, y, rate, h, free)
+        if matrix.is_structured:
+            renew = lambda y, rate: structured(freeze(terms), t, y, like, freeze(args))
+        else:
+            renew = lambda y, rate: linearize(field, t, y, rate, h, free)
         return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
@@ -354,9 +379,7 @@ class Hermite(AbstractMultistep):
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = changes[:, free] @ (matrix.state @ inverses.p).T
-        if free.size < changes.shape[1]:
-            errors = errors + (changes - changes[:, free] @ matrix.state.T)
+        errors = matrix.errors(inverses, changes, free)
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     @property

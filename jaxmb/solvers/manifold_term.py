@@ -10,8 +10,9 @@ import abc
 from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
+import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 Chart: TypeAlias = PyTree[Array]
 Y: TypeAlias = PyTree[Array]
@@ -37,6 +38,37 @@ class ManifoldEvaluation(NamedTuple):
     chart: Chart
     failed: Bool[Array, ""]
     factors: PyTree = None
+
+
+class AbstractResolvent(eqx.Module):
+    """The solved form of `(1 - r J) z = x` for one complex number r, on the tangent space of a manifold."""
+
+    @abc.abstractmethod
+    def solve(self, x: Complex[Array, " n"]) -> Complex[Array, " n"]:
+        """`(1 - r J)⁻¹ x` of a raveled tangent vector."""
+
+    @abc.abstractmethod
+    def transpose_solve(self, x: Complex[Array, " n"]) -> Complex[Array, " n"]:
+        """The transpose of `solve`."""
+
+    @abc.abstractmethod
+    def weights(self) -> Float[Array, " n"]:
+        """Weights of the components in which J is nearly normal for eigenvalues of the size of 1 / r."""
+
+
+class AbstractFieldJacobian(eqx.Module):
+    """The derivative J of a vector field along its manifold at a state, in a form that knows its structure.
+
+    It may leave out terms that are small with the change of the state in a step: implicit solvers correct for them.
+    """
+
+    @abc.abstractmethod
+    def project(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The nearest tangent vector to a raveled one; a linear function."""
+
+    @abc.abstractmethod
+    def resolvent(self, r: Complex[Array, ""]) -> AbstractResolvent:
+        """Factor `1 - r J`."""
 
 
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
@@ -102,6 +134,15 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
         The result is used only if the step to this state is accepted. It is also called before a restart after a jump.
         """
+
+    def jacobian(self, t: Any, y: Y, args: Args) -> AbstractFieldJacobian | None:
+        """The derivative of the vector field at a state on the manifold, if the term knows its structure; by default
+        None, and implicit solvers compute a full matrix for the independent components.
+
+        A term that overrides this method projects states instead of singling out components: all of them are `free`.
+        """
+        del t, y, args
+        return None
 
     def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
         """Whether the state at which a chart was updated is none of the manifold; the step to it is then retried with a

@@ -96,6 +96,9 @@ def describe_scene(
     specialised = specialised_constraints(system)
     if system.elimination is not None:
         specialised.append(f"no dense Jacobian and no charts with Adams: {_elimination(system.elimination)}")
+    if system.implicit_in_blocks:
+        joined = f"{count} bodies" if system.elimination is None else f"{count} bodies with the joints"
+        specialised.append(f"no dense Newton matrix with Hermite: sparse elimination of {joined}")
     if not spatial:
         specialised.append("planar: no Euler parameters, no gyroscopic moment")
     if not forces and not laws:

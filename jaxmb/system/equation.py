@@ -36,6 +36,10 @@ else:
     from equinox import AbstractVar
 
 
+# From this number of velocities on, implicit methods are faster with block elimination. (A step of a chain of 12 rods,
+# 36 velocities, takes as long either way.)
+_LEAST_VELOCITIES = 40
+
 # An accessor of an array of the system, and the index of the parameter along axis 0 where parts are stacked.
 ParameterPath = tuple[Callable[[Any], Array], int | None]
 
@@ -354,6 +358,14 @@ class AbstractSystem(eqx.Module):
     def ideal_on_velocities(self) -> bool:
         """Whether every constraint is ideal and binds velocities."""
         return self.ideal and self.acceleration_rows == self.velocity_rows
+
+    @property
+    def implicit_in_blocks(self) -> bool:
+        """Whether implicit methods eliminate bodies and joints in blocks by default: where a scene is so large that
+        this is faster, unless constraints are not ideal or bind accelerations.
+        """
+        in_blocks = self.elimination is not None or self.acceleration_rows == 0
+        return self.has_bodies and self.ideal and in_blocks and self.nu >= _LEAST_VELOCITIES
 
     def velocity_jacobian(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]

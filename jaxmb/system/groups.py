@@ -1,6 +1,7 @@
 """Parts of one type, stacked: one kernel and one `vmap` serve any number of them."""
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -150,6 +151,16 @@ class AbstractConstraintGroup(eqx.Module):
         """Wrenches of the constraints on their bodies, `Aᵀ λ` body by body."""
 
     @abc.abstractmethod
+    def wrench_derivatives(
+        self,
+        t: Scalar,
+        poses: Float[Array, "b_ground p"],
+        velocities: Float[Array, "b_ground v"],
+        multipliers: Float[Array, "parts rows"],
+    ) -> Float[Array, "parts k v k v"]:
+        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies."""
+
+    @abc.abstractmethod
     def acceleration(
         self,
         t: Scalar,
@@ -213,11 +224,15 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     def wrenches(self, t, poses, velocities, multipliers):
         del velocities
+        return self._map(functools.partial(self._wrench, t), poses, more=(multipliers,))
 
-        def single(at, x, multipliers):
-            _, pull = jax.vjp(lambda x: at(t).residual(self._space, x, t), x)
-            return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
+    def _wrench(self, t, at, x, multipliers):
+        _, pull = jax.vjp(lambda x: at(t).residual(self._space, x, t), x)
+        return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        del velocities
+        single = lambda at, x, own: _along_moves(self._space, lambda x: self._wrench(t, at, x, own), x)
         return self._map(single, poses, more=(multipliers,))
 
     def acceleration(self, t, poses, velocities, accelerations):
@@ -257,9 +272,13 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
         return self._map(single, poses, velocities)
 
     def wrenches(self, t, poses, velocities, multipliers):
-        def single(at, x, v, multipliers):
-            return jax.vjp(lambda w: at(t).residual(self._space, x, w, t), v)[1](multipliers)[0]
+        return self._map(functools.partial(self._wrench, t), poses, velocities, more=(multipliers,))
 
+    def _wrench(self, t, at, x, v, multipliers):
+        return jax.vjp(lambda w: at(t).residual(self._space, x, w, t), v)[1](multipliers)[0]
+
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        single = lambda at, x, v, own: _along_moves(self._space, lambda x: self._wrench(t, at, x, v, own), x)
         return self._map(single, poses, velocities, more=(multipliers,))
 
     def acceleration(self, t, poses, velocities, accelerations):
@@ -269,6 +288,16 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
 
         rates = jax.vmap(self._space.rates)(poses, velocities)
         return self._map(single, poses, rates, velocities, accelerations)
+
+
+def _along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:
+    """Derivatives of a function of the poses of some bodies along their unit velocities, (…, k, v)."""
+    moves = jax.vmap(space.moves)(x)
+    k, size, _ = moves.shape
+    _, push = jax.linearize(function, x)
+    along = jnp.eye(k, dtype=x.dtype)[:, None, :, None] * moves[:, :, None, :]
+    columns = jax.vmap(push, out_axes=-1)(along.reshape(k * size, *x.shape))
+    return columns.reshape(*columns.shape[:-1], k, size)
 
 
 class ForceGroup(eqx.Module):
@@ -287,6 +316,20 @@ class ForceGroup(eqx.Module):
     ) -> dict[str, Float[Array, "parts *shape"]]:
         """Rates of the parts' internal states, by the name of the field."""
         single = lambda at, poses, v: at(t).state_rates(self.group.layout.space, poses, v, t)
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
+    def derivatives(
+        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
+    ) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
+        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies, and to the
+        velocities.
+        """
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            of_positions = _along_moves(space, lambda x: at(t).wrenches(space, x, v, t), x)
+            return of_positions, jax.jacfwd(lambda v: at(t).wrenches(space, x, v, t))(v)
+
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
@@ -344,6 +387,9 @@ class ServoGroup(AbstractConstraintGroup):
 
     def wrenches(self, t, poses, velocities, multipliers):
         return self.program.wrenches(t, poses, velocities, multipliers)
+
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        return self.program.wrench_derivatives(t, poses, velocities, multipliers)
 
     def acceleration(self, t, poses, velocities, accelerations):
         second = self.program.acceleration(t, poses, velocities, accelerations)

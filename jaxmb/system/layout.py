@@ -45,6 +45,11 @@ class Layout:
         return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu)
 
     @functools.cached_property
+    def coordinate_place(self) -> np.ndarray:
+        """Index of each coordinate among all bodies' poses, body by body, shape (nq,)."""
+        return np.flatnonzero(self.pose_index[:-1].ravel() < self.nq)
+
+    @functools.cached_property
     def nq(self) -> int:
         return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)
 

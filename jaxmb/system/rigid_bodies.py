@@ -7,8 +7,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._types import Scalar
 from ..linalg.arrays import unchecked_take
-from ..linalg.block_jacobian import block_jacobian
+from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, rotate
@@ -67,8 +68,14 @@ class RigidBodySystem(AbstractBodySystem):
     def structured_jacobian(self, t, q, u):
         if self.elimination is None:
             return DenseJacobian(self.jacobian(t, q, u))
+        return self.block_jacobian(t, q, u, self.elimination)
+
+    def block_jacobian(
+        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], order: JointOrder
+    ) -> BlockJacobian:
+        """`A` in blocks of joints on bodies."""
         blocks = [*self._blocks(t, q, u, self.joints), jnp.zeros(1, q.dtype)]
-        return block_jacobian(_join(blocks, q.dtype), self.elimination)
+        return block_jacobian(_join(blocks, q.dtype), order)
 
     def _blocks(self, t, q, u, groups):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
@@ -164,6 +171,15 @@ class RigidBodySystem(AbstractBodySystem):
             moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.moments_of_inertia, omega)
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         return sum(parts[1:], start=parts[0]) if parts else None
+
+    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "b v v"]:
+        """The derivative of each body's gyroscopic moment with respect to its own velocity."""
+        size = self.layout.space.velocity_size
+        if not self.spatial:
+            return jnp.zeros((self.layout.bodies, size, size), u.dtype)
+        moment = lambda J, w: -cross(w, J @ w)
+        own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
+        return jnp.pad(own, ((0, 0), (3, 0), (3, 0)))
 
     # Energy and momentum
 

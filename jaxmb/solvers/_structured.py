@@ -1,0 +1,263 @@
+"""Newton's method with a Jacobian that knows its structure, where a term on a manifold has one.
+
+All components of the state are unknowns, and each iterate is projected on the manifold: the solution is the projection
+of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)` one factor of `1 - r J` for a complex number r solves
+for corrections; the eigenvalues of J near 1 / r, which decide what formulas and steps are stable, follow from Arnoldi's
+method with the same factor. The factor leaves out some terms of the exact derivative. Newton's method converges without
+them, linearly, and the derivative of its solution is found by iteration with the exact linear function, which the
+factor preconditions.
+
+Sources: Y. Saad, "Numerical Methods for Large Eigenvalue Problems", SIAM, 2011 (shift-and-invert Arnoldi); S. C.
+Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (generalized conjugate residuals).
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from ._damping import eigenvalues
+from ._evaluation import field_jacobian, freeze
+from ._implicit import Field
+from ._lanes import cond_of_any_lane
+from ._linearization import AbstractLinearization
+from .manifold_term import AbstractFieldJacobian, AbstractResolvent
+
+# Steps of Arnoldi's method for the spectrum.
+_ARNOLDI = 16
+# Eigenvalues of the inverse below this belong to components that decay, or change, in much less than a step.
+_SMALL = 0.02
+# A matrix is renewed after a step whose corrections shrank more slowly than by this factor, and in a step where more
+# than about this number of iterations would follow.
+_SLOW, _PATIENCE = 0.35, 8
+# The largest number of iterations for derivatives, and the relative residual at which they end.
+_ITERATIONS, _RESIDUAL = 40, 1e-14
+
+
+class StructuredInverses(eqx.Module):
+    """The factor of `1 - r J`, and the numbers of the step.
+
+    **Fields:** `resolvent`; `a`, `b`; `r`.
+    """
+
+    resolvent: AbstractResolvent
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    r: Complex[Array, ""]
+
+    def solve(self, x: Float[Array, " n"], rates: Float[Array, " n"] | None = None) -> Any:
+        """`(1 - a J - b J²)⁻¹ (x + (a + b J) rates)` of tangent vectors, and J times that."""
+        real, imaginary = jnp.real(self.r), jnp.imag(self.r)
+        load = lax.complex(x, -real / imaginary * x)
+        if rates is not None:
+            load = load + lax.complex(self.a * rates, -(real**2 - imaginary**2) / imaginary * rates)
+        solved = self.resolvent.solve(load)
+        return jnp.real(solved), jnp.real((solved - load) / self.r)
+
+    def transpose_solve(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The transpose of `solve`, without rates."""
+        real, imaginary = jnp.real(self.r), jnp.imag(self.r)
+        solved = self.resolvent.transpose_solve(x.astype(self.r.dtype))
+        return jnp.real(solved) + real / imaginary * jnp.imag(solved)
+
+
+class StructuredLinearization(AbstractLinearization):
+    """A matrix that knows its structure; the unknowns are all components of the state.
+
+    **Fields:** the `jacobian` J of the term; `direction` of time; `spectrum`: eigenvalues of J of the size of those
+    that formulas may amplify; `renewals`: the number of next steps that must compute their own matrix.
+    """
+
+    jacobian: AbstractFieldJacobian
+    direction: Float[Array, ""]
+    spectrum: Complex[Array, " k"]
+    renewals: Int[Array, ""]
+    is_structured: ClassVar[bool] = True
+
+    @property
+    def patience(self) -> int:
+        return _PATIENCE
+
+    @property
+    def slow(self) -> float:
+        return _SLOW
+
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> StructuredInverses:
+        del free
+        # The roots are complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
+        product, least = -b - a**2 / 4, a**2 / 1000
+        r = lax.complex(a / 2, jnp.sqrt(jnp.maximum(product, least)))
+        return StructuredInverses(self.jacobian.resolvent(r * self.direction.astype(r.dtype)), a, b, r)
+
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> StructuredInverses:
+        shapes = eqx.filter_eval_shape(self.inverses, a, b, free)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def observed(self, inverses: StructuredInverses, anew: Bool[Array, ""]) -> "StructuredLinearization":
+        """With the spectrum of a matrix that is new."""
+        find = lambda old: _spectrum(inverses, self.jacobian.project)
+        return eqx.tree_at(lambda m: m.spectrum, self, cond_of_any_lane(anew, find, lambda old: old, self.spectrum))
+
+    def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return change
+
+    def correction(self, inverses: StructuredInverses, offset, f, g, along, b, free):
+        del free
+        mismatch, lag = offset - inverses.a * along - b * g, along - f
+        mismatch, lag = lax.map(self.jacobian.project, jnp.stack([mismatch, lag]))
+        change, rate = inverses.solve(mismatch, lag)
+        # f at y - change; with it y - change = past + a f + b g along the manifold.
+        corrected = f - rate
+        g = g - (change - mismatch - inverses.a * (lag + rate)) / b
+        return change, change, corrected, g
+
+    def errors(self, inverses: StructuredInverses, changes: Float[Array, "formulas n"], free: Int[Array, " free"]):
+        del free
+
+        def error(change):
+            along = self.jacobian.project(change)
+            return inverses.solve(along)[0] + change - along
+
+        return lax.map(error, changes)
+
+
+def structured(term: Any, t: Any, y: Float[Array, " n"], like: Any, args: Any) -> StructuredLinearization | None:
+    """The linearisation of a term that knows the structure of its Jacobian, without its spectrum; else None."""
+    jacobian = field_jacobian(term, t, y, like, args)
+    if jacobian is None:
+        return None
+    direction = jnp.asarray(term.direction).astype(y.dtype)
+    spectrum = lax.complex(*[jnp.zeros(_ARNOLDI, y.dtype)] * 2)
+    return freeze(StructuredLinearization(jacobian, direction, spectrum, jnp.array(0, jnp.int32)))
+
+
+def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -> Complex[Array, " k"]:
+    """Eigenvalues of J near 1 / r, by Arnoldi's method for the inverse of `1 - r J`; zero for others."""
+    weights = inverses.resolvent.weights()
+    n, m = weights.size, _ARNOLDI
+    # Any start that excites all components.
+    places = jnp.arange(n, dtype=weights.dtype)
+    start = jnp.stack([jnp.cos(1.0 + 2.3 * places + 0.1 * places**2), jnp.sin(0.5 + 1.7 * places + 0.1 * places**2)])
+    start = lax.map(lambda x: weights * project(x / weights), start)
+    start = lax.complex(start[0], start[1])
+    floor = jnp.finfo(weights.dtype).tiny
+    size = lambda x: jnp.sqrt(jnp.sum(jnp.real(x * jnp.conj(x)))) + floor
+    basis = jnp.zeros((m + 1, n), start.dtype).at[0].set(start / size(start).astype(start.dtype))
+
+    scale = weights.astype(start.dtype)
+
+    def extend(basis, k):
+        x = scale * inverses.resolvent.solve(basis[k] / scale)
+        column = jnp.zeros(m + 1, x.dtype)
+        # Twice is enough.
+        for _ in range(2):
+            along = jnp.conj(basis) @ x
+            column, x = column + along, x - along @ basis
+        length = size(x).astype(x.dtype)
+        return basis.at[k + 1].set(x / length), column.at[k + 1].set(length)
+
+    _, columns = lax.scan(extend, basis, jnp.arange(m))
+    found = eigenvalues(columns[:, :m].T)
+    magnitude = jnp.abs(found)
+    counts = magnitude > _SMALL * jnp.max(magnitude)
+    safe = jnp.where(counts, found, jnp.ones_like(found))
+    return jnp.where(counts & jnp.isfinite(magnitude), (1 - 1 / safe) / inverses.r, jnp.zeros_like(found))
+
+
+@eqx.filter_custom_jvp
+def differentiable(
+    end: tuple[Array, Array, Array],
+    field: Field,
+    t: Any,
+    past: Float[Array, " n"],
+    a: Any,
+    b: Any,
+    matrix: StructuredLinearization,
+    inverses: StructuredInverses,
+) -> tuple[Array, Array, Array]:
+    """`(y, f, g)` at the `end` of a step, a projection of `past + a f + b g`, with its derivatives."""
+    del field, t, past, a, b, matrix, inverses
+    return end
+
+
+@differentiable.def_jvp
+def _differentiable_jvp(primals, tangents):
+    _, field, t, past, a, b, matrix, inverses = primals
+    _, dfield, dt, dpast, da, db, _, _ = tangents
+    y, f, g = differentiable(*primals)
+    matrix, inverses = freeze((matrix, inverses))
+    values, structure = eqx.partition(field, eqx.is_inexact_array)
+
+    def at(values, t, y):
+        # g for a held rate: the other part of its change is J times that of the rate.
+        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, y, has_aux=True)
+        return state, rate, push(jnp.ones_like(t), f)[1]
+
+    _, push = jax.linearize(at, values, t, y)
+    dense = lambda tangent, primal: jnp.zeros_like(primal) if tangent is None else tangent
+    dvalues = jax.tree.map(lambda v, d: None if v is None else dense(d, v), values, dfield, is_leaf=lambda x: x is None)
+    moved = push(dvalues, dense(dt, t), jnp.zeros_like(y))
+    zeros = jax.tree.map(jnp.zeros_like, (values, t))
+    along = lambda change: push(*zeros, change)
+    load = dense(dpast, past) + dense(da, a) * f + dense(db, b) * g
+    load = load + a * moved[1] + b * (moved[2] + along(moved[1])[1])
+
+    def apply(change):
+        _, rate, held = along(change)
+        return change - a * rate - b * (held + along(rate)[1])
+
+    project = matrix.jacobian.project
+
+    def precondition(x):
+        tangent = project(x)
+        return inverses.solve(tangent)[0] + x - tangent
+
+    def precondition_transpose(x):
+        pull = jax.linear_transpose(project, x)
+        return x + pull(inverses.transpose_solve(x) - x)[0]
+
+    change = lax.custom_linear_solve(
+        apply,
+        load,
+        lambda apply, x: _iterate(apply, precondition, x),
+        lambda apply, x: _iterate(apply, precondition_transpose, x),
+    )
+    dstate, drate, dheld = (own + of_change for own, of_change in zip(moved, along(change), strict=True))
+    return (y, f, g), (dstate, drate, dheld + along(drate)[1])
+
+
+def _iterate(
+    apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]
+) -> Array:
+    """The solution of a linear equation by generalized conjugate residuals."""
+    n, dtype = load.size, load.dtype
+    target = _RESIDUAL * jnp.sqrt(jnp.sum(load**2))
+
+    def proceed(carry):
+        k, _, residual, _, _ = carry
+        return (k < _ITERATIONS) & (jnp.sqrt(jnp.sum(residual**2)) > target)
+
+    def step(carry):
+        k, x, residual, directions, images = carry
+        direction = precondition(residual)
+        image = apply(direction)
+        for _ in range(2):
+            along = images @ image
+            image, direction = image - along @ images, direction - along @ directions
+        size = jnp.sqrt(jnp.sum(image**2)) + jnp.finfo(dtype).tiny
+        image, direction = image / size, direction / size
+        part = jnp.sum(image * residual)
+        return (
+            k + 1,
+            x + part * direction,
+            residual - part * image,
+            directions.at[k].set(direction),
+            images.at[k].set(image),
+        )
+
+    blank = jnp.zeros((_ITERATIONS, n), dtype)
+    return lax.while_loop(proceed, step, (jnp.array(0), jnp.zeros_like(load), load, blank, blank))[1]

@@ -1,0 +1,197 @@
+"""The graph of a scene's bodies, forces and joints, and the order in which implicit methods eliminate it.
+
+An implicit step solves
+
+    [ M − r D − r² K   −Aᵀ ] [z]   [b]
+    [       A           0  ] [l] = [c]
+
+with the derivatives K and D of the forces with respect to positions and velocities, for a complex number r. Bodies and
+joints are the nodes of the elimination, and a body is a neighbour of those that share a force or a joint with it. For
+dissipative forces the values of `xᴴ (M − r D − r² K) x` are in a sector of the complex plane with an opening below 180
+degrees, and so are those of every Schur complement, so the pivots of bodies are regular. The pivot of a joint is if the
+rows of the joints that have been eliminated are independent for the bodies that have been. A joint of a spanning tree
+therefore waits for the body below it, and a joint that closes a loop for all bodies of a shortest loop.
+
+Source: J. Brüdigam and Z. Manchester, "Linear-time variational integrators in maximal coordinates", 2021 (elimination
+over the graph of bodies and joints).
+"""
+
+import collections
+import dataclasses
+import functools
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from ..linalg.block_jacobian import JointOrder
+from ..linalg.elimination_order import NodeOrder, order_nodes
+from ..linalg.sums import PlacedSums, placed_sums
+from .joint_graph import joint_order
+from .layout import Layout
+from .rigid_bodies import RigidBodySystem
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionOrder:
+    """The order of elimination of a scene's bodies and joints; static, compared by its `key`.
+
+    A body has v velocities, a joint r rows, a node b = max(v, r).
+
+    **Fields:**
+
+    - `joints`: the order of the joints alone, which holds their rows; None of a scene without joints.
+    - `row`, `column` (pairs,): the bodies that act on each other, first each body with itself; `sums`: sums of what
+        forces and joints contribute, for each pair; `by_row` and `by_column`: sums of pairs for each body.
+    - `lower`, `upper` (stored blocks,): where the blocks are found among those of pairs, of joints on bodies, their
+        transposes, the identities of joints, and a zero.
+    - `nodes`: the order of elimination, bodies first.
+    """
+
+    key: Any
+    joints: JointOrder | None = dataclasses.field(compare=False)
+    row: np.ndarray = dataclasses.field(compare=False)
+    column: np.ndarray = dataclasses.field(compare=False)
+    sums: PlacedSums = dataclasses.field(compare=False)
+    by_row: PlacedSums = dataclasses.field(compare=False)
+    by_column: PlacedSums = dataclasses.field(compare=False)
+    lower: np.ndarray = dataclasses.field(compare=False)
+    upper: np.ndarray = dataclasses.field(compare=False)
+    nodes: NodeOrder = dataclasses.field(compare=False)
+
+
+def motion_order(system: RigidBodySystem) -> MotionOrder:
+    """The order of elimination of a scene's bodies and joints."""
+    joints = system.elimination
+    if joints is None and system.velocity_rows > 0:
+        joints = joint_order(system)
+    acting = tuple(g.group.bodies for g in (*system.forces, *system.joints))
+    return _motion_order(system.layout, acting, joints)
+
+
+@functools.lru_cache(maxsize=64)
+def _motion_order(
+    layout: Layout, acting: tuple[tuple[tuple[int, ...], ...], ...], joints: JointOrder | None
+) -> MotionOrder:
+    ground, size = layout.bodies, layout.space.velocity_size
+    # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.system.stiffness` lists them.
+    rows = [own[i] for group in acting for own in group for i in range(len(own)) for _ in own]
+    columns = [own[j] for group in acting for own in group for _ in own for j in range(len(own))]
+    rows, columns = [*rows, *range(ground)], [*columns, *range(ground)]
+    places: dict[tuple[int, int], int] = {(body, body): body for body in range(ground)}
+    outside = -1
+    of_entries = np.array(
+        [
+            outside if ground in pair else places.setdefault(pair, len(places))
+            for pair in zip(rows, columns, strict=True)
+        ],
+        np.int64,
+    )
+    row, column = np.array(list(places), np.int32).reshape(-1, 2).T
+
+    of_joints = [] if joints is None else [tuple(int(b) for b in own if b != ground) for own in joints.bodies]
+    neighbours: list[set[int]] = [set() for _ in range(ground + len(of_joints))]
+    for a, b in places:
+        if a != b:
+            neighbours[a].add(b)
+            neighbours[b].add(a)
+    for joint, own in enumerate(of_joints, ground):
+        neighbours[joint].update(own)
+        for body in own:
+            neighbours[body].add(joint)
+    widest = size if joints is None else max(size, joints.rows.shape[1])
+    after = [*([()] * ground), *_bodies_before(of_joints, ground)]
+    nodes = order_nodes(neighbours, widest, after=after, every_bound=True)
+
+    # Blocks of pairs, of joints on bodies, their transposes, identities of joints, and a zero.
+    pairs, most = len(places), 0 if joints is None else joints.bodies.shape[1]
+    across = len(of_joints) * most
+    block = {
+        (b, a): pairs + across + k * most + own.index(b)
+        for k, own in enumerate(of_joints)
+        for a in [ground + k]
+        for b in own
+    }
+    source = dict(places)
+    for (body, joint), place in block.items():
+        source[joint, body] = place - across
+        source[body, joint] = place
+    source |= {(ground + k, ground + k): pairs + 2 * across + k for k in range(len(of_joints))}
+    zero = pairs + 2 * across + len(of_joints)
+    ends = list(zip(nodes.row.tolist(), nodes.column.tolist(), strict=True))
+    lower = np.array([source.get((a, b), zero) for a, b in ends], np.int32)
+    upper = np.array([source.get((b, a), zero) for a, b in ends], np.int32)
+    order = MotionOrder(
+        key=None,
+        joints=joints,
+        row=row,
+        column=column,
+        sums=placed_sums(of_entries, pairs),
+        by_row=placed_sums(row, ground),
+        by_column=placed_sums(column, ground),
+        lower=lower,
+        upper=upper,
+        nodes=nodes,
+    )
+    return dataclasses.replace(order, key=_digest(order))
+
+
+def _digest(order):
+    """A key that is equal for equal orders."""
+    digest = hashlib.sha256()
+    for field in dataclasses.fields(order):
+        value = getattr(order, field.name)
+        if isinstance(value, np.ndarray):
+            digest.update(repr(value.shape).encode() + np.ascontiguousarray(value).tobytes())
+        elif value is not None:
+            digest.update(value.key)
+    return digest.digest()
+
+
+def _bodies_before(joints: list[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
+    """The bodies that are eliminated before each joint."""
+    at: list[list[int]] = [[] for _ in range(ground + 1)]
+    vertices = [own if len(own) > 1 else (*own, ground) for own in joints]
+    for joint, own in enumerate(vertices):
+        for vertex in own:
+            at[vertex].append(joint)
+    before: list[tuple[int, ...]] = [()] * len(joints)
+    reached = [False] * (ground + 1)
+    waits = [False] * len(joints)
+    for root in [ground, *range(ground)]:
+        if reached[root]:
+            continue
+        reached[root] = True
+        queue = collections.deque([root])
+        while queue:
+            for joint in at[queue.popleft()]:
+                below = next((vertex for vertex in vertices[joint] if not reached[vertex]), None)
+                if below is not None and not waits[joint]:
+                    reached[below] = waits[joint] = True
+                    before[joint] = (below,)
+                    queue.append(below)
+    for joint, own in enumerate(vertices):
+        if not waits[joint]:
+            before[joint] = tuple(body for body in _shortest_loop(joint, own, at, vertices) if body != ground)
+    return before
+
+
+def _shortest_loop(joint, own, at, vertices):
+    """The vertices of a shortest loop through a joint; those of the joint where it is on none."""
+    start, *ends = own
+    found = set(own)
+    for end in ends:
+        above = {start: start}
+        queue = collections.deque([start])
+        while queue and end not in above:
+            vertex = queue.popleft()
+            for other in at[vertex]:
+                if other != joint:
+                    for far in vertices[other]:
+                        if far not in above:
+                            above[far] = vertex
+                            queue.append(far)
+        while end in above and end != start:
+            end = above[end]
+            found.add(end)
+    return found

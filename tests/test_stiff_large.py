@@ -1,0 +1,301 @@
+"""`Hermite` on scenes of any size: its sparse elimination against dense matrices, and its motions against others."""
+
+import math
+import re
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+from oracles.sprung_chain import sprung_chain
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.linalg.block_lu import eliminate_unsymmetric
+from jaxmb.linalg.elimination_order import order_nodes
+from jaxmb.manifold import Partition, Projection, Unconstrained, default_manifold
+from jaxmb.manifold.motion_jacobian import motion_jacobian
+from jaxmb.solvers import Hermite
+from jaxmb.solvers._structured import StructuredInverses, _spectrum
+
+R = 0.03 + 0.02j
+
+
+def chain(n, *, stiffness=1e4, damping=20.0, curl=0.0):
+    """Rods on hinges with stiff springs, from the ground on."""
+    bodies, joints, forces, end = [], [], [mb.Gravity((0.0, -9.81))], np.zeros(2)
+    for k in range(n):
+        angle = 0.3 + curl * k
+        along = np.array([np.cos(angle), np.sin(angle)])
+        bodies.append(planar.Body(f"rod{k}", mass=1.0, inertia=1 / 12, position=end + along / 2, angle=angle))
+        end = end + along
+        before, point = (f"rod{k - 1}", (0.5, 0.0)) if k else ("ground", (0.0, 0.0))
+        places = {"point_a": point, "point_b": (-0.5, 0.0)}
+        joints.append(planar.Revolute(f"hinge{k}", before, f"rod{k}", **places))
+        if k:
+            rates = {"stiffness": (0.0, 0.0, stiffness), "damping": (0.0, 0.0, damping), "free_angle": curl}
+            forces.append(planar.Bushing(f"spring{k}", before, f"rod{k}", **places, **rates))
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def cable(n, *, stiffness=0.5, damping=5e-4):
+    """The library's cable with springs that resist bending and torsion; the ground closes a loop."""
+    plain = mb.mechanisms.get("cable", n=n)
+    poses, l, m = np.asarray(plain.state.q).reshape(n, 7), 1.0 / n, 1.0 / n
+    inertia = spatial.rod(m, l, radius=0.01)
+    rods = [
+        spatial.Body(f"rod{k}", mass=m, inertia=inertia, position=pose[:3], orientation=pose[3:])
+        for k, pose in enumerate(poses)
+    ]
+    left, right = (-l / 2, 0.0, 0.0), (l / 2, 0.0, 0.0)
+    joints = [spatial.Spherical("ball0", "ground", "rod0", point_a=(0.0, 0.0, 0.0), point_b=left)]
+    forces = [mb.Gravity((0.0, 0.0, -9.81))]
+    for k in range(1, n):
+        pair = f"rod{k - 1}", f"rod{k}"
+        joints.append(spatial.Spherical(f"ball{k}", *pair, point_a=right, point_b=left))
+        rates = {"stiffness": (0.0,) * 3 + (stiffness,) * 3, "damping": (0.0,) * 3 + (damping,) * 3}
+        upright = {"orientation": (1.0, 0.0, 0.0, 0.0)}
+        forces.append(spatial.Bushing(f"bend{k}", *pair, point_a=right, point_b=left, **rates, **upright))
+    joints.append(spatial.Spherical(f"ball{n}", f"rod{n - 1}", "ground", point_a=right, point_b=(0.8, 0.0, 0.0)))
+    return mb.Scene(rods, joints=joints, forces=forces).compile()
+
+
+def ladder(n):
+    """Two chains of rods with rungs between them: loops that share bodies, and implied rows in none of them."""
+    bodies, joints, forces = [], [], [mb.Gravity((0.0, -9.81))]
+    for k in range(n):
+        for side, x in (("l", 0.0), ("r", 1.0)):
+            before = f"{side}{k - 1}" if k else "ground"
+            bodies.append(planar.Body(f"{side}{k}", mass=1.0, inertia=0.1, position=(x, -k - 0.5)))
+            joints.append(planar.Revolute(f"{side}{k}_pin", before, f"{side}{k}", point=(x, -k)))
+            if k:
+                spring = {"stiffness": (0.0, 0.0, 1e3), "damping": (0.0, 0.0, 1.0)}
+                forces.append(planar.Bushing(f"{side}{k}_spring", before, f"{side}{k}", point=(x, -k), **spring))
+        bodies.append(planar.Body(f"rung{k}", mass=0.5, inertia=0.05, position=(0.5, -k - 0.8)))
+        joints.append(planar.Revolute(f"rung{k}_l", f"l{k}", f"rung{k}", point=(0.0, -k - 0.8)))
+        joints.append(planar.Revolute(f"rung{k}_r", f"rung{k}", f"r{k}", point=(1.0, -k - 0.8)))
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def tower(n):
+    """Spatial bodies on bushings alone, from the ground on."""
+    bodies = [
+        spatial.Body(f"b{k}", mass=1.0, inertia=np.diag([0.1, 0.2, 0.3]), position=(0.0, 0.0, k + 0.5))
+        for k in range(n)
+    ]
+    rates = {"stiffness": (1e5,) * 3 + (1e4,) * 3, "damping": (1e2,) * 3 + (1e1,) * 3}
+    pairs = [("ground" if k == 0 else f"b{k - 1}", f"b{k}", k) for k in range(n)]
+    forces = [spatial.Bushing(f"mount{k}", a, b, point=(0.0, 0.1, float(k)), **rates) for a, b, k in pairs]
+    return mb.Scene(bodies, forces=[mb.Gravity((0.0, 0.0, -9.81)), *forces]).compile()
+
+
+def moving(system, seed=0):
+    """A state on the constraints with some velocities and angles."""
+    random = np.random.default_rng(seed)
+    state = mb.assemble(system)
+    u = jnp.asarray(random.normal(size=system.nu))
+    return mb.manifold.project(system, 0.0, mb.State(state.q, u))
+
+
+# Linear algebra
+
+
+@pytest.mark.parametrize(("n", "size"), [(30, 2), (9, 4)])
+def test_elimination_of_unsymmetric_matrices(n, size):
+    random = np.random.default_rng(n)
+    neighbours = [set() for _ in range(n)]
+    for i, j in [*zip(range(n - 1), range(1, n), strict=True), (0, n - 1), (2, n // 2)]:
+        neighbours[i].add(j)
+        neighbours[j].add(i)
+    order = order_nodes(neighbours, size)
+    entries = lambda: random.normal(size=(size, size)) + 1j * random.normal(size=(size, size))
+    lower, upper = np.zeros((2, order.blocks, size, size), complex)
+    full = np.zeros((n, size, n, size), complex)
+    for k, (i, j) in enumerate(zip(order.row, order.column, strict=True)):
+        if i == j:
+            lower[k] = full[i, :, i] = entries() + 6 * np.eye(size)
+        elif j in neighbours[i]:
+            lower[k] = full[i, :, j] = entries()
+            upper[k] = full[j, :, i] = entries()
+    factor = eliminate_unsymmetric(jnp.asarray(lower), jnp.asarray(upper), order)
+    x = entries()[:1].repeat(n, axis=0) * np.arange(1, n + 1)[:, None]
+    matrix = full.reshape(n * size, n * size)
+    found = factor.solve(jnp.asarray(x)), factor.transpose().solve(jnp.asarray(x))
+    for own, dense in zip(found, (matrix, matrix.T), strict=True):
+        np.testing.assert_allclose(own.ravel(), np.linalg.solve(dense, x.ravel()), rtol=0, atol=1e-13)
+
+
+def dense_resolvent(system, y, x, r):
+    """The same equations with dense matrices, from the whole system's functions."""
+    t, (q, u) = 0.0, (y.q, y.u)
+    A, M = system.jacobian(t, q, u), system.inertia(t, q, u)
+    _, multipliers = mb.formulations.accelerations(system, mb.formulations.Multipliers(), t, q, u)
+    force = lambda q, u: system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
+    N = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
+    K, D = jax.jacfwd(force, (0, 1))(q, u)
+    mass, m = M.product(jnp.eye(system.nu)), A.shape[0]
+    K, D, N, mass, A = map(np.asarray, (K @ N, D, N, mass, A))
+    top = np.concatenate([mass - r * D - r**2 * K, A.T], axis=1)
+    matrix = np.concatenate([top, np.concatenate([A, np.zeros((m, m))], axis=1)])
+    move = np.linalg.lstsq(N, x[: system.nq])[0]
+    load = np.concatenate([mass @ x[system.nq :] + r * K @ move, np.zeros(m)])
+    solved = np.linalg.solve(matrix, load)[: system.nu]
+    return np.concatenate([N @ (move + r * solved), solved])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 6), (ladder, 5), (tower, 4)])
+def test_resolvents_are_those_of_dense_matrices(build, n):
+    system = build(n)
+    y = moving(system)
+    jacobian = motion_jacobian(system, 0.0, y)
+    random = np.random.default_rng(1)
+    x, w = random.normal(size=(2, system.nq + system.nu)) + 1j * random.normal(size=(2, system.nq + system.nu))
+    resolvent = jacobian.resolvent(jnp.asarray(R))
+    found = resolvent.solve(jnp.asarray(x))
+    expected = dense_resolvent(system, y, x, R)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(expected)))
+    across = resolvent.transpose_solve(jnp.asarray(w))
+    np.testing.assert_allclose(np.sum(across * x), np.sum(w * found), rtol=1e-10)
+    # A projection, on tangent vectors of the constraints.
+    tangent = jacobian.project(jnp.asarray(x.real))
+    np.testing.assert_allclose(jacobian.project(tangent), tangent, rtol=0, atol=1e-11)
+    bound = system.jacobian(0.0, y.q, y.u) @ tangent[system.nq :]
+    np.testing.assert_allclose(bound, 0.0, rtol=0, atol=1e-11)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("damping", [0.0, 20.0])
+def test_the_spectrum_is_that_near_the_step(damping):
+    """Of the dense Jacobian in independent coordinates, by `linearise` at rest: the eigenvalue nearest to an
+    undamped vibration with `|h λ|` of a few, which decides on formulas, is found.
+    """
+    system = chain(6, stiffness=1e3, damping=damping)
+    hanging = mb.assemble(system, fix={f"rod{k}.angle": -np.pi / 2 for k in range(6)})
+    expected = np.asarray(mb.linearise(system, hanging).eigenvalues)
+    jacobian = motion_jacobian(system, 0.0, hanging)
+    r = jnp.asarray(1 / (1.4 * np.max(np.abs(expected.imag)) * (0.8 - 0.6j)))
+    inverses = StructuredInverses(jacobian.resolvent(r), jnp.real(2 * r), -(jnp.abs(r) ** 2), r)
+    found = np.asarray(_spectrum(inverses, jacobian.project))
+    nearest = expected[np.argsort(np.abs(1 / (1 - complex(r) * expected)))[-3:]]
+    for own in nearest:
+        assert np.min(np.abs(found - own)) <= 1e-6 * abs(own)
+
+
+# Motions
+
+
+def run(system, state, *, rtol, **options):
+    return mb.simulate(system, state, rtol=rtol, solver=Hermite(), **options)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "build, n, t1",
+    [(lambda n: chain(n, stiffness=1e5, damping=1.0, curl=0.1), 4, 0.2), (cable, 3, 0.3), (tower, 2, 0.2)],
+)
+def test_motions_are_those_of_dense_matrices(build, n, t1):
+    system = build(n)
+    state = mb.assemble(system)
+    dense = Partition() if system.velocity_rows else Unconstrained()
+    solve = lambda manifold: jit_quickly(lambda rtol: _ends(run(system, state, rtol=rtol, t1=t1, manifold=manifold)))
+    of_dense, of_blocks = solve(dense), solve(Projection())
+    reference = of_dense(1e-10)[0]
+    size = np.max(np.abs(reference))
+    for rtol in (1e-4, 1e-6, 1e-8):
+        (expected, steps, _), (found, own, violation) = of_dense(rtol), of_blocks(rtol)
+        error, wrong = np.max(np.abs(found - reference)), np.max(np.abs(expected - reference))
+        assert error <= max(3 * wrong, rtol * size)
+        assert abs(own - steps) <= 0.2 * steps
+        assert violation <= 1e-12
+
+
+def _ends(sol):
+    violation = jnp.max(sol.constraint_violation.position, initial=0.0)
+    return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]), sol.stats["num_steps"], violation
+
+
+@pytest.mark.long
+def test_a_long_chain_moves_as_by_other_equations():
+    times, n = np.array([0.1, 0.3]), 20
+    expected = sprung_chain(times, n=n, stiffness=1e4, damping=20.0)
+    system = chain(n)
+    state = mb.assemble(system)
+    sol = run(system, state, rtol=1e-7, t1=times[-1], saveat=times)
+    found = np.concatenate([sol.ys.q[:, 2::3], sol.ys.u[:, 2::3]], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert np.all(sol.constraint_violation.position <= 1e-12)
+    assert np.all(sol.constraint_violation.velocity <= 1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("build, sizes", [(chain, (100, 400)), (cable, (50, 200)), (tower, (50, 200))])
+def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
+    lines = []
+    for n in sizes:
+        system = build(n)
+        program = jax.jit(lambda y, system=system: run(system, y, rtol=1e-6, t1=0.1).ys).lower(system.guess)
+        text = program.as_text()
+        found = set(re.findall(r"tensor<((?:\d+x)+)(?:f64|complex)", text))
+        assert max(math.prod(map(int, shape[:-1].split("x"))) for shape in found) < 3000 * n
+        lines.append(text.count("\n"))
+    assert lines[1] <= 1.3 * lines[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 2, 0.1)])
+def test_derivatives_three_ways(build, n, t1):
+    system = build(n)
+    state = mb.assemble(system)
+    force = system.force_names()[-1]
+    names = ["rod1.mass", f"{force}.stiffness", f"{force}.damping"]
+    values = [mb.parameters(system)[name] for name in names]
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=system.nq + system.nu))
+
+    def value(x, rtol, adjoint=None):
+        changed = {name: own * (1 + x[k]) for k, (name, own) in enumerate(zip(names, values, strict=True))}
+        moved = mb.with_parameters(system, changed)
+        sol = run(moved, state, rtol=rtol, t1=t1, manifold=Projection(), adjoint=adjoint)
+        return weights @ jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]])
+
+    x = jnp.zeros(3)
+    forward = jit_quickly(jax.jacfwd(lambda x: value(x, 1e-8, diffrax.ForwardMode())))(x)
+    reverse = jit_quickly(jax.grad(lambda x: value(x, 1e-8)))(x)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12 * np.max(np.abs(forward)))
+    tighter, h = jit_quickly(jax.vmap(lambda x: value(x, 1e-10))), 1e-3
+    ends = tighter(h * jnp.concatenate([jnp.eye(3), -jnp.eye(3), 2 * jnp.eye(3), -2 * jnp.eye(3)])).reshape(4, 3)
+    central = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * h)
+    np.testing.assert_allclose(forward, central, rtol=1e-4, atol=1e-4 * np.max(np.abs(central)))
+
+
+# The choice
+
+
+def test_size_decides():
+    hermite, adams = Hermite(), mb.solvers.Adams()
+    for system, implicit, explicit in (
+        (chain(4), Partition, Partition),
+        (chain(16), Projection, Projection),
+        (tower(2), Unconstrained, Unconstrained),
+        (tower(8), Projection, Unconstrained),
+    ):
+        assert isinstance(default_manifold(system, hermite, None), implicit)
+        assert isinstance(default_manifold(system, adams, None), explicit)
+        assert ("no dense Newton matrix with Hermite" in str(system)) == (implicit is Projection)
+
+
+@pytest.mark.parametrize("n, most", [(100, 40), (1000, 40)])
+def test_levels_of_a_chain(n, most):
+    """Bodies that share a spring and a hinge with the next, by cyclic reduction and not from an end on."""
+    bodies, pairs = tuple((k,) for k in range(n)), tuple((k - 1, k) for k in range(1, n))
+    neighbours = [set() for _ in range(2 * n)]
+    for joint, own in enumerate([bodies[0], *pairs], n):
+        neighbours[joint].update(own)
+        for a in own:
+            neighbours[a].update({joint, *own} - {a})
+    after = [*([()] * n), *bodies]
+    order = order_nodes(neighbours, 3, after=after, every_bound=True)
+    assert order.levels <= most
+    assert order.blocks <= 10 * n
