@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
@@ -103,7 +103,7 @@ def project_in_metric(
     scale = fixed_system.velocity_scale()
 
     def correct(q):
-        step = fixed.cancel(_position_rows(fixed_system, fixed_t, q))
+        step = fixed.cancel(position_rows(fixed_system, fixed_t, q))
         return displaced(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
 
     first = jnp.ones((), y.q.dtype)
@@ -113,13 +113,13 @@ def project_in_metric(
     own = fixed_system.structured_jacobian(fixed_t, found, before.u)
     own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
     q = y.q + (found - before.q)
-    q = displaced(system, t, q, own.cancel(_position_rows(system, t, q)))
+    q = displaced(system, t, q, own.cancel(position_rows(system, t, q)))
     at = State(q, y.u)
     here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
     u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
     return State(q, u), here, iterations, failed
 
 
-def _position_rows(system, t, q):
+def position_rows(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "m"]:
     """Φ, and zeros for the rows that bind velocities only."""
     return jnp.pad(system.position_residual(t, q), (0, system.velocity_rows - system.position_rows))

@@ -12,7 +12,7 @@ from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
-from ..linalg.jacobian import MassProjector
+from ..linalg.arrays import namespace
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
@@ -20,11 +20,14 @@ from ..system import AbstractSystem
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
-from .orthogonal_projection import project, project_in_metric, project_normalized
+from .orthogonal_projection import project, project_normalized
+from .restoration import SolvedState, restore_near
 from .vector_field import VectorField
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
+# Size of the corrections that are left out, as a power of eps: 1e-12 in double precision.
+_LEFT_OUT = 0.77
 # Redundant rows may be violated by this multiple of the pivots that count as zero.
 _ALLOWED = 8.0
 
@@ -37,16 +40,16 @@ class Projection(AbstractManifold):
     configuration, then of the velocities. A first-same-as-last derivative is kept across it: the difference is of the
     size of the local error.
 
-    With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` serves
-    positions, velocities and accelerations. The elimination follows the graph of joints: for chains, trees and local
-    loops a step takes time and memory in proportion to the number of joints. Constraints must be ideal and linear in
-    velocities. Rows that others imply are left out where a scene is large enough for sparse elimination, the same ones
-    throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs independent coordinates, which a
-    projection does not single out.
+    With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` a step, that
+    of its prediction, serves positions, velocities and accelerations. The elimination follows the graph of joints: for
+    chains, trees and local loops a step takes time and memory in proportion to the number of joints. Constraints must
+    be ideal and linear in velocities. Rows that others imply are left out where a scene is large enough for sparse
+    elimination, the same ones throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs
+    independent coordinates, which a projection does not single out.
 
-    **Arguments:** `newton_tol`: with `Adams`, size of the last Newton correction of positions relative to the system's
-    size, default tied to the tolerance of integration; one more correction is made with the factor of the state it led
-    to.
+    **Arguments:** `newton_tol`: with `Adams`, size of the Newton corrections that are left out, of positions,
+    velocities and accelerations relative to the system's, default 1e-12 or a thousandth of the tolerance of
+    integration.
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)
@@ -61,7 +64,10 @@ class Projection(AbstractManifold):
                 f"Projection needs Adams or a Runge–Kutta solver, got {type(solver).__name__}; use Partition() with it."
             )
         _check_multistep(system, formulation)
-        return ProjectionTerm(system, formulation, newton_tolerance(self.newton_tol, rtol)), solver
+        tol = newton_tolerance(self.newton_tol, rtol)
+        if self.newton_tol is None:
+            tol = namespace(tol).minimum(tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
+        return ProjectionTerm(system, formulation, tol), solver
 
     def default_formulation(self, system):
         return all_rows_formulation(system)
@@ -127,21 +133,16 @@ class ProjectionTerm(AbstractManifoldTerm):
     def evaluate(self, t, y, chart, args):
         system, y = self.system, State(self.system.normalize(y.q), y.u)
         projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
-        return ManifoldEvaluation(y, self._field(t, y, projector), chart, jnp.array(False), projector)
+        free = projector.metric.solve(system.force(t, y.q, y.u))
+        multipliers = -projector.multipliers(system.acceleration_residual(t, y.q, y.u, free))
+        udot = free + projector.direction(multipliers)
+        f = State(system.rates(t, y.q, y.u), udot)
+        return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
 
     def project_near(self, t, y, linearized_at, args):
-        metric_at = lambda y: self.system.inertia(t, y.q, y.u)
-        y, projector, iterations, failed = project_in_metric(
-            self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
-        )
-        return ManifoldEvaluation(y, self._field(t, y, projector), linearized_at.chart + iterations, failed, None)
-
-    def _field(self, t, y, projector: MassProjector):
-        """Rates and accelerations by the formulation's equations, with a factor that is known."""
-        system = self.system
-        free = projector.metric.solve(system.force(t, y.q, y.u))
-        udot = free + projector.cancel(system.acceleration_residual(t, y.q, y.u, free))
-        return State(system.rates(t, y.q, y.u), udot)
+        out: Any = restore_near(self.system, t, y, linearized_at.factors, self.newton_tol)
+        f = State(self.system.rates(t, out.q, out.u), out.udot)
+        return ManifoldEvaluation(State(out.q, out.u), f, linearized_at.chart + out.iterations, out.failed, None)
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)
