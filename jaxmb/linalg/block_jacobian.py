@@ -72,6 +72,10 @@ class JointOrder:
     hub_places: np.ndarray = dataclasses.field(compare=False)
     nodes: NodeOrder = dataclasses.field(compare=False)
 
+    def of_first(self, rows: int) -> "JointOrder":
+        """The same order with these rows kept at most."""
+        return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
+
 
 class BlockJacobian(AbstractJacobian):
     """Blocks of joints on bodies; products and elimination take a time that the graph of the joints determines, for
@@ -117,6 +121,9 @@ class BlockJacobian(AbstractJacobian):
     def dense(self):
         unit = jnp.eye(self.order.velocity_place.size, dtype=self.blocks.dtype)
         return DenseJacobian(jax.vmap(self.product, in_axes=1, out_axes=1)(unit))
+
+    def of_first(self, rows):
+        return BlockJacobian(self.blocks, self.order.of_first(rows))
 
     def _joint_rows(self, values):
         return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)

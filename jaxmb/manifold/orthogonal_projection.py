@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
-from ..linalg.jacobian import MassProjector
+from ..linalg.jacobian import AbstractJacobian, MassProjector
 from ..linalg.newton import chord, newton, root
 from ..system import AbstractSystem
 from ..system.displacement import displaced
@@ -37,7 +37,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     if system.elimination is not None:
         metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
         t, tol = jnp.asarray(t, y.q.dtype), 64 * jnp.finfo(y.q.dtype).eps
-        linearized_at = system.structured_jacobian(t, y.q, y.u).projector(metric)
+        linearized_at = binding_velocities(system, t, y.q, y.u).projector(metric)
         return project_in_metric(system, t, y, lambda y: metric, linearized_at, tol)[0]
     q = y.q
     if system.coordinate_rank > 0:
@@ -110,16 +110,29 @@ def project_in_metric(
     found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices.
-    own = fixed_system.structured_jacobian(fixed_t, found, before.u)
+    own = binding_velocities(fixed_system, fixed_t, found, before.u)
     own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
     q = y.q + (found - before.q)
     q = displaced(system, t, q, own.cancel(position_rows(system, t, q)))
     at = State(q, y.u)
-    here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
-    u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
+    here = binding_velocities(system, t, q, y.u).projector(metric_at(at), own.factor)
+    u = y.u + here.cancel(velocity_rows(system, t, q, y.u))
     return State(q, u), here, iterations, failed
 
 
 def position_rows(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "m"]:
-    """Φ, and zeros for the rows that bind velocities only."""
-    return jnp.pad(system.position_residual(t, q), (0, system.velocity_rows - system.position_rows))
+    """Φ, and zeros for the rows that bind velocities or accelerations only."""
+    return jnp.pad(system.position_residual(t, q), (0, system.acceleration_rows - system.position_rows))
+
+
+def velocity_rows(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "m"]:
+    """ψ, and zeros for the rows that bind accelerations only."""
+    return jnp.pad(system.velocity_residual(t, q, u), (0, system.acceleration_rows - system.velocity_rows))
+
+
+def binding_velocities(
+    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
+) -> AbstractJacobian:
+    """A with the rows that bind positions or velocities as its independent ones."""
+    jacobian = system.structured_jacobian(t, q, u)
+    return jacobian if system.acceleration_rows == system.velocity_rows else jacobian.of_first(system.velocity_rows)

@@ -11,8 +11,10 @@ from jaxtyping import Array, Float
 from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
-from ..formulations.formulation import check_mass
+from ..formulations.formulation import check_mass, solve_constrained
+from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
+from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
@@ -20,7 +22,7 @@ from ..system import AbstractSystem
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
-from .orthogonal_projection import project, project_normalized
+from .orthogonal_projection import binding_velocities, project, project_in_metric, project_normalized
 from .restoration import SolvedState, restore_near
 from .vector_field import VectorField
 
@@ -43,9 +45,11 @@ class Projection(AbstractManifold):
     With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` a step, that
     of its prediction, serves positions, velocities and accelerations. The elimination follows the graph of joints: for
     chains, trees and local loops a step takes time and memory in proportion to the number of joints. Constraints must
-    be ideal and linear in velocities. Rows that others imply are left out where a scene is large enough for sparse
-    elimination, the same ones throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs
-    independent coordinates, which a projection does not single out.
+    be linear in velocities. Where some are not ideal or act on accelerations, each evaluation has a factor of its own:
+    servos need a second one, and friction a solution for each row of the joints that rub, and a full matrix of the size
+    of all these rows. Rows that others imply are left out where a scene is large enough for sparse elimination, the
+    same ones throughout a motion; in smaller scenes no row may be redundant. `Hermite` needs independent coordinates,
+    which a projection does not single out.
 
     **Arguments:** `newton_tol`: with `Adams`, size of the Newton corrections that are left out, of positions,
     velocities and accelerations relative to the system's, default 1e-12 or a thousandth of the tolerance of
@@ -108,11 +112,8 @@ def _check_multistep(system, formulation):
             f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and "
             "Projection with Adams drops none; use Partition()."
         )
-    if not (system.ideal_on_velocities and system.linear):
-        raise ValueError(
-            "Projection with Adams takes constraints that are ideal, bind positions or velocities, and are linear in "
-            "velocities; use Partition()."
-        )
+    if not system.linear:
+        raise ValueError("Projection with Adams takes constraints that are linear in velocities; use Partition().")
 
 
 class ProjectionTerm(AbstractManifoldTerm):
@@ -132,6 +133,9 @@ class ProjectionTerm(AbstractManifoldTerm):
 
     def evaluate(self, t, y, chart, args):
         system, y = self.system, State(self.system.normalize(y.q), y.u)
+        if not system.ideal_on_velocities:
+            jacobian, inertia = binding_velocities(system, t, y.q, y.u), system.inertia(t, y.q, y.u)
+            return self._solved(t, y, jacobian.projector(inertia), chart)
         projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
         free = projector.metric.solve(system.force(t, y.q, y.u))
         multipliers = -projector.multipliers(system.acceleration_residual(t, y.q, y.u, free))
@@ -140,9 +144,26 @@ class ProjectionTerm(AbstractManifoldTerm):
         return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
 
     def project_near(self, t, y, linearized_at, args):
+        if not self.system.ideal_on_velocities:
+            metric_at = lambda y: self.system.inertia(t, y.q, y.u)
+            y, projector, iterations, failed = project_in_metric(
+                self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
+            )
+            out = self._solved(t, y, projector, linearized_at.chart + iterations)
+            return out._replace(failed=failed | out.failed)
         out: Any = restore_near(self.system, t, y, linearized_at.factors, self.newton_tol)
         f = State(self.system.rates(t, out.q, out.u), out.udot)
         return ManifoldEvaluation(State(out.q, out.u), f, linearized_at.chart + out.iterations, out.failed, None)
+
+    def _solved(self, t, y, projector: MassProjector, chart):
+        """The evaluation with friction and servos, at a state whose projector on the constraints is known."""
+        system, jacobian, factor = self.system, projector.jacobian, projector.factor
+        if system.acceleration_rows > system.velocity_rows:
+            jacobian = system.structured_jacobian(t, y.q, y.u)
+            factor = jacobian.gram(projector.metric).eliminate()
+        solution = solve_constrained(system, FactoredMultipliers(factor), t, y.q, y.u, jacobian)
+        failed = jnp.array(False) if solution.failed is None else solution.failed
+        return ManifoldEvaluation(y, State(system.rates(t, y.q, y.u), solution.udot), chart, failed, projector)
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)

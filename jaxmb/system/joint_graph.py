@@ -39,7 +39,7 @@ def elimination_order(
     **Arguments:** as in `joint_order`.
     """
     least = _LEAST_ROWS_WITH_IMPLIED if left_out else _LEAST_ROWS
-    if not (system.ideal_on_velocities and system.linear) or system.velocity_rows < least:
+    if not system.linear or system.velocity_rows < least:
         return None
     return joint_order(system, left_out, absolute)
 
