@@ -11,15 +11,16 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._types import Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
-from ..linalg.jacobian import AbstractJacobian, MassProjector
+from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, newton, root
 from ..system import AbstractSystem
 from ..system.displacement import displaced
+from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
 from .manifold import normalize_state
 
 _ITERATIONS = 8
@@ -118,21 +119,3 @@ def project_in_metric(
     here = binding_velocities(system, t, q, y.u).projector(metric_at(at), own.factor)
     u = y.u + here.cancel(velocity_rows(system, t, q, y.u))
     return State(q, u), here, iterations, failed
-
-
-def position_rows(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "m"]:
-    """Φ, and zeros for the rows that bind velocities or accelerations only."""
-    return jnp.pad(system.position_residual(t, q), (0, system.acceleration_rows - system.position_rows))
-
-
-def velocity_rows(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "m"]:
-    """ψ, and zeros for the rows that bind accelerations only."""
-    return jnp.pad(system.velocity_residual(t, q, u), (0, system.acceleration_rows - system.velocity_rows))
-
-
-def binding_velocities(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-) -> AbstractJacobian:
-    """A with the rows that bind positions or velocities as its independent ones."""
-    jacobian = system.structured_jacobian(t, q, u)
-    return jacobian if system.acceleration_rows == system.velocity_rows else jacobian.of_first(system.velocity_rows)

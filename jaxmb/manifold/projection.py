@@ -19,10 +19,11 @@ from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluatio
 from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
+from ..system.padded_rows import binding_velocities
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance
-from .orthogonal_projection import binding_velocities, project, project_in_metric, project_normalized
+from .orthogonal_projection import project, project_in_metric, project_normalized
 from .restoration import SolvedState, restore_near
 from .vector_field import VectorField
 

@@ -21,7 +21,7 @@ from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord
 from ..system import AbstractSystem
 from ..system.displacement import displaced
-from .orthogonal_projection import position_rows
+from ..system.padded_rows import position_rows
 
 _ITERATIONS = 8
 # Corrections shrink at least by this multiple of the distance to the state of the factor, in scales of the coordinates.

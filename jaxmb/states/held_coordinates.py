@@ -1,5 +1,6 @@
 """Prescribed coordinates by name: entries of q and u, and the own coordinates of joints."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +10,8 @@ from .._types import Scalar, VectorLike
 from ..parts.names import unknown
 from ..system import AbstractSystem
 from ..system.arguments import real_array
+from ..system.joint_graph import joint_order_with_more
+from .closest import eliminates_by_blocks
 
 
 def split_names(
@@ -32,8 +35,12 @@ def split_names(
     return {name: value for name, value in values.items() if name in own}, of_joints
 
 
-def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
+def holding(system: Any, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
     """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
     if not values:
         return system
-    return system.holding(values, {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}, t)
+    rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
+    held: Any = system.holding(values, rates, t)
+    if not eliminates_by_blocks(system):
+        return held
+    return dataclasses.replace(held, elimination=joint_order_with_more(held, system, system.elimination))

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from ..linalg.block_jacobian import JointOrder
-from ..linalg.elimination_order import order_nodes
-from ..linalg.sums import placed_sums
+from ..linalg.elimination_order import NodeOrder, order_nodes
+from ..linalg.sums import PlacedSums, placed_sums
 from .block_cut_tree import components
 from .layout import Layout
 from .rigid_bodies import RigidBodySystem
@@ -54,6 +54,15 @@ def joint_order(
     """
     parts = tuple((g.group.bodies, g.rows) for g in system.joints)
     return _joint_order(system.layout, parts, left_out, absolute)
+
+
+def joint_order_with_more(system: RigidBodySystem, before: RigidBodySystem, order: JointOrder) -> JointOrder:
+    """The order of elimination of a scene that has more position constraints, after those of one with a known order."""
+    parts = lambda own: sum(len(g.group.names) for g in own.constraints)
+    more, rows = parts(system) - parts(before), system.position_rows - before.position_rows
+    left_out = tuple(row if row < before.position_rows else row + rows for row in order.left_out)
+    absolute = frozenset(part if part < parts(before) else part + more for part in order.absolute)
+    return joint_order(system, left_out, absolute)
 
 
 @functools.lru_cache(maxsize=64)
@@ -96,6 +105,8 @@ def _joint_order(
         on_hubs=on_hubs,
         hub_places=hub_places,
         nodes=nodes,
+        left_out=left_out,
+        absolute=absolute,
     )
     return dataclasses.replace(order, key=_digest(order))
 
@@ -107,7 +118,7 @@ def _digest(order):
         value = getattr(order, field.name)
         if isinstance(value, np.ndarray):
             digest.update(repr(value.shape).encode() + np.ascontiguousarray(value).tobytes())
-        elif value is not None:
+        elif isinstance(value, PlacedSums | NodeOrder):
             digest.update(value.key)
     return digest.digest()
 
