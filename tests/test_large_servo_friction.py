@@ -13,6 +13,7 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.manifold import Partition
+from jaxmb.manifold.impulse import after_impulse
 
 
 def swing(t, p):
@@ -89,6 +90,10 @@ def test_accelerations_and_multipliers(build):
     ideal, _ = jax.jit(lambda y: accelerations(without, Multipliers(), 0.0, y.q, y.u))(state)
     assert np.max(np.abs(ideal - found[0])) > 1e-3
     assert np.max(np.abs(system.acceleration_residual(0.0, state.q, state.u, found[0]))) < 1e-9
+    jumped = mb.State(state.q, state.u + 0.1)
+    after, expected = jax.jit(lambda y: [after_impulse(own, 0.0, y).u for own in (system, dense(system))])(jumped)
+    np.testing.assert_allclose(after, expected, rtol=0, atol=1e-10)
+    assert np.max(np.abs(system.velocity_residual(0.0, state.q, after))) < 1e-11
 
 
 @pytest.mark.long
