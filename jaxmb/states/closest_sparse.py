@@ -222,11 +222,14 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
     free = ~fixed
     independent = order.scatter_rows(order.gather_rows(jnp.ones(system.acceleration_rows, q.dtype)))
 
+    # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+    join = lambda v, multipliers: jnp.concatenate([v, multipliers])
+
     def matrix(x):
-        v, multipliers = x
+        v, multipliers = x[: system.nu], x[system.nu :]
         forces = jnp.where(free, order.transpose_product(independent * multipliers), v)
         rows = independent * order.product(jnp.where(free, v, 0.0))
-        return curved(v) + forces, rows + (1 - independent) * multipliers
+        return join(curved(v) + forces, rows + (1 - independent) * multipliers)
 
     def displacement(rows):
         return projector.direction(projector.multipliers(rows))
@@ -235,7 +238,7 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         return projector.multipliers(projector.jacobian.product(projector.metric.solve(forces)))
 
     def solve(_, b):
-        forces, rows = b
+        forces, rows = b[: system.nu], b[system.nu :]
         particular = displacement(rows)
         v = particular + _null_space_solution(curved, projector, forces - curved(particular))
         # Both are refined once: the last pivots of long loops are small.
@@ -243,10 +246,10 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         left = forces - curved(v)
         multipliers = constraint_multipliers(left)
         multipliers += constraint_multipliers(left - projector.jacobian.transpose_product(multipliers))
-        return jnp.where(free, v, forces), multipliers + (1 - independent) * rows
+        return join(jnp.where(free, v, forces), multipliers + (1 - independent) * rows)
 
-    right = jnp.where(free, gradient, 0.0), independent * unmet
-    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[0]
+    right = join(jnp.where(free, gradient, 0.0), independent * unmet)
+    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[: system.nu]
 
 
 def _null_space_solution(curved, projector, force):
