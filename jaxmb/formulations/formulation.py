@@ -54,6 +54,11 @@ class AbstractFormulation(eqx.Module):
         **Arguments:** M, F, A and γ of the equation. A formulation that needs A as one matrix takes `jacobian.dense()`.
         """
 
+    def prepared(self, inertia: AbstractInertia, jacobian: AbstractJacobian) -> "AbstractFormulation":
+        """The same method for several F and γ, with what it computes of M and A alone."""
+        del inertia, jacobian
+        return self
+
 
 def pivoted_jacobian(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> DenseJacobian:
     """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
@@ -134,6 +139,8 @@ def solve_constrained(
     inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     gamma = gamma if gamma_shift is None else gamma - gamma_shift
+    if not system.ideal:
+        formulation = formulation.prepared(inertia, jacobian)
     udot, multipliers = formulation.solve(inertia, force, jacobian, gamma)
     if system.ideal:
         return Solution(udot, multipliers, None)

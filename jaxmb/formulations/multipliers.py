@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+from ..linalg.positive_definite import AbstractPositiveFactor
 from .formulation import AbstractFormulation
 
 
@@ -17,8 +18,23 @@ class Multipliers(AbstractFormulation):
     inverts_mass: ClassVar[bool] = True
     takes_blocks: ClassVar[bool] = True
 
+    def prepared(self, inertia, jacobian):
+        return FactoredMultipliers(jacobian.gram(inertia).eliminate())
+
+    def solve(self, inertia, force, jacobian, gamma):
+        return self.prepared(inertia, jacobian).solve(inertia, force, jacobian, gamma)
+
+
+class FactoredMultipliers(AbstractFormulation):
+    """The same with a `factor` of `A M⁻¹ Aᵀ` that is known already."""
+
+    factor: AbstractPositiveFactor
+    partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = True
+    takes_blocks: ClassVar[bool] = True
+
     def solve(self, inertia, force, jacobian, gamma):
         free = inertia.solve(force)
-        projector = jacobian.projector(inertia)
+        projector = jacobian.projector(inertia, self.factor)
         multipliers = projector.multipliers(gamma - jacobian.product(free))
         return free + projector.direction(multipliers), multipliers

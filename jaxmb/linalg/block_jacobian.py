@@ -53,6 +53,8 @@ class JointOrder:
     - `hubs` (h,): the bodies that are nodes of their own, after the joints; `on_hubs` (entries,): the blocks, by joint
         and body raveled, of joints on hubs, and `hub_places` their places among the stored blocks.
     - `nodes`: the order of elimination of joints and hubs.
+    - `left_out`: rows that are not eliminated, and `absolute`: numbers of parts that bind bodies to the world, not only
+        to each other; as given.
     """
 
     key: Any
@@ -71,6 +73,12 @@ class JointOrder:
     on_hubs: np.ndarray = dataclasses.field(compare=False)
     hub_places: np.ndarray = dataclasses.field(compare=False)
     nodes: NodeOrder = dataclasses.field(compare=False)
+    left_out: tuple[int, ...] = dataclasses.field(compare=False)
+    absolute: frozenset[int] = dataclasses.field(compare=False)
+
+    def of_first(self, rows: int) -> "JointOrder":
+        """The same order with these rows kept at most."""
+        return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
 
 
 class BlockJacobian(AbstractJacobian):
@@ -117,6 +125,9 @@ class BlockJacobian(AbstractJacobian):
     def dense(self):
         unit = jnp.eye(self.order.velocity_place.size, dtype=self.blocks.dtype)
         return DenseJacobian(jax.vmap(self.product, in_axes=1, out_axes=1)(unit))
+
+    def of_first(self, rows):
+        return BlockJacobian(self.blocks, self.order.of_first(rows))
 
     def _joint_rows(self, values):
         return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)

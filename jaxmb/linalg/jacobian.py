@@ -7,6 +7,7 @@ with `A M⁻¹ Aᵀ` by an elimination that follows the structure.
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .elimination import Factor
@@ -48,6 +49,10 @@ class AbstractJacobian(eqx.Module):
     def dense(self) -> "DenseJacobian":
         """The same as one full matrix."""
 
+    @abc.abstractmethod
+    def of_first(self, rows: int) -> "AbstractJacobian":
+        """The same matrix whose independent rows are those of the first ones: `gather_rows` keeps no others."""
+
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
         """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
         gram = self.gram(metric)
@@ -80,17 +85,18 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, which selects the independent rows, or None where all rows
-    are independent and no pivots were searched for.
+    **Fields:** `matrix` (m × n); its `factor` in a chart, which selects the independent rows, or None where all of the
+    `first` rows, default all rows, are independent and no pivots were searched for.
     """
 
     matrix: Float[Array, "m n"]
     factor: Factor | None = None
+    first: int | None = eqx.field(static=True, default=None)
 
     @property
     def independent(self) -> Float[Array, "r n"]:
         """The independent rows."""
-        return self.matrix if self.factor is None else self.matrix[self.factor.rows]
+        return self.gather_rows(self.matrix)
 
     @property
     def pivoted(self) -> Factor:
@@ -108,10 +114,14 @@ class DenseJacobian(AbstractJacobian):
         return norm(self.matrix * scale[None, :])
 
     def gather_rows(self, values):
-        return values if self.factor is None else values[self.factor.rows]
+        if self.factor is None:
+            return values if self.first is None else values[: self.first]
+        return values[self.factor.rows]
 
     def scatter_rows(self, values):
-        return values if self.factor is None else self.factor.scatter_rows(values)
+        if self.factor is None:
+            return values if self.first is None else jnp.pad(values, (0, self.matrix.shape[0] - self.first))
+        return self.factor.scatter_rows(values)
 
     def gram(self, inertia):
         A = self.independent
@@ -119,3 +129,7 @@ class DenseJacobian(AbstractJacobian):
 
     def dense(self):
         return self
+
+    def of_first(self, rows):
+        assert self.factor is None, "a chart selects the rows already"
+        return DenseJacobian(self.matrix, None, rows)

@@ -43,13 +43,15 @@ def newton(
 
 
 def chord(
-    correct: Callable[[Array], tuple[Array, Float[Array, ""]]],
-    start: Array,
+    correct: Callable[[PyTree], tuple[PyTree, Float[Array, ""]]],
+    start: PyTree,
     *,
     first: Float[Array, ""],
     tol: Any,
     most: int,
-) -> tuple[Array, Int[Array, ""], Bool[Array, ""]]:
+    rate: Any = 0.0,
+    rounding: Any = None,
+) -> tuple[PyTree, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method with one matrix for all corrections.
 
     Corrections shrink by a constant factor, so the size of the next one is known and needs no iteration. The iteration
@@ -58,7 +60,8 @@ def chord(
 
     **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
     first correction is compared with (1: the error of the matrix is as large as the first correction; 0: unknown, and a
-    second correction is made); `tol`; `most`: the largest number of corrections.
+    second correction is made); `tol`; `most`: the largest number of corrections; `rate`: a lower bound of the factor by
+    which they shrink; `rounding`: the size below which they may stop shrinking, default some thousand rounding errors.
 
     **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
     """
@@ -66,9 +69,10 @@ def chord(
     def advance(carry):
         x, before, _, k = carry
         x, size = correct(x)
-        rate = jnp.where(size < before, size / before, 1.0)
-        rounded = (size < 4096 * jnp.finfo(size.dtype).eps) & (rate > 0.5)
-        return x, size, jnp.where(rounded, 0.0, size * rate), k + 1
+        shrinks = jnp.where(size < before, size / before, 1.0)
+        small = 4096 * jnp.finfo(size.dtype).eps if rounding is None else rounding
+        rounded = (size < small) & (shrinks > 0.5)
+        return x, size, jnp.where(rounded, 0.0, size * jnp.maximum(shrinks, rate)), k + 1
 
     def proceed(carry):
         _, size, ahead, k = carry

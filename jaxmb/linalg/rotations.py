@@ -8,6 +8,8 @@ Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
 """
 
+import functools
+import operator
 from typing import Any
 
 import jax
@@ -18,8 +20,9 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import Scalar, VectorLike
 from .arrays import as_array, namespace
 
-# Each product of rotation algebra is one sum with a small constant tensor, which XLA fuses; slices and stacks of
-# components would become separate kernels.
+# Each product of rotation algebra is a sum with a small constant tensor, written term by term, which XLA fuses. Stacks
+# of components would become separate kernels. A reduction of some thousand numbers becomes a library call: with those
+# the accelerations of the rows of a chain of 200 ball joints take 85 µs instead of 18.
 
 
 def _tables():
@@ -47,15 +50,19 @@ def _constant(table: np.ndarray, like: Array) -> np.ndarray:
 
 def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
     """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
-    # Pairs form one axis: under several `vmap`s, arrays of rank seven and more make jaxlib 0.10.2 and 0.11.0 hang.
-    pairs = (a[:, None] * b[None, :]).reshape(-1)
-    return (_constant(table.reshape(-1, pairs.size), a) * pairs[None, :]).sum(axis=1)
+    table = _constant(table.reshape(-1, *table.shape[-2:]), a)
+    of_b = lambda row: _sum([row[:, k] * b[k] for k in range(row.shape[1]) if np.any(row[:, k])])
+    return _sum([of_b(table[:, j]) * a[j] for j in range(table.shape[1])])
+
+
+def _sum(terms):
+    return functools.reduce(operator.add, terms)
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     """Euclidean norm over the last axis, with derivative zero (not NaN) at the zero vector."""
     xp = namespace(x)
-    square = (x * x).sum(axis=-1)
+    square = _sum([x[..., k] ** 2 for k in range(x.shape[-1])]) if x.shape[-1] <= 4 else (x * x).sum(axis=-1)
     positive = square > 0
     return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
 
@@ -73,12 +80,14 @@ def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """World components of the body vector `v`."""
-    return (rotation_matrix(p) * v[None, :]).sum(axis=1)
+    matrix = rotation_matrix(p)
+    return _sum([matrix[:, j] * v[j] for j in range(3)])
 
 
 def unrotate(p: Float[Array, "4"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
     """Body components of the world vector `v_W`."""
-    return (rotation_matrix(p) * v_W[:, None]).sum(axis=0)
+    matrix = rotation_matrix(p)
+    return _sum([matrix[j] * v_W[j] for j in range(3)])
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -88,7 +97,8 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def skew(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The matrix `ã` of the vector product, `ã b = a × b`."""
-    return (_constant(_CROSS, a) * a[None, :, None]).sum(axis=1)
+    table: Any = _constant(_CROSS, a)
+    return _sum([table[:, j] * a[j] for j in range(3)])
 
 
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -116,7 +126,8 @@ def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array,
 
 def matrix_rates(R: Float[Array, "3 3"], omega: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """`Ṙ = R ω̃′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
-    return jnp.sum(R[:, :, None] * skew(omega)[None, :, :], axis=1)
+    turn = skew(omega)
+    return _sum([R[:, j, None] * turn[None, j] for j in range(3)])
 
 
 def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -124,8 +135,7 @@ def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> F
 
     This is the adjoint of `matrix_rates`.
     """
-    work = jnp.sum(R[:, :, None] * gradient[:, None, :], axis=0)
-    return jnp.sum(_constant(_CROSS, R) * work[:, None, :], axis=(0, 2))
+    return _sum([cross(gradient[i], R[i]) for i in range(3)])
 
 
 def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Array, "3"]:

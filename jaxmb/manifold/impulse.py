@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Scalar, State
 from ..linalg.elimination import solve_positive
 from ..system import AbstractSystem
+from ..system.padded_rows import binding_velocities, velocity_rows
 from .orthogonal_projection import independent_rows
 
 # A jump is looked for in this number of intervals, and the one chosen is halved so often.
@@ -27,6 +28,9 @@ def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
     Source: L. A. Pars, "A Treatise on Analytical Dynamics", Heinemann, 1965 (impulsive motion).
     """
     u, inertia = y.u, system.inertia(t, y.q, y.u)
+    if system.elimination is not None:
+        projector = binding_velocities(system, t, y.q, u).projector(inertia)
+        return State(y.q, u + projector.cancel(velocity_rows(system, t, y.q, u)))
     for _ in range(1 if system.linear else 3):
         jacobian = system.velocity_jacobian(t, y.q, u)
         rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)

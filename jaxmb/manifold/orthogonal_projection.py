@@ -21,6 +21,7 @@ from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, newton, root
 from ..system import AbstractSystem
 from ..system.displacement import displaced
+from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
 from .manifold import normalize_state
 
 _ITERATIONS = 8
@@ -38,7 +39,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     if system.elimination is not None:
         metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
         t, tol = jnp.asarray(t, y.q.dtype), 64 * jnp.finfo(y.q.dtype).eps
-        linearized_at = system.structured_jacobian(t, y.q, y.u).projector(metric)
+        linearized_at = binding_velocities(system, t, y.q, y.u).projector(metric)
         return project_in_metric(system, t, y, lambda y: metric, linearized_at, tol)[0]
     q = y.q
     if system.coordinate_rank > 0:
@@ -104,23 +105,18 @@ def project_in_metric(
     scale = fixed_system.velocity_scale()
 
     def correct(q):
-        step = fixed.cancel(_position_rows(fixed_system, fixed_t, q))
+        step = fixed.cancel(position_rows(fixed_system, fixed_t, q))
         return displaced(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
 
     first = jnp.ones((), y.q.dtype)
     found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices.
-    own = fixed_system.structured_jacobian(fixed_t, found, before.u)
+    own = binding_velocities(fixed_system, fixed_t, found, before.u)
     own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
     q = y.q + (found - before.q)
-    q = displaced(system, t, q, own.cancel(_position_rows(system, t, q)))
+    q = displaced(system, t, q, own.cancel(position_rows(system, t, q)))
     at = State(q, y.u)
-    here = system.structured_jacobian(t, q, y.u).projector(metric_at(at), own.factor)
-    u = y.u + here.cancel(system.velocity_residual(t, q, y.u))
+    here = binding_velocities(system, t, q, y.u).projector(metric_at(at), own.factor)
+    u = y.u + here.cancel(velocity_rows(system, t, q, y.u))
     return dataclasses.replace(y, q=q, u=u), here, iterations, failed
-
-
-def _position_rows(system, t, q):
-    """Φ, and zeros for the rows that bind velocities only."""
-    return jnp.pad(system.position_residual(t, q), (0, system.velocity_rows - system.position_rows))

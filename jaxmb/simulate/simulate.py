@@ -102,8 +102,9 @@ def simulate(
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
         `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a scene of 30 or
         more constraint rows, 150 where some are redundant, the default is `Projection()` as well, whose cost grows
-        with the number of joints and not with its cube, unless joints have friction or a servo; so it is for `Hermite`
-        on such a scene, or one without joints, of 40 or more velocities.
+        with the number of joints and not with its cube, except that it does with the cube of the number of joints that
+        rub; so it is for `Hermite` on such a scene, or one without joints, of 40 or more velocities, without friction,
+        servos and internal states.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of

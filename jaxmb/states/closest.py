@@ -36,7 +36,7 @@ _REFINEMENTS = 16
 
 def eliminates_by_blocks(system: AbstractSystem) -> bool:
     """Whether closest states are found without dense matrices."""
-    only_positions = system.acceleration_rows == system.position_rows
+    only_positions = system.velocity_rows == system.position_rows
     return system.elimination is not None and only_positions and system.position_rows >= MANY_ROWS
 
 

@@ -27,6 +27,7 @@ from ..linalg.jacobian import MassProjector
 from ..linalg.newton import newton
 from ..system import AbstractSystem
 from ..system.displacement import displaced
+from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
 
 # Rows are independent if every pivot of the elimination (a squared distance between rows of unit norm) exceeds this. A
 # row of n four-bars with its crank held has a pivot of 0.7 / n³, and 5e-14 where 333 of them are held twice.
@@ -60,9 +61,9 @@ def meet_sparse(
 
     def correct(q):
         residual = system.position_residual(t, q)
-        jacobian = system.structured_jacobian(t, q, at_rest)
+        jacobian = binding_velocities(system, t, q, at_rest)
         factor = jacobian.gram(metric).eliminate(_SHIFT)
-        multipliers = factor.substitute(jacobian.gather_rows(_all_rows(system, residual)))
+        multipliers = factor.substitute(jacobian.gather_rows(position_rows(system, t, q)))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         # Rotations by more than about a radian leave the region where the linearisation is valid.
         longest = jnp.max(jnp.abs(step) / scale)
@@ -107,8 +108,8 @@ def sparse_velocities(
     """The velocities closest to a guess, with some rates held; and whether they were found."""
     # Rates that are held have an infinite mass.
     metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
-    here = system.structured_jacobian(t, q, jnp.zeros_like(guess)).projector(metric)
-    u = guess + here.cancel(system.velocity_residual(t, q, guess))
+    here = binding_velocities(system, t, q, jnp.zeros_like(guess)).projector(metric)
+    u = guess + here.cancel(velocity_rows(system, t, q, guess))
     return u, jnp.all(jnp.isfinite(u)) & (here.factor.smallest_pivot() > _INDEPENDENT)
 
 
@@ -134,7 +135,7 @@ def _closest(system, t, guess, held, tol):
     def correct(carry):
         q, step, length, _ = carry
         new = meet_sparse(system, t, displaced(system, t, q, length * step), fixed)
-        norms = system.structured_jacobian(t, new, jnp.zeros_like(step)).row_norms(system.velocity_scale())
+        norms = binding_velocities(system, t, new, jnp.zeros_like(step)).row_norms(system.velocity_scale())
         residual = largest_residual(system.position_residual(t, new), norms[: system.position_rows])
         before, after = distance(q), distance(new)
         size = length * jnp.max(jnp.abs(step) / system.velocity_scale())
@@ -166,7 +167,7 @@ def _closest_jvp(primals, tangents):
     moved = jnp.where(np.array(held.coordinates), dguess, 0.0)
 
     def equations(system, t, guess, q):
-        return _gradient(system, t, q, guess, at.multipliers), _all_rows(system, system.position_residual(t, q))
+        return _gradient(system, t, q, guess, at.multipliers), position_rows(system, t, q)
 
     _, (gradient, unmet) = eqx.filter_jvp(equations, (system, t, guess, q), (dsystem, dt, dguess, moved))
     step = _solve(system, t, q, guess, fixed, at, -gradient, -unmet)
@@ -176,7 +177,7 @@ def _closest_jvp(primals, tangents):
 
 def _optimality(system, t, q, guess, fixed):
     metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(system, t, q)))
-    projector = system.structured_jacobian(t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
+    projector = binding_velocities(system, t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
     gradient = _gradient(system, t, q, guess, jnp.zeros(system.acceleration_rows, q.dtype))
     multipliers = -projector.multipliers(projector.jacobian.product(metric.solve(gradient)))
     return _Optimality(projector, multipliers, gradient + projector.jacobian.transpose_product(multipliers))
@@ -221,11 +222,14 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
     free = ~fixed
     independent = order.scatter_rows(order.gather_rows(jnp.ones(system.acceleration_rows, q.dtype)))
 
+    # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+    join = lambda v, multipliers: jnp.concatenate([v, multipliers])
+
     def matrix(x):
-        v, multipliers = x
+        v, multipliers = x[: system.nu], x[system.nu :]
         forces = jnp.where(free, order.transpose_product(independent * multipliers), v)
         rows = independent * order.product(jnp.where(free, v, 0.0))
-        return curved(v) + forces, rows + (1 - independent) * multipliers
+        return join(curved(v) + forces, rows + (1 - independent) * multipliers)
 
     def displacement(rows):
         return projector.direction(projector.multipliers(rows))
@@ -234,7 +238,7 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         return projector.multipliers(projector.jacobian.product(projector.metric.solve(forces)))
 
     def solve(_, b):
-        forces, rows = b
+        forces, rows = b[: system.nu], b[system.nu :]
         particular = displacement(rows)
         v = particular + _null_space_solution(curved, projector, forces - curved(particular))
         # Both are refined once: the last pivots of long loops are small.
@@ -242,10 +246,10 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         left = forces - curved(v)
         multipliers = constraint_multipliers(left)
         multipliers += constraint_multipliers(left - projector.jacobian.transpose_product(multipliers))
-        return jnp.where(free, v, forces), multipliers + (1 - independent) * rows
+        return join(jnp.where(free, v, forces), multipliers + (1 - independent) * rows)
 
-    right = jnp.where(free, gradient, 0.0), independent * unmet
-    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[0]
+    right = join(jnp.where(free, gradient, 0.0), independent * unmet)
+    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[: system.nu]
 
 
 def _null_space_solution(curved, projector, force):
@@ -283,8 +287,3 @@ def _null_space_solution(curved, projector, force):
 
     start = jnp.zeros_like(force), force, towards, size, jnp.array(0), jnp.array(True)
     return lax.while_loop(proceed, correct, start)[0]
-
-
-def _all_rows(system, residual):
-    """Φ, and zeros for the rows that bind velocities and accelerations only."""
-    return jnp.pad(residual, (0, system.acceleration_rows - system.position_rows))

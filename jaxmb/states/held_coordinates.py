@@ -1,5 +1,6 @@
 """Prescribed coordinates by name: entries of q and u, and the own coordinates of joints."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,8 @@ from ..parts.names import unknown
 from ..system import AbstractSystem
 from ..system.arguments import real_array
 from ..system.coordinates import prescribe
+from ..system.joint_graph import joint_order_with_more
+from .closest import eliminates_by_blocks
 
 
 def split_names(
@@ -53,8 +56,12 @@ def internal_states(
     return z, {name: value for name, value in values.items() if name not in own}
 
 
-def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
+def holding(system: Any, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
     """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
     if not values:
         return system
-    return system.holding(values, {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}, t)
+    rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
+    held: Any = system.holding(values, rates, t)
+    if not eliminates_by_blocks(system):
+        return held
+    return dataclasses.replace(held, elimination=joint_order_with_more(held, system, system.elimination))

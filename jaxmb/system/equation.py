@@ -362,10 +362,11 @@ class AbstractSystem(eqx.Module):
     @property
     def implicit_in_blocks(self) -> bool:
         """Whether implicit methods eliminate bodies and joints in blocks by default: where a scene is so large that
-        this is faster, unless constraints are not ideal or bind accelerations.
+        this is faster, unless constraints are not ideal or bind accelerations, or parts have internal states.
         """
         in_blocks = self.elimination is not None or self.acceleration_rows == 0
-        return self.has_bodies and self.ideal and in_blocks and self.nu >= _LEAST_VELOCITIES
+        plain = self.has_bodies and self.ideal_on_velocities and self.nz == 0
+        return plain and in_blocks and self.nu >= _LEAST_VELOCITIES
 
     def velocity_jacobian(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
