@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,10 +41,9 @@ def _picture(shape: Shape) -> tuple[AbstractShape, ...]:
     if shape.kind == "cylinder":
         return (Cylinder(size[0], 2 * size[1], **place),)
     if shape.kind == "capsule":
-        ends = [
-            place["position"] + s * rot.rotate(place["orientation"], np.array([0, 0, size[1]])) for s in (-1.0, 1.0)
-        ]
-        balls = [Sphere(size[0], **(place | {"position": end})) for end in ends]
+        half: Any = np.array([0.0, 0.0, size[1]])
+        axis = rot.rotate(place["orientation"], half)
+        balls = [Sphere(size[0], **(place | {"position": place["position"] + s * axis})) for s in (-1.0, 1.0)]
         return Cylinder(size[0], 2 * size[1], **place), *balls
     if shape.kind == "ellipsoid":
         return (dataclasses.replace(_UNIT_BALL, vertices=_UNIT_BALL.vertices * np.asarray(size), **place),)

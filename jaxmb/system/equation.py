@@ -36,8 +36,8 @@ else:
     from equinox import AbstractVar
 
 
-# From this number of velocities on, implicit methods are faster with block elimination. (A step of a chain of 12 rods,
-# 36 velocities, takes as long either way.)
+# From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
+# velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
 _LEAST_VELOCITIES = 40
 
 # An accessor of an array of the system, and the index of the parameter along axis 0 where parts are stacked.
