@@ -99,7 +99,7 @@ def at_one_instant(examples, formulation):
 
     def observe(system, extra, rtol, adjoint):
         state, t = mb.assemble(system, throw=False), jnp.zeros(())
-        udot, multipliers = formulations.accelerations(system, formulation, t, state.q, state.u)
+        udot, multipliers = formulations.accelerations(system.at(state), formulation, t, state.q, state.u)
         along = t[None], mb.State(state.q[None], state.u[None]), Solved(udot[None], multipliers[None])
         out = {}
         for name in (name for machine in machines for name in machine.outputs):
@@ -156,6 +156,7 @@ PLANAR_FORCES = named(
     "DraftGear",
     "Track",
     "Contact",
+    "Tyre",
     "PlateContact",
     "DiscContact",
 )
@@ -170,6 +171,7 @@ SPATIAL_FORCES = named(
     "TorsionalSpringDamper",
     "Bushing",
     "Contact",
+    "Tyre",
 )
 # Examples, and how they are integrated.
 GROUPS = {"planar joints": (named("planar", "Revolute", "Fixed", "PointOnLine", "Prismatic", "Distance"), FIXED)}

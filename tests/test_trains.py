@@ -386,6 +386,12 @@ def turning_pendulum():
     )
 
 
+def dry_friction():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pin = planar.Revolute("pin", "ground", "body", point=(1.0, 0.0))
+    return mb.Scene([body], joints=[pin], forces=[planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)]).compile()
+
+
 def skater():
     return mb.mechanisms.get("appell_hamel").system
 
@@ -405,12 +411,6 @@ def test_projection_with_adams_refuses(build, options, message):
     system = build()
     with pytest.raises(ValueError, match=message):
         mb.simulate(system, system.guess, t1=1.0, **({"manifold": Projection()} | options))
-
-
-def dry_friction():
-    body = planar.Body("body", mass=1.0, inertia=0.1)
-    pin = planar.Revolute("pin", "ground", "body", point=(1.0, 0.0))
-    return mb.Scene([body], joints=[pin], forces=[planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)]).compile()
 
 
 LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
