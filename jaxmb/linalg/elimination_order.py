@@ -11,11 +11,12 @@ Sources: J. W. H. Liu, "The role of elimination trees in sparse factorization", 
 """
 
 import dataclasses
-import hashlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+
+from .digest import digest
 
 _CAPS = (2, 3, 4, 6, 8, 12)
 # Costs of one step of the loop in µs on one core of 2 GHz: of the step itself, and of one multiplication in a lane.
@@ -196,10 +197,8 @@ def _laid_out(neighbours, levels, rest, size, cost):
     stages = tuple(_stage(part, diagonal, n, blocks) for part in _cut(sorted_levels, size))
     row, column = np.array(list(pairs), np.int32).reshape(-1, 2).T
     arrays = [row, column, np.array(rest, np.int32), np.array(rest_blocks, np.int32).reshape(len(rest), len(rest))]
-    digest = hashlib.sha256()
-    for array in (*arrays, *(array for stage in stages for array in dataclasses.astuple(stage))):
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return NodeOrder(digest.digest(), n, blocks, row, column, stages, arrays[2], arrays[3], len(levels), cost)
+    key = digest([*arrays, *(array for stage in stages for array in dataclasses.astuple(stage))])
+    return NodeOrder(key, n, blocks, row, column, stages, arrays[2], arrays[3], len(levels), cost)
 
 
 def _cut(levels, size, most=3):

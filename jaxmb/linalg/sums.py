@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import hashlib
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .arrays import unchecked_take
+from .digest import digest
 
 # Entries of one place that one pass adds up; more take another pass, so the work is proportional to the entries.
 _WIDTH = 4
@@ -54,7 +54,4 @@ def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
             break
         place = np.repeat(np.arange(places), groups)
         order, entries = np.arange(place.size), place.size
-    digest = hashlib.sha256()
-    for index in passes:
-        digest.update(repr(index.shape).encode() + index.tobytes())
-    return PlacedSums(digest.digest(), tuple(passes))
+    return PlacedSums(digest(passes), tuple(passes))

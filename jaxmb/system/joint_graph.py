@@ -10,13 +10,13 @@ pivot is regular.
 
 import dataclasses
 import functools
-import hashlib
 import itertools
 from typing import Any
 
 import numpy as np
 
 from ..linalg.block_jacobian import JointOrder
+from ..linalg.digest import digest_of_fields
 from ..linalg.elimination_order import order_nodes
 from ..linalg.sums import placed_sums
 from .block_cut_tree import components
@@ -113,19 +113,7 @@ def _joint_order(
         left_out=left_out,
         absolute=absolute,
     )
-    return dataclasses.replace(order, key=_digest(order))
-
-
-def _digest(order):
-    """A key that is equal for equal orders."""
-    digest = hashlib.sha256()
-    for field in dataclasses.fields(order):
-        value = getattr(order, field.name)
-        if isinstance(value, np.ndarray):
-            digest.update(repr(value.shape).encode() + np.ascontiguousarray(value).tobytes())
-        elif field.name in ("on_bodies", "products", "nodes"):
-            digest.update(value.key)
-    return digest.digest()
+    return dataclasses.replace(order, key=digest_of_fields(order))
 
 
 def _indices(parts, joints, ground, size):

@@ -19,12 +19,12 @@ over the graph of bodies and joints).
 import collections
 import dataclasses
 import functools
-import hashlib
 from typing import Any
 
 import numpy as np
 
 from ..linalg.block_jacobian import JointOrder
+from ..linalg.digest import digest_of_fields
 from ..linalg.elimination_order import NodeOrder, order_nodes
 from ..linalg.sums import PlacedSums, placed_sums
 from .joint_graph import joint_order
@@ -133,19 +133,7 @@ def _motion_order(
         upper=upper,
         nodes=nodes,
     )
-    return dataclasses.replace(order, key=_digest(order))
-
-
-def _digest(order):
-    """A key that is equal for equal orders."""
-    digest = hashlib.sha256()
-    for field in dataclasses.fields(order):
-        value = getattr(order, field.name)
-        if isinstance(value, np.ndarray):
-            digest.update(repr(value.shape).encode() + np.ascontiguousarray(value).tobytes())
-        elif value is not None:
-            digest.update(value.key)
-    return digest.digest()
+    return dataclasses.replace(order, key=digest_of_fields(order))
 
 
 def _bodies_before(joints: list[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
