@@ -65,13 +65,16 @@ def probed_derivatives(
     aside = lax.stop_gradient(eps ** (1 / 3) * signs * jnp.where(size > 0, size, jnp.ones_like(size)))
 
     # A loop, so that the field is compiled once for both states.
-    def at(y, _):
+    def at(carry, _):
+        y, way = carry
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
-        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, aside]))
-        return y + (lax.stop_gradient(move) if along else aside), (Derivatives(state, f, g, rest), slope)
+        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
+        # The same way at both states, for the mean of both slopes to be that of the difference to second order.
+        way = lax.stop_gradient(move) if along else way
+        return (y + way, way), (Derivatives(state, f, g, rest), slope)
 
-    _, (both, slopes) = lax.scan(at, y, None, length=2)
+    _, (both, slopes) = lax.scan(at, (y, aside), None, length=2)
     f = lax.stop_gradient(both.f)
     change, expected = f[1] - f[0], lax.stop_gradient(jnp.mean(slopes, axis=0))
     wrong = jnp.abs(change - expected)
