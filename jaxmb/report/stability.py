@@ -231,7 +231,7 @@ def _speeds(base: _Base) -> Iterator[_Trial]:
     if not (np.any(np.asarray(own.state.u)) and own.system.linear and own.system.drift_free):
         raise _NotHereError("left out, the motion starts from rest, or velocities are prescribed")
     for factor in (1e-6, 1e-3, 10.0, 1e3):
-        fast = State(own.state.q, factor * own.state.u)
+        fast = dataclasses.replace(own.state, u=factor * own.state.u)
         yield base.trial(f"× {factor:.0e}", state=fast, t1=own.t1 / max(factor, 1.0))
 
 

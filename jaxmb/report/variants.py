@@ -41,6 +41,8 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
 
     **Raises:** `ValueError` where a length may hide in a function, or a unit is not known.
     """
+    if system.nz:
+        raise ValueError(f"the internal states {', '.join(system.state_names())} are of no known power of a length.")
     functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
     powers = {name: _powers(unit) for name, unit in units(system).items()}
     unknown = [*functions, *(name for name, own in powers.items() if own is None)]
