@@ -20,6 +20,26 @@ LOOP_Y = [1.1, 1.1, 1.1, 1.0, 0.9, 0.75, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.3, 0.4
 LOOP = np.stack([LOOP_X, LOOP_Y], axis=1)
 TURN = np.deg2rad(20.0) * np.arange(18)
 LENGTHS = ("base", "crank", "coupler", "rocker")
+# The best designs of these papers, of J. A. Cabrera et al., "An evolutionary algorithm for path synthesis of
+# mechanisms", Mechanism and Machine Theory 46, 2011, and of S. Nguyen-Van et al., Symmetry 14, 381, 2022, from whose
+# published tables and data they are taken: the lengths, the point of the coupler, the place, the tilt, crank angles.
+OF_LINE = {
+    "Cabrera 2011": """31.788264 8.2046468 24.932131 31.385926 34.193719 14.415668 -6.366519 56.83676 4.015959
+        1.366547 2.330773 2.871039 3.394591 3.97096 4.96349""",
+    "Nguyen-Van 2022": """14.201369 8.0143127 16.309922 12.253871 27.797721 11.305412 -2.309531 45.695083 4.5172417
+        6.2532447 2.4038981 2.9362397 3.4905751 4.0650776 5.2095019""",
+}
+OF_ARC = {
+    "Kunjur 1997": "3.509643 1.857606 4.725835 3.518721 1.959538 1.558898 0 0 0",
+    "Cabrera 2002": "3.0630424 1.9959624 3.305823 2.524706 1.645158 1.708959 0 0 0",
+    "Cabrera 2011": "3.77326856 2.00000403 4.11697104 2.74615671 1.67848787 1.67098007 0 0 0",
+    "Nguyen-Van 2022": "4.2930812 1.9978324 4.7374099 2.9417301 1.7074051 1.6441696 0 0 0",
+}
+OF_LOOP = {
+    "Kunjur 1997": "1.87966 0.274853 1.180253 2.138209 -0.833592 -0.37877 1.132062 0.663433 4.354224 2.558625",
+    "Cabrera 2002": "3.057878 0.237803 4.828954 2.056456 0.767038 1.850828 1.776808 -0.641991 1.002168 0.226186",
+    "Cabrera 2011": "4.453772 0.297057 3.913095 0.849372 -2.067338 1.6610626 -1.309243 2.806964 2.7387359 4.853543",
+}
 
 
 def turned(angle, x):
@@ -44,8 +64,9 @@ def four_bar(lengths, scale, angle):
 
 
 def path_error(system, state, target, v, angles):
-    """Squared distances of the coupler's point from a target at crank angles, one after the other; the gap; and the
-    sine of the angle between coupler and rocker, which is zero where the linkage is about to open.
+    """Squared distances of the coupler's point from a target at crank angles, one after the other, their sum and the
+    root of their mean; the gap; and the sine of the angle between coupler and rocker, which is zero where the linkage
+    is about to open.
     """
     own = mb.parameters(system)
     system = mb.with_parameters(system, {name: x for name, x in v.items() if name in own})
@@ -60,7 +81,9 @@ def path_error(system, state, target, v, angles):
     _, (coupler, gap, transmission) = jax.lax.scan(turn, state, angles + v.get("tilt", jnp.zeros(())))
     point = jnp.stack([v["point"][0] - 0.5 * v["coupler"], v["point"][1]])
     path = coupler[:, :2] + jax.vmap(turned, (0, None))(coupler[:, 2], point)
-    return {"error": jnp.sum((path - target) ** 2), "gap": jnp.sum(gap), "transmission": transmission}
+    error = jnp.sum((path - target) ** 2)
+    out = {"error": error, "distance": jnp.sqrt(error / len(target))}
+    return out | {"gap": jnp.sum(gap), "transmission": transmission}
 
 
 def closed_form_error(target, lengths, point, place, tilt, angles):
@@ -79,6 +102,17 @@ def closed_form_error(target, lengths, point, place, tilt, angles):
     return np.minimum(*errors) + 1e3 * np.sum(np.maximum(-square / coupler**2, 0.0), axis=-1)
 
 
+def published_errors(target, designs, angles):
+    """The errors of published designs, by the same closed form; `angles` as a function of the numbers of a design."""
+    errors = {}
+    for name, text in designs.items():
+        x = np.fromstring(text, sep=" ")
+        point, place = np.asarray(complex(*x[4:6])), np.asarray(complex(*x[6:8]))
+        errors[name] = closed_form_error(target, x[:4], point, place, x[8], angles(x))
+    print("published", errors)
+    return errors
+
+
 def evolved(objective, bounds, size, generations=1000):
     """The best of a published kind of search: differential evolution, with as many evaluations."""
     options = {"strategy": "rand1bin", "mutation": 0.6, "recombination": 0.9, "tol": 0, "polish": False, "rng": 0}
@@ -90,24 +124,27 @@ def evolved(objective, bounds, size, generations=1000):
 def test_four_bar_through_a_line():
     """Six points of a vertical line without timing, with a bound of the transmission angle."""
     system, state = four_bar((35.0, 15.0, 30.0, 30.0), 20.0, 0.5)
+    drive = lambda v: path_error(system, state, LINE, v, v["angles"])
+    limits = {"gap": (None, 0), "transmission": (0.2, None)}
+    bounds = dict.fromkeys(LENGTHS, (5.0, 60.0)) | {"point": (-60.0, 60.0)}
     start = {"base": 35.0, "crank": 15.0, "coupler": 12.0, "rocker": 9.0, "place": [40.0, 20.0], "tilt": 0.0}
     start |= {"point": [10.0, 10.0], "angles": np.linspace(2.0, 0.8, 6)}
-    bounds = dict.fromkeys(LENGTHS, (5.0, 60.0)) | {"point": (-60.0, 60.0)}
+    options = {"constraints": limits, "system": system, "max_iterations": 500}
+    one = mb.optimise(drive, start, objective="error", bounds=bounds, **options)
+    print(one)
+    assert np.isnan(one.before["error"]) and one.before["gap"] > 0
+    # The points of several starts are turned by most of a turn of the crank.
+    start |= {"crank": 10.0, "point": [20.0, 10.0], "angles": np.linspace(1.4, 5.0, 6)}
     best = mb.optimise(
-        lambda v: path_error(system, state, LINE, v, v["angles"]),
-        start,
-        objective="error",
-        constraints={"gap": (None, 0), "transmission": (0.2, None)},
-        system=system,
-        bounds=bounds,
-        max_iterations=500,
+        drive, start, objective="distance", bounds=bounds | {"angles": (-1.0, 7.0)}, starts=64, **options
     )
-    p = best.parameters
-    where = [complex(*p[name]) for name in ("point", "place")]
-    again = closed_form_error(LINE, [p[n] for n in LENGTHS], *map(np.asarray, where), p["tilt"], p["angles"])
     print(best)
-    assert np.isnan(best.before["error"]) and best.before["gap"] > 0
-    np.testing.assert_allclose(again, best.objective, rtol=1e-4, atol=1e-12)
+    for found in one, best:
+        p = found.parameters
+        where = [complex(*p[name]) for name in ("point", "place")]
+        again = closed_form_error(LINE, [p[n] for n in LENGTHS], *map(np.asarray, where), p["tilt"], p["angles"])
+        np.testing.assert_allclose(again, found.outputs["error"], rtol=1e-4, atol=1e-12)
+        assert np.min(found.outputs["transmission"]) > 0.2 * (1 - 2e-6)
 
     def objective(x):
         angles = x[:, 9:].reshape(-1, 6)
@@ -116,8 +153,10 @@ def test_four_bar_through_a_line():
 
     searched = evolved(objective, [(5, 60)] * 4 + [(-60, 60)] * 4 + [(0, 2 * np.pi)] * 7, 7)
     print("differential evolution", searched)
-    assert np.min(best.outputs["transmission"]) > 0.2 * (1 - 2e-6)
-    assert best.objective < 1e-3 and best.objective < searched
+    published = published_errors(LINE, OF_LINE, lambda design: design[9:])
+    assert one.objective < 1e-3 and one.objective < searched
+    # The design of 2022 passes through the points to the digits it is given with, after 100 000 evaluations.
+    assert best.outputs["error"] <= published["Cabrera 2011"] and published["Nguyen-Van 2022"] < 1e-10
 
 
 @pytest.mark.long
@@ -128,7 +167,7 @@ def test_four_bar_along_an_arc():
     best = mb.optimise(
         lambda v: path_error(system, state, ARC, v, jnp.asarray(angles)),
         {"base": 6.0, "crank": 2.0, "coupler": 2.5, "rocker": 1.5, "point": [1.0, 1.0]},
-        objective="error",
+        objective="distance",
         constraints={"gap": (None, 0)},
         system=system,
         bounds={"point": (-50.0, 50.0)},
@@ -138,11 +177,12 @@ def test_four_bar_along_an_arc():
     again = closed_form_error(ARC, [p[n] for n in LENGTHS], np.asarray(complex(*p["point"])), *np.zeros((2, 1)), angles)
     print(best)
     assert np.isnan(best.before["error"])
-    np.testing.assert_allclose(again, best.objective, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(again, best.outputs["error"], rtol=1e-4, atol=1e-12)
     objective = lambda x: closed_form_error(ARC, x[:, :4].T, x[:, 4] + 1j * x[:, 5], *np.zeros((2, len(x))), angles)
     searched = evolved(objective, [(0.01, 50)] * 4 + [(-50, 50)] * 2, 17)
     print("differential evolution", searched)
-    assert best.objective < 2e-6 and best.objective < searched
+    published = published_errors(ARC, OF_ARC, lambda design: angles)
+    assert best.outputs["error"] <= min(published.values()) < 2e-6 and best.outputs["error"] < searched
 
 
 @pytest.mark.long
@@ -171,7 +211,8 @@ def test_four_bar_around_a_loop():
 
     searched = evolved(objective, [(0.01, 50)] * 4 + [(-50, 50)] * 4 + [(0, 2 * np.pi)] * 2, 10)
     print("differential evolution", searched)
-    assert best.objective < 0.0091 and best.objective < searched
+    published = published_errors(LOOP, OF_LOOP, lambda design: design[9] + TURN)
+    assert best.objective < 0.0091 < min(published.values()) and best.objective < searched
 
 
 @pytest.mark.long

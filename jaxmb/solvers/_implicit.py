@@ -6,23 +6,19 @@ them f and g, follow from the constraints.
 """
 
 import functools
-import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._damping import eigenvalues
+from ._field import Derivatives, Field, derivatives, filled, linearized
 from ._lanes import cond_of_any_lane
 from ._linearization import AbstractLinearization
-
-# `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
-Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
 
 _MAX_ITERATIONS = 10
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
@@ -36,60 +32,6 @@ _ATTEMPTS, _DONE = 4, 9
 # The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps: with
 # longer differences the truncation error, which is stiff, slows Newton's method, with shorter ones the rounding error.
 _AHEAD = 0.4
-
-
-class Derivatives(NamedTuple):
-    """A state with its first and second derivative in time; `rest`: the other outputs of the field."""
-
-    y: Float[Array, " n"]
-    f: Float[Array, " n"]
-    g: Float[Array, " n"]
-    rest: PyTree
-
-
-def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
-    """The state, on the manifold, and its derivatives in time."""
-    (y, f), push, rest = jax.linearize(field, t, y, has_aux=True)
-    return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
-
-
-def probed_derivatives(
-    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
-) -> Derivatives:
-    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known;
-    `along`: whether to take differences along the manifold only, where a projection returns to it.
-    """
-    eps = jnp.finfo(y.dtype).eps
-    size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
-    signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
-    aside = lax.stop_gradient(eps ** (1 / 3) * signs * jnp.where(size > 0, size, jnp.ones_like(size)))
-
-    # A loop, so that the field is compiled once for both states.
-    def at(carry, _):
-        y, way = carry
-        (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
-        times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
-        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
-        # The same way at both states, for the mean of both slopes to be that of the difference to second order.
-        way = lax.stop_gradient(move) if along else way
-        return (y + way, way), (Derivatives(state, f, g, rest), slope)
-
-    _, (both, slopes) = lax.scan(at, (y, aside), None, length=2)
-    f = lax.stop_gradient(both.f)
-    change, expected = f[1] - f[0], lax.stop_gradient(jnp.mean(slopes, axis=0))
-    wrong = jnp.abs(change - expected)
-    rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
-    contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
-    lax.cond(eqxi.unvmap_any(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
-    return jax.tree.map(lambda x: x[0], both)
-
-
-def _warn():
-    warnings.warn(
-        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its "
-        "results would be wrong: look for `stop_gradient`, rounding and integers in the vector field.",
-        stacklevel=2,
-    )
 
 
 class Linearization(AbstractLinearization):
@@ -360,23 +302,12 @@ def _differentiable_jvp(primals, tangents):
     _, field, t, past, a, b, free = primals
     _, dfield, dt, dpast, da, db, _ = tangents
     y, f, g = differentiable(*primals)
-    values, structure = eqx.partition(field, eqx.is_inexact_array)
-
-    def at(values, t, change):
-        # g for a held rate: the other part of its change is J times that of the rate.
-        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, y.at[free].add(change), has_aux=True)
-        return state, rate, push(jnp.ones_like(t), f)[1]
-
     still = jnp.zeros(free.shape[0], y.dtype)
-    _, push = jax.linearize(at, values, t, still)
-    dense = lambda tangent, primal: jnp.zeros_like(primal) if tangent is None else tangent
-    dvalues = jax.tree.map(lambda v, d: None if v is None else dense(d, v), values, dfield, is_leaf=lambda x: x is None)
-    moved = push(dvalues, dense(dt, t), still)
-    zeros = jax.tree.map(jnp.zeros_like, (values, t))
-    columns = jax.vmap(lambda change: push(*zeros, change), out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
+    moved, push = linearized(field, dfield, t, dt, lambda change: y.at[free].add(change), still, f)
+    columns = jax.vmap(push, out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
     jacobian, held = columns[1][free], columns[2][free]
     inverses = inverses_of(jacobian, held, a, b)
-    load = (dense(dpast, past) + dense(da, a) * f + dense(db, b) * g + b * moved[2])[free]
+    load = (filled(dpast, past) + filled(da, a) * f + filled(db, b) * g + b * moved[2])[free]
 
     def correction(change):
         # Large terms are combined as in `solve`, so the result does not depend on the last digits of an inverse.

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._damping import eigenvalues
 from ._evaluation import field_jacobian, freeze
-from ._implicit import Field
+from ._field import Field, filled, linearized
 from ._lanes import cond_of_any_lane
 from ._linearization import AbstractLinearization
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
@@ -34,8 +34,9 @@ _SMALL = 0.02
 # A matrix is renewed after a step whose corrections shrank more slowly than by this factor, and in a step where more
 # than about this number of iterations would follow.
 _SLOW, _PATIENCE = 0.35, 8
-# The largest number of iterations for derivatives, and the relative residual at which they end.
-_ITERATIONS, _RESIDUAL = 40, 1e-14
+# The largest number of iterations for derivatives; the relative residual at which they end, and the largest one of a
+# derivative that may be used, in rounding units.
+_ITERATIONS, _RESIDUAL, _LARGEST_RESIDUAL = 40, 50, 1e5
 
 
 class StructuredInverses(eqx.Module):
@@ -190,25 +191,24 @@ def _differentiable_jvp(primals, tangents):
     _, dfield, dt, dpast, da, db, _, _ = tangents
     y, f, g = differentiable(*primals)
     matrix, inverses = freeze((matrix, inverses))
-    values, structure = eqx.partition(field, eqx.is_inexact_array)
+    moved, along = linearized(field, dfield, t, dt, lambda change: y + change, jnp.zeros_like(y), f)
 
-    def at(values, t, y):
-        # g for a held rate: the other part of its change is J times that of the rate.
-        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, y, has_aux=True)
-        return state, rate, push(jnp.ones_like(t), f)[1]
+    def twice(change):
+        """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
 
-    _, push = jax.linearize(at, values, t, y)
-    dense = lambda tangent, primal: jnp.zeros_like(primal) if tangent is None else tangent
-    dvalues = jax.tree.map(lambda v, d: None if v is None else dense(d, v), values, dfield, is_leaf=lambda x: x is None)
-    moved = push(dvalues, dense(dt, t), jnp.zeros_like(y))
-    zeros = jax.tree.map(jnp.zeros_like, (values, t))
-    along = lambda change: push(*zeros, change)
-    load = dense(dpast, past) + dense(da, a) * f + dense(db, b) * g
-    load = load + a * moved[1] + b * (moved[2] + along(moved[1])[1])
+        def step(x, _):
+            by_x = along(x)
+            return by_x[1], by_x
+
+        _, (states, rates, held) = lax.scan(step, change, None, length=2)
+        return states[0], rates[0], held[0] + rates[1]
 
     def apply(change):
-        _, rate, held = along(change)
-        return change - a * rate - b * (held + along(rate)[1])
+        _, rate, acceleration = twice(change)
+        return change - a * rate - b * acceleration
+
+    acceleration = moved[2] + along(moved[1])[1]
+    load = filled(dpast, past) + filled(da, a) * f + filled(db, b) * g + a * moved[1] + b * acceleration
 
     project = matrix.jacobian.project
 
@@ -226,20 +226,21 @@ def _differentiable_jvp(primals, tangents):
         lambda apply, x: _iterate(apply, precondition, x),
         lambda apply, x: _iterate(apply, precondition_transpose, x),
     )
-    dstate, drate, dheld = (own + of_change for own, of_change in zip(moved, along(change), strict=True))
-    return (y, f, g), (dstate, drate, dheld + along(drate)[1])
+    by_change = twice(change)
+    return (y, f, g), tuple(map(jnp.add, (moved[0], moved[1], acceleration), by_change))
 
 
 def _iterate(
     apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]
 ) -> Array:
-    """The solution of a linear equation by generalized conjugate residuals."""
+    """The solution of a linear equation by generalized conjugate residuals; NaN where it is not found."""
     n, dtype = load.size, load.dtype
-    target = _RESIDUAL * jnp.sqrt(jnp.sum(load**2))
+    size = lambda x: jnp.sqrt(jnp.sum(x**2))
+    unit = jnp.finfo(dtype).eps * size(load)
 
     def proceed(carry):
         k, _, residual, _, _ = carry
-        return (k < _ITERATIONS) & (jnp.sqrt(jnp.sum(residual**2)) > target)
+        return (k < _ITERATIONS) & (size(residual) > _RESIDUAL * unit)
 
     def step(carry):
         k, x, residual, directions, images = carry
@@ -248,8 +249,8 @@ def _iterate(
         for _ in range(2):
             along = images @ image
             image, direction = image - along @ images, direction - along @ directions
-        size = jnp.sqrt(jnp.sum(image**2)) + jnp.finfo(dtype).tiny
-        image, direction = image / size, direction / size
+        length = size(image) + jnp.finfo(dtype).tiny
+        image, direction = image / length, direction / length
         part = jnp.sum(image * residual)
         return (
             k + 1,
@@ -260,4 +261,7 @@ def _iterate(
         )
 
     blank = jnp.zeros((_ITERATIONS, n), dtype)
-    return lax.while_loop(proceed, step, (jnp.array(0), jnp.zeros_like(load), load, blank, blank))[1]
+    start = jnp.array(0), jnp.zeros_like(load), load, blank, blank
+    _, x, residual, _, _ = lax.while_loop(proceed, step, start)
+    # A derivative that has not converged may look like one that has.
+    return jnp.where(size(residual) <= _LARGEST_RESIDUAL * unit, x, jnp.full_like(x, jnp.nan))

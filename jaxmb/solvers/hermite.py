@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._damping import are_damped, is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
+from ._field import derivatives, probed_derivatives
 from ._formulas import FAMILIES, Family, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
-from ._implicit import Linearization, Solved, derivatives, differentiable, linearize, probed_derivatives, solve
+from ._implicit import Linearization, Solved, differentiable, linearize, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.solvers._implicit import derivatives, differentiable
+from jaxmb.solvers._field import derivatives
+from jaxmb.solvers._implicit import differentiable
 
 
 class Field(eqx.Module):

@@ -1,0 +1,102 @@
+"""A vector field on raveled states, its second derivative in time, and its linearisation."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+# `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
+Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
+
+
+class Derivatives(NamedTuple):
+    """A state with its first and second derivative in time; `rest`: the other outputs of the field."""
+
+    y: Float[Array, " n"]
+    f: Float[Array, " n"]
+    g: Float[Array, " n"]
+    rest: PyTree
+
+
+def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
+    """The state, on the manifold, and its derivatives in time."""
+    (y, f), push, rest = jax.linearize(field, t, y, has_aux=True)
+    return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
+
+
+def probed_derivatives(
+    field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
+) -> Derivatives:
+    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known;
+    `along`: whether to take differences along the manifold only, where a projection returns to it.
+    """
+    eps = jnp.finfo(y.dtype).eps
+    size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
+    signs = jnp.where(jnp.arange(y.size) % 2 == 0, 1.0, -0.7).astype(y.dtype)
+    aside = lax.stop_gradient(eps ** (1 / 3) * signs * jnp.where(size > 0, size, jnp.ones_like(size)))
+
+    # A loop, so that the field is compiled once for both states.
+    def at(carry, _):
+        y, way = carry
+        (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
+        times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
+        (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
+        # The same way at both states, for the mean of both slopes to be that of the difference to second order.
+        way = lax.stop_gradient(move) if along else way
+        return (y + way, way), (Derivatives(state, f, g, rest), slope)
+
+    _, (both, slopes) = lax.scan(at, (y, aside), None, length=2)
+    f = lax.stop_gradient(both.f)
+    change, expected = f[1] - f[0], lax.stop_gradient(jnp.mean(slopes, axis=0))
+    wrong = jnp.abs(change - expected)
+    rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
+    contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
+    lax.cond(eqxi.unvmap_any(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
+    return jax.tree.map(lambda x: x[0], both)
+
+
+def _warn():
+    warnings.warn(
+        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its "
+        "results would be wrong: look for `stop_gradient`, rounding and integers in the vector field.",
+        stacklevel=2,
+    )
+
+
+def filled(tangent: Array | None, primal: Array) -> Array:
+    """A tangent, zero where there is none."""
+    return jnp.zeros_like(primal) if tangent is None else tangent
+
+
+def linearized(
+    field: Field,
+    dfield: Field,
+    t: Array,
+    dt: Array | None,
+    place: Callable[[Float[Array, " free"]], Float[Array, " n"]],
+    still: Float[Array, " free"],
+    f: Float[Array, " n"],
+) -> tuple[Any, Callable[[Float[Array, " free"]], Any]]:
+    """The derivatives of `(y, f, g)` at `y = place(still)`. Of g they are those for a held rate `f`: the rest of its
+    change is J times the change of the rate.
+
+    **Returns:** the changes by the tangents of the field and of time, and the change as a linear function of that of
+    `still`.
+    """
+    values, structure = eqx.partition(field, eqx.is_inexact_array)
+
+    def at(values, t, change):
+        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, place(change), has_aux=True)
+        return state, rate, push(jnp.ones_like(t), f)[1]
+
+    _, push = jax.linearize(at, values, t, still)
+    none = lambda x: x is None
+    dvalues = jax.tree.map(lambda v, d: None if v is None else filled(d, v), values, dfield, is_leaf=none)
+    zeros = jax.tree.map(jnp.zeros_like, (values, t))
+    return push(dvalues, filled(dt, t), jnp.zeros_like(still)), lambda change: push(*zeros, change)
