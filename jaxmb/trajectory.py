@@ -157,7 +157,7 @@ class Trajectory(eqx.Module):
     @_of_each_member
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
-        return jax.vmap(lambda t, y: self.system.potential_energy(t, y.q))(self.ts, self.ys)
+        return jax.vmap(lambda t, y: self.system.at(y).potential_energy(t, y.q))(self.ts, self.ys)
 
     @property
     def energy(self) -> Float[Array, "times"]:

@@ -10,7 +10,17 @@ from oracles import driven
 import jaxmb as mb
 from jaxmb import contact, manifold, mechanisms, planar, solvers, spatial, terrain
 from jaxmb.manifold import with_internal_states
-from jaxmb.parts import AbstractDynamicForce, AbstractForce, Number, body_name, internal_state, name, parameter
+from jaxmb.manifold.impulse import after_impulse
+from jaxmb.parts import (
+    AbstractDynamicForce,
+    AbstractForce,
+    AbstractPotentialForce,
+    Number,
+    body_name,
+    internal_state,
+    name,
+    parameter,
+)
 
 # Of the cart's place and speed, the pole's angle and its rate, and the integral of the place; a stable motion.
 GAINS = {"place": 27.0, "speed": 27.0, "angle": -160.0, "rate": -45.0, "integral": 10.0}
@@ -94,6 +104,38 @@ class Filter(AbstractDynamicForce):
 def filtered(part=None):
     body = planar.Body("body", mass=1.0, inertia=1.0, velocity=(1.0, 0.0))
     return mb.Scene([body], forces=[part or Filter("filter", "body", lag=0.1)]).compile()
+
+
+class Maxwell(AbstractDynamicForce, AbstractPotentialForce):
+    """A spring in series with a damper, along x."""
+
+    name: str = name()
+    body: str = body_name()
+    stiffness: Number = parameter(unit="N/m", sign="positive")
+    damping: Number = parameter(unit="N s/m", sign="positive")
+    creep: Number = internal_state(unit="m")
+
+    def stretch(self, poses):
+        return poses[0, 0] - self.creep
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros_like(velocities).at[0, 0].set(-self.stiffness * self.stretch(poses))
+
+    def energy(self, space, poses, t):
+        return 0.5 * self.stiffness * self.stretch(poses) ** 2
+
+    def state_rates(self, space, poses, velocities, t):
+        return {"creep": self.stiffness * self.stretch(poses) / self.damping}
+
+
+def test_energy_may_depend_on_internal_states():
+    body = planar.Body("body", mass=1.0, inertia=1.0, position=(0.1, 0.0))
+    part = Maxwell("spring", "body", stiffness=10.0, damping=1.0)
+    system = mb.Scene([body], forces=[part]).compile()
+    sol = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=np.linspace(0.0, 1.0, 5))
+    stretch = sol["body"].position[:, 0] - sol["spring"].creep
+    np.testing.assert_allclose(sol.potential_energy, 5.0 * stretch**2, rtol=1e-12)
+    assert sol.energy[0] == pytest.approx(0.05) and np.all(np.diff(sol.energy) < 0)
 
 
 def end(system, gains, angle, integral, adjoint=None, rtol=1e-10):
@@ -276,6 +318,15 @@ def test_sparse_elimination_serves_machines_with_states():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+def test_a_jump_keeps_internal_states():
+    system = chain_of_motors(15)
+    start = mb.assemble(system)
+    assert system.elimination is not None
+    after = after_impulse(system, 0.0, mb.State(start.q, start.u, start.z + 1.0))
+    np.testing.assert_array_equal(after.z, start.z + 1.0)
+    np.testing.assert_allclose(after.u, 0.0, atol=1e-12)
+
+
 def test_program_does_not_grow_with_the_number_of_motors():
     lines = []
     for n in (20, 40):
@@ -435,6 +486,14 @@ REFUSED = {
         "Controller 'pid': Unknown joint, body or frame 'hing'; did you mean 'hinge'",
     ),
     "acts on a body": (lambda: cart_and_pole(acts_on="cart.position"), "it acts on coordinates of joints"),
+    "acts twice": (
+        lambda: cart_and_pole(acts_on=["slide.displacement", "slide.displacement"]),
+        "Controller 'pid': acts_on names a coordinate twice",
+    ),
+    "a state's name": (
+        lambda: cart_and_pole(states={"integral": 0.0, "a.b": 0.0}),
+        "Controller 'pid': names of states must not be empty or contain a dot, got 'a.b'",
+    ),
     "gain of a force": (
         lambda: motor_on_four_bar(mode="force"),
         "Actuator 'motor': gain and damping belong to the modes 'speed' and 'position'",

@@ -297,8 +297,9 @@ class AbstractPotentialForce(AbstractForce):
 class AbstractDynamicForce(AbstractForce):
     """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
 
-    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches` and `state_rates` find
-    its current value. A `State` holds those of all parts in `z`; by name they are `"motor.torque"`.
+    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches`, `state_rates` and, of
+    a part with a potential, `energy` find its current value. A `State` holds those of all parts in `z`; by name they
+    are `"motor.torque"`.
     """
 
     @abc.abstractmethod

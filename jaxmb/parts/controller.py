@@ -78,6 +78,8 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
                 raise ValueError(f"{self.label}: a quantity is named 'part.quantity', got {name!r}.")
         if not self.acts_on:
             raise ValueError(f"{self.label}: acts_on names at least one coordinate of a joint.")
+        if len(set(self.acts_on)) < len(self.acts_on):
+            raise ValueError(f"{self.label}: acts_on names a coordinate twice, got {self.acts_on}.")
         taken = set(self.states) & set(self.parameters)
         if taken:
             raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
