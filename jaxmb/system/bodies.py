@@ -17,23 +17,15 @@ from ..linalg.block_jacobian import JointOrder
 from ..linalg.rotations import normalize
 from ..parts.forces import Gravity
 from .body_motion import attachments, body_motion, body_quantities, outline
+from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
 from .coordinates import coordinate_names, rate_names
 from .describe import describe_scene
 from .design_variables import DesignVariables, description_rows, in_range
 from .equation import AbstractSystem, Ranks
+from .force_groups import ForceGroup, NonIdealGroup
 from .frame_motion import frame_quantities
 from .group_inputs import signals_of, with_signals
-from .groups import (
-    AbstractConstraintGroup,
-    BodyGroup,
-    ConstraintGroup,
-    ForceGroup,
-    FrameGroup,
-    NonIdealGroup,
-    ServoGroup,
-    TendonGroup,
-    VelocityConstraintGroup,
-)
+from .groups import BodyGroup, FrameGroup, TendonGroup
 from .internal_states import (
     StateField,
     initial_states,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..parts.fields import entry, internal_states
-from .groups import ForceGroup
+from .force_groups import ForceGroup
 from .quantities import Quantity
 
 
