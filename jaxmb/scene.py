@@ -22,7 +22,8 @@ from .parts.base import (
     rows_of,
 )
 from .parts.boundary import check_kernels
-from .parts.fields import anonymous, declarations, inner_parts
+from .parts.contents import anonymous, inner_parts
+from .parts.fields import declarations
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart

@@ -11,7 +11,8 @@ import numpy as np
 
 from .._types import State
 from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
-from ..parts.fields import field_names, paths
+from ..parts.contents import paths
+from ..parts.fields import field_names
 from ..parts.forces import Damper
 from ..states.structure import with_structure
 from ..system import AbstractSystem, parameters, with_parameters

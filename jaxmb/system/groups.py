@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
-from ..parts.fields import anonymous, entry, inner_parts
+from ..parts.contents import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal
 from ..parts.space import AbstractSpace
 from .layout import Layout
