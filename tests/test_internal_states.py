@@ -138,6 +138,18 @@ def test_energy_may_depend_on_internal_states():
     assert sol.energy[0] == pytest.approx(0.05) and np.all(np.diff(sol.energy) < 0)
 
 
+def test_a_failure_of_friction_is_named_beside_internal_states():
+    """A rod that slides on the floor swings up to Painlevé's angle, and a filter watches."""
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    floor = planar.PointOnLine("floor", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0), axis_a=(1.0, 0.0))
+    rub = planar.Friction("rub", "floor", coefficient=1.5, transition_speed=1e-2)
+    forces = [mb.Gravity((0.0, -9.81)), rub, Filter("filter", "rod", lag=0.1)]
+    system = mb.Scene([rod], joints=[floor], forces=forces).compile()
+    state = mb.assemble(system, fix={"rod.angle": 0.5}, rates={"rod.x": -3.0, "rod.angle": 6.0})
+    with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration"):
+        mb.simulate(system, state, t1=1.0)
+
+
 def end(system, gains, angle, integral, adjoint=None, rtol=1e-10):
     changed = mb.with_parameters(system, {"pid.of_angle": gains[0], "pid.of_integral": gains[1]})
     start = mb.assemble(changed, fix={"hinge.angle": angle, "slide.displacement": 0.0, "pid.integral": integral})

@@ -185,9 +185,12 @@ def motion(
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
     shown = trajectory.system.picture(trajectory.ts, trajectory.ys)
-    for body in given:
+    for body, own in given.items():
         if body not in shown.positions:
             raise unknown("body", body, shown.positions)
+        listed = own if isinstance(own, Sequence) else [own]
+        if not all(isinstance(shape, AbstractShape) for shape in listed):
+            raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {own!r}.")
     return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 
