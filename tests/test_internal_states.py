@@ -154,6 +154,15 @@ def test_a_failure_of_friction_is_named_beside_internal_states():
         mb.simulate(system, state, t1=1.0)
 
 
+@pytest.mark.long
+def test_a_rate_that_is_not_finite_is_named():
+    bad = lambda t, measured, states, p: (0.0, {"integral": jnp.sqrt(0.5 - t)})
+    system = cart_and_pole_with(bad)
+    state = system.guess
+    assert system.with_states(state.z).not_finite(0.4, state.q, state.u) == ()
+    assert system.with_states(state.z).not_finite(0.6, state.q, state.u) == ("the rate of 'pid.integral'",)
+
+
 def end(system, gains, angle, integral, adjoint=None, rtol=1e-10):
     changed = mb.with_parameters(system, {"pid.of_angle": gains[0], "pid.of_integral": gains[1]})
     start = mb.assemble(changed, fix={"hinge.angle": angle, "slide.displacement": 0.0, "pid.integral": integral})

@@ -301,19 +301,24 @@ class AbstractBodySystem(AbstractBodies):
         return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
 
     def not_finite(self, t, q, u):
-        values = self._of_parts(jnp.asarray(t, q.dtype), q, u)
+        t = jnp.asarray(t, q.dtype)
+        values = self._of_parts(t, q, u)
         kinds = zip(
             ("residual", "residual", "force"), (self.constraints, self.joints, self.forces), values, strict=True
         )
-        return tuple(
-            dict.fromkeys(
-                f"the {kind} of {name!r}"
-                for kind, of_kind, of_parts in kinds
-                for group, own in zip(of_kind, of_parts, strict=True)
-                for name, value in zip(group.group.names, np.asarray(own), strict=True)
-                if not np.all(np.isfinite(value))
-            )
-        )
+        found = [
+            f"the {kind} of {name!r}"
+            for kind, of_kind, of_parts in kinds
+            for group, own in zip(of_kind, of_parts, strict=True)
+            for name, value in zip(group.group.names, np.asarray(own), strict=True)
+            if not np.all(np.isfinite(value))
+        ]
+        if self.nz:
+            rates = np.asarray(self.state_rates(t, q, u))
+            found += [
+                f"the rate of {name!r}" for name, k in self.state_names().items() if not np.all(np.isfinite(rates[k]))
+            ]
+        return tuple(dict.fromkeys(found))
 
     @eqx.filter_jit
     def _of_parts(self, t, q, u):
