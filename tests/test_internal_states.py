@@ -89,6 +89,24 @@ def test_error_control_sees_internal_states():
     np.testing.assert_allclose(coarse["filter"].value[-1], expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["Adams", "Hermite", "Dopri8"])
+def test_small_states_that_start_at_zero_are_as_accurate(method):
+    """A motor of nanonewton metres on a rotor as small moves it like one of newton metres a large one."""
+    unit, w, lag, t = 1e-9, 5.0, 0.05, 3.0
+    rod = planar.Body("rod", mass=1.0, inertia=0.1 * unit)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    motor = mb.Actuator("motor", "pin.angle", command=0.0, lag=lag)
+    system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
+    command = {"motor.command": lambda t: unit * jnp.sin(w * t)}
+    sol = mb.simulate(system, mb.assemble(system), t1=t, inputs=command, **METHODS[method])
+    # Twice the integral of the lagging force.
+    decay = lag * (1 - np.exp(-t / lag))
+    angle = t / w - np.sin(w * t) / w**2 - lag * (1 - np.cos(w * t)) / w + w * lag**2 * (t - decay)
+    expected = angle / (1 + (w * lag) ** 2) / 0.1
+    np.testing.assert_allclose(sol["rod"].angle[-1], expected, rtol=1e-8)
+
+
 class Filter(AbstractDynamicForce):
     """A signal that is filtered, and pushes nothing."""
 

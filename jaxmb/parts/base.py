@@ -307,8 +307,8 @@ class AbstractDynamicForce(AbstractForce):
         """The rate of every internal state [its unit/s], by the name of the field."""
 
     def state_sizes(self) -> dict[str, Any]:
-        """Hook: the typical sizes of internal states by the name of the field, for error control where a state is zero;
-        default one in its unit.
+        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
+        control states that have stayed smaller than 1e-4 of it count as this much.
         """
         return {}
 
