@@ -147,7 +147,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
         return forces, {name: jnp.asarray(rate, poses.dtype) for name, rate in rates.items()}
 
     def _row(self, space, poses, forces):
-        """The forces on all coordinates, raveled one after the other."""
+        """The forces [N m, N] on all coordinates, raveled one after the other."""
         forces = forces if isinstance(forces, dict) else {self.acts_on[0]: forces}
         if set(forces) != set(self.acts_on):
             raise ValueError(f"the function of {self.label} must return the force on {' and '.join(self.acts_on)}.")

@@ -99,11 +99,9 @@ class Motion:
 
     def _anchor(self, body, point):
         turn, place = self.picture.orientations[body], self.picture.positions[body]
-        return (
-            place
-            if point is None
-            else place + stage.viser().transforms.SO3(turn).apply(np.broadcast_to(point, place.shape))
-        )
+        if point is None:
+            return place
+        return place + stage.viser().transforms.SO3(turn).apply(np.broadcast_to(point, place.shape))
 
     # Nodes
 
