@@ -22,7 +22,8 @@ from .parts.base import (
     rows_of,
 )
 from .parts.boundary import check_kernels
-from .parts.fields import anonymous, declarations, inner_parts
+from .parts.contents import anonymous, inner_parts
+from .parts.fields import declarations
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
@@ -34,19 +35,11 @@ from .parts.sources import AbstractOfSources
 from .parts.spatial.kinematics import SPACE
 from .states.structure import with_structure
 from .system import RigidBodySystem
+from .system.constraint_groups import ConstraintGroup, VelocityConstraintGroup, servo_group
 from .system.description import Description
 from .system.equation import Ranks
-from .system.groups import (
-    BodyGroup,
-    ConstraintGroup,
-    ForceGroup,
-    FrameGroup,
-    NonIdealGroup,
-    TendonGroup,
-    VelocityConstraintGroup,
-    servo_group,
-    stack,
-)
+from .system.force_groups import ForceGroup, NonIdealGroup
+from .system.groups import BodyGroup, FrameGroup, TendonGroup, stack
 from .system.layout import Layout
 
 # Parts that act on other parts, given by their names.

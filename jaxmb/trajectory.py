@@ -137,13 +137,9 @@ class Trajectory(eqx.Module):
 
     @_of_each_member
     def _at(self, t):
-        t = jnp.asarray(t, self.ys_dtype)
+        t = jnp.asarray(t, self.system.guess.q.dtype)
         out = _between(self.system, self.interpolation, t.reshape(-1))
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
-
-    @property
-    def ys_dtype(self):
-        return self.system.guess.q.dtype
 
     @property
     @eqx.filter_jit
@@ -157,7 +153,7 @@ class Trajectory(eqx.Module):
     @_of_each_member
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
-        return jax.vmap(lambda t, y: self.system.potential_energy(t, y.q))(self.ts, self.ys)
+        return jax.vmap(lambda t, y: self.system.at(y).potential_energy(t, y.q))(self.ts, self.ys)
 
     @property
     def energy(self) -> Float[Array, "times"]:

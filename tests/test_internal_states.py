@@ -1,6 +1,9 @@
 """Parts with internal states: motors with lag, controllers with memory, tyres with relaxation."""
 
+import dataclasses
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +11,19 @@ import pytest
 from oracles import driven
 
 import jaxmb as mb
-from jaxmb import contact, manifold, mechanisms, planar, solvers, spatial, terrain
+from jaxmb import contact, formulations, manifold, mechanisms, planar, solvers, spatial, terrain
 from jaxmb.manifold import with_internal_states
-from jaxmb.parts import AbstractDynamicForce, AbstractForce, Number, body_name, internal_state, name, parameter
+from jaxmb.manifold.impulse import after_impulse
+from jaxmb.parts import (
+    AbstractDynamicForce,
+    AbstractForce,
+    AbstractPotentialForce,
+    Number,
+    body_name,
+    internal_state,
+    name,
+    parameter,
+)
 
 # Of the cart's place and speed, the pole's angle and its rate, and the integral of the place; a stable motion.
 GAINS = {"place": 27.0, "speed": 27.0, "angle": -160.0, "rate": -45.0, "integral": 10.0}
@@ -76,6 +89,24 @@ def test_error_control_sees_internal_states():
     np.testing.assert_allclose(coarse["filter"].value[-1], expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["Adams", "Hermite", "Dopri8"])
+def test_small_states_that_start_at_zero_are_as_accurate(method):
+    """A motor of nanonewton metres on a rotor as small moves it like one of newton metres a large one."""
+    unit, w, lag, t = 1e-9, 5.0, 0.05, 3.0
+    rod = planar.Body("rod", mass=1.0, inertia=0.1 * unit)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    motor = mb.Actuator("motor", "pin.angle", command=0.0, lag=lag)
+    system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
+    command = {"motor.command": lambda t: unit * jnp.sin(w * t)}
+    sol = mb.simulate(system, mb.assemble(system), t1=t, inputs=command, **METHODS[method])
+    # Twice the integral of the lagging force.
+    decay = lag * (1 - np.exp(-t / lag))
+    angle = t / w - np.sin(w * t) / w**2 - lag * (1 - np.cos(w * t)) / w + w * lag**2 * (t - decay)
+    expected = angle / (1 + (w * lag) ** 2) / 0.1
+    np.testing.assert_allclose(sol["rod"].angle[-1], expected, rtol=1e-8)
+
+
 class Filter(AbstractDynamicForce):
     """A signal that is filtered, and pushes nothing."""
 
@@ -94,6 +125,60 @@ class Filter(AbstractDynamicForce):
 def filtered(part=None):
     body = planar.Body("body", mass=1.0, inertia=1.0, velocity=(1.0, 0.0))
     return mb.Scene([body], forces=[part or Filter("filter", "body", lag=0.1)]).compile()
+
+
+class Maxwell(AbstractDynamicForce, AbstractPotentialForce):
+    """A spring in series with a damper, along x."""
+
+    name: str = name()
+    body: str = body_name()
+    stiffness: Number = parameter(unit="N/m", sign="positive")
+    damping: Number = parameter(unit="N s/m", sign="positive")
+    creep: Number = internal_state(unit="m")
+
+    def stretch(self, poses):
+        return poses[0, 0] - self.creep
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros_like(velocities).at[0, 0].set(-self.stiffness * self.stretch(poses))
+
+    def energy(self, space, poses, t):
+        return 0.5 * self.stiffness * self.stretch(poses) ** 2
+
+    def state_rates(self, space, poses, velocities, t):
+        return {"creep": self.stiffness * self.stretch(poses) / self.damping}
+
+
+def test_energy_may_depend_on_internal_states():
+    body = planar.Body("body", mass=1.0, inertia=1.0)
+    system = mb.Scene([body], forces=[Maxwell("spring", "body", stiffness=10.0, damping=1.0)]).compile()
+    ts, x, creep = np.array([0.0, 1.0]), np.array([0.1, 0.3]), np.array([0.0, -0.2])
+    ys = mb.State(jnp.array([x, 0 * x, 0 * x]).T, jnp.zeros((2, 3)), jnp.array(creep)[:, None])
+    sol = mb.Trajectory(system, formulations.Multipliers(), ts, ys, {}, mb.RESULTS.successful, None, None)
+    np.testing.assert_allclose(sol.energy, 5.0 * (x - creep) ** 2, rtol=1e-12)
+
+
+@pytest.mark.long
+def test_a_failure_of_friction_is_named_beside_internal_states():
+    """A rod that slides on the floor swings up to Painlevé's angle, with a motor that stays without force."""
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    floor = planar.PointOnLine("floor", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0), axis_a=(1.0, 0.0))
+    rub = planar.Friction("rub", "floor", coefficient=1.5, transition_speed=1e-2)
+    motor = mb.Actuator("motor", "floor.displacement", command=0.0, lag=0.1)
+    forces = [mb.Gravity((0.0, -9.81)), rub, motor]
+    system = mb.Scene([rod], joints=[floor], forces=forces).compile()
+    state = mb.assemble(system, fix={"rod.angle": 0.5}, rates={"rod.x": -3.0, "rod.angle": 6.0})
+    with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration"):
+        mb.simulate(system, state, t1=1.0)
+
+
+@pytest.mark.long
+def test_a_rate_that_is_not_finite_is_named():
+    bad = lambda t, measured, states, p: (0.0, {"integral": jnp.sqrt(0.5 - t)})
+    system = cart_and_pole_with(bad)
+    state = system.guess
+    assert system.with_states(state.z).not_finite(0.4, state.q, state.u) == ()
+    assert system.with_states(state.z).not_finite(0.6, state.q, state.u) == ("the rate of 'pid.integral'",)
 
 
 def end(system, gains, angle, integral, adjoint=None, rtol=1e-10):
@@ -276,6 +361,15 @@ def test_sparse_elimination_serves_machines_with_states():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+def test_a_jump_keeps_internal_states():
+    system = chain_of_motors(15)
+    assert system.elimination is not None
+    before = dataclasses.replace(system.guess, z=system.guess.z + 1.0)
+    after = eqx.filter_jit(after_impulse)(system, 0.0, before)
+    np.testing.assert_array_equal(after.z, before.z)
+    np.testing.assert_allclose(after.u, 0.0, atol=1e-12)
+
+
 def test_program_does_not_grow_with_the_number_of_motors():
     lines = []
     for n in (20, 40):
@@ -435,6 +529,14 @@ REFUSED = {
         "Controller 'pid': Unknown joint, body or frame 'hing'; did you mean 'hinge'",
     ),
     "acts on a body": (lambda: cart_and_pole(acts_on="cart.position"), "it acts on coordinates of joints"),
+    "acts twice": (
+        lambda: cart_and_pole(acts_on=["slide.displacement", "slide.displacement"]),
+        "Controller 'pid': acts_on names a coordinate twice",
+    ),
+    "a state's name": (
+        lambda: cart_and_pole(states={"integral": 0.0, "a.b": 0.0}),
+        "Controller 'pid': names of states must not be empty or contain a dot, got 'a.b'",
+    ),
     "gain of a force": (
         lambda: motor_on_four_bar(mode="force"),
         "Actuator 'motor': gain and damping belong to the modes 'speed' and 'position'",

@@ -16,6 +16,8 @@ from test_every_part import SPACES, compiled as built
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
 from jaxmb.cli.picture import check_picture, show_motion
+from jaxmb.importers.description import Shape
+from jaxmb.importers.pictures import pictures
 from jaxmb.linalg import rotations as rot
 from jaxmb.parts import contact
 from jaxmb.viz.solids import solids
@@ -268,12 +270,34 @@ def test_motions_that_cannot_be_shown(pendulum):
         viz.show([trajectory.ys])
     with pytest.raises(ValueError, match="no motion"):
         viz.show([])
-    for options in ({"frames": 1}, {"speed": 0.0}, {"speed": np.nan}, {"height": -1}):
+    wrong = ({"frames": 1}, {"frames": 2.5}, {"speed": 0.0}, {"speed": np.nan}, {"speed": "fast"}, {"height": -1})
+    for options in (*wrong, {"shapes": {"bar": 3}}):
         with pytest.raises(ValueError, match=next(iter(options))):
             viz.show(trajectory, **options)
     still = at_rest(mb.Scene([spatial.PointMass("mass", mass=1.0)]).compile())
     with pytest.raises(ValueError, match="Planar and spatial"):
         viz.show([trajectory, still])
+
+
+def test_a_single_name(pendulum):
+    """A word is one name and not its letters, and a name that stands twice counts once."""
+    read = [Page(viz.show(pendulum[0], points=points, frames=2).html) for points in ("pin", ["pin", "pin"])]
+    assert all("/trails/pin" in page.names() for page in read)
+
+
+def test_names_with_the_marks_of_a_page():
+    body = planar.Body("</script><b>", mass=1.0, inertia=0.1)
+    motion = at_rest(mb.Scene([body]).compile())
+    shown = viz.show({"<i>one": motion, "two": motion}, points="</script><b>")
+    assert "</script><b>" not in shown.html and "<i>one" not in shown.html
+    assert "/<i>one/trails/</script><b>" in Page(shown.html).names()
+
+
+def test_what_collides_is_shown_where_nothing_else_can_be(tmp_path):
+    mesh = Shape("mesh", "link", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), str(tmp_path / "none.stl"))
+    box = dataclasses.replace(mesh, kind="box", size=(0.1, 0.2, 0.3), file="", collides=True)
+    (shown,) = pictures([mesh, box])["link"]
+    np.testing.assert_allclose(shown.scale, (0.2, 0.4, 0.6))
 
 
 def test_a_system_without_bodies():

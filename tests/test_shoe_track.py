@@ -83,6 +83,8 @@ def test_what_cannot_be_built_is_refused(options, message):
 def test_shoes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="pitch must be positive"):
         mechanisms.Shoes(pitch=0.0)
+    with pytest.raises(ValueError, match=r"number must be an integer, got 60\.5"):
+        mechanisms.Shoes(number=60.5)
     with pytest.raises(ValueError, match=r"40 shoes of .* fit; about 6"):
         mechanisms.tracked_vehicle(track=mechanisms.Shoes(number=40))
 

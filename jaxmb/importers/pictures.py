@@ -13,18 +13,19 @@ from .description import Shape
 
 
 def pictures(shapes: Sequence[Shape]) -> dict[str, tuple[AbstractShape, ...]]:
-    """Shapes for a picture by the name of the body. Those for collisions are shown where a body has no others, and
-    meshes whose files are not there are left out.
+    """Shapes for a picture by the name of the body. Meshes whose files are not there are left out, and shapes for
+    collisions are shown where a body has nothing else to show.
     """
     of_bodies: dict[str, list[Shape]] = {}
     for shape in shapes:
         of_bodies.setdefault(shape.body, []).append(shape)
     out = {}
     for body, own in of_bodies.items():
-        seen = [shape for shape in own if not shape.collides] or own
-        found = tuple(picture for shape in seen for picture in _picture(shape))
-        if found:
-            out[body] = found
+        for collides in (False, True):
+            found = tuple(picture for shape in own if shape.collides is collides for picture in _picture(shape))
+            if found:
+                out[body] = found
+                break
     return out
 
 

@@ -59,6 +59,6 @@ def diagnose_friction(
     **Returns:** the result, and the coupling of friction with its own reactions; zero where it is not the reason.
     """
     none = jnp.zeros((system.friction_rows.size,) * 2, y.q.dtype)
-    coupling = lax.cond(failed, lambda: friction_coupling(system, formulation, t, y.q, y.u), lambda: none)
+    coupling = lax.cond(failed, lambda: friction_coupling(system.at(y), formulation, t, y.q, y.u), lambda: none)
     singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
     return RESULTS.where(singular, RESULTS.singular_configuration, result), jnp.where(singular, coupling, none)

@@ -53,6 +53,8 @@ class Shoes:
     tensioner_damping: float = 1e4
 
     def __post_init__(self):
+        if self.number is not None and not isinstance(self.number, int | np.integer):
+            raise ValueError(f"Shoes: number must be an integer, got {self.number!r}.")
         # With other numbers no track can be laid; those of bodies and forces are checked there.
         for name in ("pitch", "height", "sprocket_radius", "idler_radius"):
             if not 0 < getattr(self, name) < np.inf:

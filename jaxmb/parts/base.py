@@ -297,8 +297,9 @@ class AbstractPotentialForce(AbstractForce):
 class AbstractDynamicForce(AbstractForce):
     """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
 
-    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches` and `state_rates` find
-    its current value. A `State` holds those of all parts in `z`; by name they are `"motor.torque"`.
+    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches`, `state_rates` and, of
+    a part with a potential, `energy` find its current value. A `State` holds those of all parts in `z`; by name they
+    are `"motor.torque"`.
     """
 
     @abc.abstractmethod
@@ -306,8 +307,8 @@ class AbstractDynamicForce(AbstractForce):
         """The rate of every internal state [its unit/s], by the name of the field."""
 
     def state_sizes(self) -> dict[str, Any]:
-        """Hook: the typical sizes of internal states by the name of the field, for error control where a state is zero;
-        default one in its unit.
+        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
+        control states that have stayed smaller than 1e-4 of it count as this much.
         """
         return {}
 

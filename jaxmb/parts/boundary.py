@@ -15,7 +15,7 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
-from .fields import entry, internal_states
+from .contents import entry, internal_states
 from .space import AbstractSpace
 
 

@@ -37,6 +37,8 @@ def check_kinds(part: Any, label: str) -> None:
             if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
                 raise ValueError(f"{label}: {field} must be a dictionary of numbers, got {value!r}.")
             for key, number in value.items():
+                if not key or "." in key:
+                    raise ValueError(f"{label}: names of {field} must not be empty or contain a dot, got {key!r}.")
                 if not _is_number(number):
                     raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
         elif not isinstance(value, declared.of):

@@ -78,6 +78,8 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
                 raise ValueError(f"{self.label}: a quantity is named 'part.quantity', got {name!r}.")
         if not self.acts_on:
             raise ValueError(f"{self.label}: acts_on names at least one coordinate of a joint.")
+        if len(set(self.acts_on)) < len(self.acts_on):
+            raise ValueError(f"{self.label}: acts_on names a coordinate twice, got {self.acts_on}.")
         taken = set(self.states) & set(self.parameters)
         if taken:
             raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
@@ -145,7 +147,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
         return forces, {name: jnp.asarray(rate, poses.dtype) for name, rate in rates.items()}
 
     def _row(self, space, poses, forces):
-        """The forces on all coordinates, raveled one after the other."""
+        """The forces [N m, N] on all coordinates, raveled one after the other."""
         forces = forces if isinstance(forces, dict) else {self.acts_on[0]: forces}
         if set(forces) != set(self.acts_on):
             raise ValueError(f"the function of {self.label} must return the force on {' and '.join(self.acts_on)}.")

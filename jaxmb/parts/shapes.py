@@ -156,6 +156,8 @@ class Mesh(AbstractShape):
         except ImportError as error:
             raise ImportError('Mesh.read needs trimesh; install it with: pip install "jaxmb[view]"') from error
         mesh = trimesh.load_mesh(path)
+        if not len(mesh.faces):
+            raise ValueError(f"Mesh.read: there are no triangles in {str(path)!r}.")
         return cls(scale * np.asarray(mesh.vertices), np.asarray(mesh.faces), **place)
 
 

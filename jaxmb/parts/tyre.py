@@ -36,7 +36,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
         are regularised.
     - `deflection` [m], (d − 1,), an internal state: of the tread in the contact relative to the rim, forwards and, in
-        space, to the left; initially zero.
+        space, to the left; initially zero. Off the ground, where there is no force, it follows the slip all the same.
     """
 
     name: str = fields.name()

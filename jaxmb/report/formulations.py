@@ -133,7 +133,7 @@ def formulation_costs(
 
 
 def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
-    t = jnp.zeros((), y.q.dtype)
+    t, system = jnp.zeros((), y.q.dtype), system.at(y)
     jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         matrix = jacobian.dense().matrix

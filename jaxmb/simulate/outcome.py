@@ -51,5 +51,5 @@ def reason_of_failure(system, result, t1, t, y) -> str:
     for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
         wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
         if wrong:
-            return f"{text.rstrip('.')}: at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
+            return f"{text} Here at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
     return text

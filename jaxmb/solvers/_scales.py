@@ -7,6 +7,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+# What a group of further states counts as at least, in its natural units, as a power of eps: 1e-4 in double precision.
+# Much more hides a small motion that starts at zero; much less asks for the digits of rounding errors.
+_LEAST = 0.25
+
 
 class RunningScales(eqx.Module):
     """Sizes of the components of a state: the largest coordinate, the largest velocity, and the largest of each further
@@ -36,7 +40,8 @@ class RunningScales(eqx.Module):
         ahead = jnp.sqrt(coordinates * self._largest(f)[1])
         velocities = jnp.maximum(velocities, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
         velocities = jnp.where(velocities > 0, velocities, jnp.asarray(self.rate, y.dtype))
-        others = [jnp.where(size > 0, size, 1.0) for size in others]
+        least = jnp.finfo(y.dtype).eps ** _LEAST
+        others = [jnp.maximum(size, least) for size in others]
         return lax.stop_gradient(jnp.stack([coordinates, velocities, *others]))
 
     def grown(self, sizes: Float[Array, " groups"], y: Float[Array, " n"]) -> Float[Array, " groups"]:

@@ -13,16 +13,17 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ._damping import are_damped, is_resolved
+from ._damping import is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
 from ._field import derivatives, probed_derivatives
-from ._formulas import FAMILIES, Family, double, formulas, start
+from ._formulas import FAMILIES, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._implicit import Linearization, Solved, differentiable, linearize, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of
-from ._order import GAIN, LOWER, choose_order, growth_factors
+from ._neighbours import a_stable, damped_growth, ladder, responses
+from ._order import LOWER, choose_order, growth_factors
 from ._structured import differentiable as differentiable_projection, structured
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
@@ -304,19 +305,21 @@ class Hermite(AbstractMultistep):
         newton = step.newton
         failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
 
-        ladder = _ladder(self.past_points)
-        around = jnp.asarray(ladder)[k]
-        candidates = jnp.append(around, self._stable or 1)
+        around = jnp.asarray(ladder(self.past_points))[k]
+        stable = a_stable(self.family, self.past_points)
+        candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
         tangents, scales = self._tangents_after(state.tangents, along)
         for end, scale in zip(along, scales, strict=True):
             sizes = jnp.maximum(sizes, self._sizes(end.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
-        bounded = None if self._stable is None else functools.partial(self._bounded, around, h, newton.matrix.spectrum)
+        bounded = None
+        if stable is not None:
+            bounded = functools.partial(damped_growth, self.family, around, h, newton.matrix.spectrum)
         change, estimate = choose_order(
             sizes[:3],
             family.order(around) + 1,
-            jnp.asarray(_responses(family), dtype)[k],
+            jnp.asarray(responses(family), dtype)[k],
             may_fall=k > self.past_points[0],
             may_rise=(k < self.past_points[-1]) & (family.multiplicity * (around[2] - 1) <= history.known),
             known=family.multiplicity * (around[2] + 1) <= history.known,
@@ -326,10 +329,10 @@ class Hermite(AbstractMultistep):
             bounded=bounded,
         )
         order_index = around[1 + change]
-        if self._stable is not None:
+        if stable is not None:
             # For this step length the formulas in between may be unstable.
             growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
-            better = (k > self._stable) & (growth > estimate.growth)
+            better = (k > stable) & (growth > estimate.growth)
             order_index = jnp.where(better, candidates[3], order_index)
             estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))
 
@@ -383,38 +386,8 @@ class Hermite(AbstractMultistep):
         errors = matrix.errors(inverses, changes, free)
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
-    @property
-    def _stable(self) -> int | None:
-        """The A-stable formula with the most points, if formulas with more points may be chosen."""
-        stable = [k for k in self.past_points if k <= FAMILIES[self.family].stable]
-        return stable[-1] if stable and stable[-1] < self.past_points[-1] else None
-
-    def _bounded(self, points, h, spectrum, factors) -> Float[Array, " formulas"]:
-        """The factors by which steps may grow such that the longer steps damp all decaying components."""
-        # One change of a step is not larger than this.
-        steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
-        then, now = jax.vmap(lambda steps: are_damped(self.family, points, steps, spectrum))(steps)
-        zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)
-        return jnp.where(then, factors, jnp.where(now, jnp.minimum(factors, one), zero))
-
     def _recorded(self, y, f, g):
         """The values that the history holds, and their time derivatives."""
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])
-
-
-def _ladder(past_points: tuple[int, ...]) -> np.ndarray:
-    """For each number of points: the next lower, itself, and the next higher."""
-    steps = [*range(1, past_points[0]), *past_points]
-    out = np.zeros((past_points[-1] + 1, 3), np.int32)
-    for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
-        out[own] = lower, own, upper
-    return out
-
-
-def _responses(family: Family) -> np.ndarray:
-    # As in Adams' method, the error is a product of a power of the step and its distances from all nodes.
-    k = np.arange(1, family.highest + 1)
-    last = (3 if family.integrated else 2) + family.multiplicity * np.cumsum(1 / k)
-    return np.append(1.0, GAIN * (family.order(k) + 1) / last)

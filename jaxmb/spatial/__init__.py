@@ -23,17 +23,15 @@ from ..parts.spatial.forces import (
 from ..parts.spatial.frames import Frame as Frame
 from ..parts.spatial.joints import (
     Cylindrical as Cylindrical,
-    Distance as Distance,
     Fixed as Fixed,
     Gimbal as Gimbal,
     Planar as Planar,
-    PointOnLine as PointOnLine,
-    PointOnPlane as PointOnPlane,
     Prismatic as Prismatic,
     Revolute as Revolute,
     Screw as Screw,
     Spherical as Spherical,
     Universal as Universal,
 )
+from ..parts.spatial.point_joints import Distance as Distance, PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
 from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere
 from ..parts.spatial.tyre import Tyre as Tyre

@@ -98,7 +98,8 @@ def equilibrium(
         q = eqx.error_if(
             q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see the unbalanced coordinates."
         )
-    return State(q if throw else not_a_number_where(jnp.logical_not(ok), q, (system, guess, fix, time)), u, z)
+    state = State(q, u, z)
+    return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, time))
 
 
 @eqx.filter_jit

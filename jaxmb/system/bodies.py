@@ -1,4 +1,4 @@
-"""Systems of bodies: sizes, kinematics, names, and views of a motion, for a scene whose parts are stacked."""
+"""Systems of bodies and other parts: sizes, names, and views of a motion, for a scene whose parts are stacked."""
 
 import dataclasses
 import itertools
@@ -12,28 +12,19 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..linalg.arrays import is_traced, unchecked_take
+from ..linalg.arrays import is_traced
 from ..linalg.block_jacobian import JointOrder
-from ..linalg.rotations import normalize
 from ..parts.forces import Gravity
+from .body_kinematics import AbstractBodies
 from .body_motion import attachments, body_motion, body_quantities, outline
-from .coordinates import coordinate_names, rate_names
+from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
 from .describe import describe_scene
 from .design_variables import DesignVariables, description_rows, in_range
-from .equation import AbstractSystem, Ranks
+from .equation import Ranks
+from .force_groups import ForceGroup, NonIdealGroup
 from .frame_motion import frame_quantities
 from .group_inputs import signals_of, with_signals
-from .groups import (
-    AbstractConstraintGroup,
-    BodyGroup,
-    ConstraintGroup,
-    ForceGroup,
-    FrameGroup,
-    NonIdealGroup,
-    ServoGroup,
-    TendonGroup,
-    VelocityConstraintGroup,
-)
+from .groups import BodyGroup, FrameGroup, TendonGroup
 from .internal_states import (
     StateField,
     initial_states,
@@ -61,7 +52,7 @@ class Implied(NamedTuple):
     by: tuple[str, ...]
 
 
-class AbstractBodySystem(AbstractSystem):
+class AbstractBodySystem(AbstractBodies):
     """The bodies, parts and names of a compiled scene, for a class that knows the equations of their motion.
 
     **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
@@ -89,18 +80,6 @@ class AbstractBodySystem(AbstractSystem):
     tendons: tuple[TendonGroup, ...] = ()
 
     # Sizes
-
-    @property
-    def nq(self) -> int:
-        return self.layout.nq
-
-    @property
-    def nu(self) -> int:
-        return self.layout.nu
-
-    @property
-    def spatial(self) -> bool:
-        return self.layout.space.dimension == 3
 
     @property
     def position_rows(self) -> int:
@@ -140,10 +119,6 @@ class AbstractBodySystem(AbstractSystem):
         return True
 
     @property
-    def rates_are_velocities(self) -> bool:
-        return not self.spatial
-
-    @property
     def linear(self) -> bool:
         return all(g.group.part.linear for g in self.velocity_constraints)
 
@@ -155,12 +130,6 @@ class AbstractBodySystem(AbstractSystem):
     def rows(self) -> tuple[tuple[str, int], ...]:
         """Name and number within its part of every row of A."""
         return tuple((name, k) for g in self.joints for name in g.group.names for k in range(g.rows))
-
-    def coordinate_names(self):
-        return coordinate_names(self.layout, self.body_names)
-
-    def rate_names(self):
-        return rate_names(self.layout, self.body_names)
 
     # Internal states
 
@@ -332,19 +301,24 @@ class AbstractBodySystem(AbstractSystem):
         return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
 
     def not_finite(self, t, q, u):
-        values = self._of_parts(jnp.asarray(t, q.dtype), q, u)
+        t = jnp.asarray(t, q.dtype)
+        values = self._of_parts(t, q, u)
         kinds = zip(
             ("residual", "residual", "force"), (self.constraints, self.joints, self.forces), values, strict=True
         )
-        return tuple(
-            dict.fromkeys(
-                f"the {kind} of {name!r}"
-                for kind, of_kind, of_parts in kinds
-                for group, own in zip(of_kind, of_parts, strict=True)
-                for name, value in zip(group.group.names, np.asarray(own), strict=True)
-                if not np.all(np.isfinite(value))
-            )
-        )
+        found = [
+            f"the {kind} of {name!r}"
+            for kind, of_kind, of_parts in kinds
+            for group, own in zip(of_kind, of_parts, strict=True)
+            for name, value in zip(group.group.names, np.asarray(own), strict=True)
+            if not np.all(np.isfinite(value))
+        ]
+        if self.nz:
+            rates = np.asarray(self.state_rates(t, q, u))
+            found += [
+                f"the rate of {name!r}" for name, k in self.state_names().items() if not np.all(np.isfinite(rates[k]))
+            ]
+        return tuple(dict.fromkeys(found))
 
     @eqx.filter_jit
     def _of_parts(self, t, q, u):
@@ -355,84 +329,3 @@ class AbstractBodySystem(AbstractSystem):
             [g.acceleration(t, poses, velocities, jnp.zeros_like(velocities)) for g in self.joints],
             [g.wrenches(t, poses, velocities) for g in self.forces],
         )
-
-    # Bodies
-
-    @property
-    def mass(self) -> Float[Array, "b"]:
-        """Masses [kg] of the bodies."""
-        return self._in_order([g.mass for g in self.bodies])
-
-    @property
-    def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
-        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
-        return self._in_order([g.inertia for g in self.bodies])
-
-    def _in_order(self, of_groups):
-        """Per-body values of all groups, in the order of the bodies."""
-        if len(of_groups) == 1:
-            return of_groups[0]
-        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
-        return unchecked_take(jnp.concatenate(of_groups), order)
-
-    # Kinematics
-
-    def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
-        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
-        prepare = self.layout.space.prepare
-        ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
-
-    def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
-        """Velocities of the bodies and of the ground."""
-        return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
-
-    def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
-        """Poses of the bodies."""
-        if self.layout.uniform:
-            return q.reshape(self.layout.bodies, -1)
-        ground = jnp.asarray(self.layout.space.ground, q.dtype)
-        return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
-
-    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
-        """Velocities of the bodies."""
-        if self.layout.uniform:
-            return u.reshape(self.layout.bodies, -1)
-        return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
-
-    def rates(self, t, q, u):
-        if self.rates_are_velocities:
-            return u
-        return self._pack(jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u)))
-
-    def normalize(self, q):
-        if self.rates_are_velocities:
-            return q
-        return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
-
-    def normalize_fixed(self, q, fixed):
-        whole = [
-            row[3:]
-            for row in self.layout.pose_index[:-1]
-            if self.spatial and row[-1] < self.nq and fixed[row[3:]].all()
-        ]
-        for index in whole:
-            q = q.at[index].set(normalize(q[index]))
-        return q, len(whole)
-
-    def held_velocities(self, held):
-        if self.rates_are_velocities:
-            return held
-        d = self.layout.space.dimension
-        of_pose = np.append(held, np.ones(self.layout.space.pose_size, bool))[self.layout.pose_index[:-1]]
-        turns = of_pose[:, d:]
-        if np.any(np.any(turns, axis=1) & ~np.all(turns, axis=1)):
-            return None
-        of_bodies = np.concatenate([of_pose[:, :d], np.repeat(turns[:, :1], d, axis=1)], axis=1)
-        return of_bodies.reshape(-1)[self.layout.velocity_place]
-
-    def _pack(self, poses):
-        if self.layout.uniform:
-            return poses.reshape(-1)
-        sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
-        return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])

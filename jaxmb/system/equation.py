@@ -203,7 +203,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def not_finite(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> tuple[str, ...]:
-        """What is not finite at a state, forces and residuals, by the names of the parts; for messages."""
+        """What is not finite at a state: forces, residuals and rates of internal states by name; for messages."""
 
     @abc.abstractmethod
     def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:

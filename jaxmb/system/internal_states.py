@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..parts.fields import entry, internal_states
-from .groups import ForceGroup
+from ..parts.contents import entry, internal_states
+from .force_groups import ForceGroup
 from .quantities import Quantity
 
 

@@ -13,8 +13,9 @@ from jaxtyping import Array
 
 from .._types import Scalar
 from ..parts.joint_parts import JointDriver
+from .constraint_groups import ConstraintGroup
 from .equation import AbstractSystem
-from .groups import ConstraintGroup, Group, TendonGroup
+from .groups import Group, TendonGroup
 from .layout import Layout
 from .quantities import Quantity
 

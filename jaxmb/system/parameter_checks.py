@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool
 
 from ..linalg.arrays import is_traced
 from ..parts.checks import in_range
-from ..parts.fields import entry, inner_parts, paths
+from ..parts.contents import entry, inner_parts, paths
 from ..parts.servo import Servo
 
 

@@ -5,7 +5,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..parts.fields import Declaration, entry, paths
+from ..parts.contents import entry, paths
+from ..parts.fields import Declaration
 from .equation import ParameterPath
 
 

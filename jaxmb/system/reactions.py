@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.rotations import cross
-from .groups import AbstractConstraintGroup, ForceGroup, Group
+from .constraint_groups import AbstractConstraintGroup
+from .force_groups import ForceGroup
+from .groups import Group
 from .quantities import Reaction
 
 

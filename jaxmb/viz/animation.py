@@ -49,9 +49,9 @@ class MovingPicture:
 def show(
     trajectory: Motions,
     *,
-    points: Sequence[str] = (),
-    reactions: Sequence[str] = (),
-    forces: Sequence[str] = (),
+    points: str | Sequence[str] = (),
+    reactions: str | Sequence[str] = (),
+    forces: str | Sequence[str] = (),
     shapes: Shapes | None = None,
     frames: int = 400,
     speed: float | None = None,
@@ -72,7 +72,7 @@ def show(
 
     - `trajectory`: a motion of a scene; a list, or a dictionary by name, of several, such as one before and one after a
         change, or members of a sweep.
-    - `points`: names of bodies (their mass centres), frames and joints that leave a trail.
+    - `points`: the name of a body (its mass centre), frame or joint that leaves a trail, or several.
     - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
         on the last body of a joint, and on each body of a force element.
     - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, in place of the default; `"ground"` as
@@ -89,9 +89,12 @@ def show(
     **Raises:** `ValueError` for unknown names, batches, motions saved at fewer than two times, states that are not
     finite, and systems without bodies; `ImportError` without viser, which `jaxmb[view]` installs.
     """
-    for value, name in ((frames - 1, "frames"), (height, "height"), (1 if speed is None else speed, "speed")):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be {'at least 2' if name == 'frames' else 'positive'}.")
+    if not isinstance(frames, int | np.integer) or frames < 2:
+        raise ValueError(f"frames must be an integer of at least 2, got {frames!r}.")
+    for value, name in ((height, "height"), (1.0 if speed is None else speed, "speed")):
+        if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be a positive number, got {value!r}.")
+    points, reactions, forces = (_listed(names) for names in (points, reactions, forces))
     motions = [
         motion(name, chosen(own, frames), shapes or {}, COLORS[k % len(COLORS)] if overlay else None)
         for k, (name, own) in enumerate(_named(trajectory).items())
@@ -119,6 +122,11 @@ def show(
 def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
     """Write a moving picture as a page that any browser opens, also without a network; options as in `show`."""
     return show(trajectory, **options).save(path)
+
+
+def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Names without repetitions; a single one counts as several."""
+    return tuple(dict.fromkeys((names,) if isinstance(names, str) else names))
 
 
 def _named(trajectory: Motions) -> dict[str, Trajectory]:

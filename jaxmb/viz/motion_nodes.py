@@ -99,11 +99,9 @@ class Motion:
 
     def _anchor(self, body, point):
         turn, place = self.picture.orientations[body], self.picture.positions[body]
-        return (
-            place
-            if point is None
-            else place + stage.viser().transforms.SO3(turn).apply(np.broadcast_to(point, place.shape))
-        )
+        if point is None:
+            return place
+        return place + stage.viser().transforms.SO3(turn).apply(np.broadcast_to(point, place.shape))
 
     # Nodes
 
@@ -185,9 +183,12 @@ def motion(
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
     shown = trajectory.system.picture(trajectory.ts, trajectory.ys)
-    for body in given:
+    for body, own in given.items():
         if body not in shown.positions:
             raise unknown("body", body, shown.positions)
+        listed = own if isinstance(own, Sequence) else [own]
+        if not all(isinstance(shape, AbstractShape) for shape in listed):
+            raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {own!r}.")
     return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 

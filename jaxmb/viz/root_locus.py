@@ -21,8 +21,8 @@ def plot_root_locus(locus: RootLocus) -> "Figure":
     **Raises:** `ImportError` without matplotlib.
     """
     figure = new_figure(9.0, 6.0)
-    (real, plane), (imaginary, _) = figure.subplots(2, 2, gridspec_kw={"width_ratios": [3, 2]})
-    _.remove()
+    (real, plane), (imaginary, empty) = figure.subplots(2, 2, gridspec_kw={"width_ratios": [3, 2]})
+    empty.remove()
     for k, values in enumerate(np.asarray(locus.eigenvalues).T):
         color = f"C{k % 10}"
         real.plot(locus.values, values.real, color=color, linewidth=1.2)

@@ -12,7 +12,9 @@ from ..parts.shapes import GROUND, along
 from . import meshes, stage
 from .motion_nodes import Motion
 
-_FRONT_ANGLE, _ANGLE = np.radians(8.0), np.radians(35.0)  # Of view; from the front nearly without perspective.
+# Vertical fields of view of planar and of spatial pictures; the narrow one shows nearly no perspective.
+_FRONT_ANGLE, _ANGLE = np.radians(8.0), np.radians(35.0)
+# Width over height of a picture.
 _ASPECT = 1.6
 
 

@@ -112,10 +112,11 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
 class PlateContact(AbstractBodyContact):
     """Contact of a disc with plates of other bodies, each a straight line between two points of its body.
 
-    A plate bears on both sides. Near its ends the force fades: the depth is measured from the plate's line, and the
-    potential is that of `normal` times a step with two continuous derivatives, from one at the distance `edge` before
-    the end to zero as far behind it. A disc that rolls from a plate to the next one in line is thus borne by both as by
-    one, whatever its depth.
+    A plate bears on both sides: it pushes a disc to the side on which the disc's centre is, so one whose centre is
+    driven across the line leaves on the other side. Near its ends the force fades: the depth is measured from the
+    plate's line, and the potential is that of `normal` times a step with two continuous derivatives, from one at the
+    distance `edge` before the end to zero as far behind it. A disc that rolls from a plate to the next one in line is
+    thus borne by both as by one, whatever its depth.
 
     The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
 

@@ -37,6 +37,16 @@ def offset_in_a(space, part, poses: Float[Array, "k p"]) -> Vector3:
     return space.body_point(poses[0], space.point(poses[1], part.point_b)) - part.point_a
 
 
+def across(axis: Vector3, w: Vector3) -> Float[Array, "2"]:
+    """The components `u·w`, `v·w` of a vector in A along the perpendiculars of an axis; zero if it is parallel."""
+    return jax.numpy.sum(perpendiculars(axis) * w[None, :], axis=1)
+
+
+def displacement_along(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
+    """The component of `d` along `axis_a` [m]."""
+    return jax.numpy.dot(part.axis_a, offset_in_a(space, part, poses))
+
+
 def relative_orientation(poses: Float[Array, "k p"]) -> Float[Array, "4"]:
     """Euler parameters of B relative to A."""
     return rot.multiply(rot.conjugate(poses[0, 3:7]), poses[1, 3:7])

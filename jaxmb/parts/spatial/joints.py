@@ -15,18 +15,19 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import conjugate, cross, multiply, norm, rotate, unrotate
+from ...linalg.rotations import conjugate, cross, multiply, rotate, unrotate
 from .. import fields
-from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
+from ..base import AbstractJoint, AbstractSpatialPart
 from ..shapes import ball, pin, sleeve
 from ..space import both_points, separation
 from .axes import (
+    across,
     angle,
     cosine_sine,
     direction_in_a,
+    displacement_along,
     measured_from_given_poses,
     offset_in_a,
-    perpendiculars,
     relative_orientation,
     rotation_error,
     rotation_vector,
@@ -35,18 +36,8 @@ from .axes import (
 )
 
 
-def _across(axis_a, w):
-    """The components `u·w`, `v·w` of a vector in A; both are zero if it is parallel to the axis."""
-    return jnp.sum(perpendiculars(axis_a) * w[None, :], axis=1)
-
-
-def _displacement(space, part, poses):
-    """The component of d along the axis."""
-    return jnp.dot(part.axis_a, offset_in_a(space, part, poses))
-
-
 def _parallel(space, part, poses):
-    return _across(part.axis_a, direction_in_a(space, poses, part.axis_b))
+    return across(part.axis_a, direction_in_a(space, poses, part.axis_b))
 
 
 class Spherical(AbstractSpatialPart, AbstractJoint):
@@ -219,10 +210,10 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
-        return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift)])
+        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
 
     def coordinates(self, space, poses):
-        return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
+        return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
     def path(self, space, poses):
         return both_points(space, self, poses)
@@ -266,10 +257,10 @@ class Screw(AbstractSpatialPart, AbstractJoint):
         turn = (jnp.dot(self.axis_a, shift) - self.offset) / lead
         c, s = cosine_sine(space, self, poses)
         thread = lead * (s * jnp.cos(turn) - c * jnp.sin(turn))
-        return jnp.concatenate([_parallel(space, self, poses), _across(self.axis_a, shift), thread[None]])
+        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread[None]])
 
     def coordinates(self, space, poses):
-        return {"angle": angle(space, self, poses), "displacement": _displacement(space, self, poses)}
+        return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
     def path(self, space, poses):
         return both_points(space, self, poses)
@@ -298,10 +289,10 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
         return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
-        return jnp.concatenate([_across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
+        return jnp.concatenate([across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
 
     def coordinates(self, space, poses):
-        return {"displacement": _displacement(space, self, poses)}
+        return {"displacement": displacement_along(space, self, poses)}
 
     def path(self, space, poses):
         return both_points(space, self, poses)
@@ -353,67 +344,3 @@ class Fixed(AbstractSpatialPart, AbstractJoint):
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])
-
-
-class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
-    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length)`.
-
-    The multiplier is the rod force [N].
-
-    **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; `length` [m] > 0, default that of the given poses.
-    """
-
-    point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
-    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0, 0.0))
-    length: fields.Number = fields.length(sign="positive", optional=True)
-    rows: ClassVar[int] = 1
-    rheonomic: ClassVar[bool] = False
-
-    def complete(self, space, poses):
-        return self.filled(length=norm(separation(space, self, poses)))
-
-    def residual(self, space, poses, t):
-        d = separation(space, self, poses)
-        return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
-
-class PointOnPlane(AbstractSpatialPart, AbstractJoint):
-    """A point of B stays in a plane fixed in A, through A normal to the axis. Rows 1: `a·d`.
-
-    **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), normal of the plane fixed in `body_a`, or
-    `axis` in the world.
-    """
-
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
-    rows: ClassVar[int] = 1
-
-    def residual(self, space, poses, t):
-        return jnp.dot(self.axis_a, offset_in_a(space, self, poses))[None]
-
-
-class PointOnLine(AbstractSpatialPart, AbstractJoint):
-    """A ball in a straight slot: a point of B stays on the line through A along the axis. Rows 2: `u·d`, `v·d`.
-
-    **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slot fixed in `body_a`, or
-    `axis` in the world.
-    """
-
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
-    rows: ClassVar[int] = 2
-
-    def residual(self, space, poses, t):
-        return _across(self.axis_a, offset_in_a(space, self, poses))
-
-    def coordinates(self, space, poses):
-        return {"displacement": _displacement(space, self, poses)}
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
-    def shapes(self, space, size):
-        return ((1, ball(self.point_b, size)),)

@@ -1,0 +1,88 @@
+"""What a part contains: its parameters, its internal states, and other parts that it holds."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+
+from .fields import Declaration, declarations, field_names
+
+
+def anonymous(part: Any) -> Any:
+    """The part without the names that distinguish stacked parts, and without the initial guess of bodies."""
+    declared = declarations(type(part))
+    out = object.__new__(type(part))
+    for field in field_names(type(part)):
+        value, kind = getattr(part, field), declared[field].kind if field in declared else None
+        if kind in ("identity", "body"):
+            value = ""
+        elif kind in ("identities", "bodies"):
+            value = ("",) * len(value)
+        elif kind == "state":
+            value = None
+        elif kind == "part" or (kind == "law" and hasattr(value, "bodies")):
+            value = None if value is None else anonymous(value)
+        elif kind == "parts":
+            value = {key: anonymous(own) for key, own in value.items()}
+        object.__setattr__(out, field, value)
+    return out
+
+
+def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
+    for name, own in declarations(type(part)).items():
+        value: Any = getattr(part, name)
+        if own.kind == "part" and value is not None:
+            held = [((*prefix, name), value)]
+        elif own.kind == "parts":
+            held = [((*prefix, name, key), inner) for key, inner in (value or {}).items()]
+        else:
+            continue
+        for keys, inner in held:
+            yield keys, inner
+            yield from inner_parts(inner, keys)
+
+
+def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
+    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by their names."""
+    found = {}
+    for prefix, own in (((), part), *inner_parts(part)):
+        for name, declared in declarations(type(own)).items():
+            if declared.kind == "internal":
+                found[name] = (*prefix, name)
+            elif declared.kind == "internals":
+                found |= {key: (*prefix, name, key) for key in getattr(own, name)}
+    return found
+
+
+def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
+    """For every parameter of a part, without those of other parts that it holds: its path of keys, the same path
+    without the names of dictionaries, as in the parameter's name, and its declaration, which for an entry of a
+    dictionary says nothing.
+    """
+    declared = declarations(type(part))
+    for field in field_names(type(part)):
+        own = declared.get(field, _ANY_NUMBER)
+        if own.kind not in ("state", "internal", "internals", "part", "parts"):
+            yield from _paths(getattr(part, field), (field,), (field,), own)
+
+
+_ANY_NUMBER = Declaration("number")
+
+
+def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: Declaration):
+    if eqx.is_inexact_array(value):
+        yield keys, shown, declared
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _ANY_NUMBER)
+    elif isinstance(value, eqx.Module):
+        for inner, name, own in paths(value):
+            yield (*keys, *inner), (*shown, *name), own
+
+
+def entry(value: Any, keys: tuple[str, ...]) -> Any:
+    """The value at a path of attribute names and dictionary keys."""
+    for key in keys:
+        value = value[key] if isinstance(value, dict) else getattr(value, key)
+    return value
