@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import importers
+from jaxmb import importers, shapes
 from jaxmb.formulations import Multipliers, accelerations
 
 mujoco = pytest.importorskip("mujoco")
@@ -70,31 +70,42 @@ def body_accelerations(model, data, imported):
 
 
 def check_dynamics(imported, count=20, *, scale=1.0):
-    """Accelerations and energies are MuJoCo's, without what jaxmb approximates, at random states and controls."""
+    """Accelerations, energies and rates of activations are MuJoCo's, without what jaxmb approximates, at random states,
+    controls and activations.
+    """
     model = imported.locate.model
     bits = mujoco.mjtDisableBit
     model.opt.disableflags |= int(bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_FRICTIONLOSS)
     data = mujoco.MjData(model)
     system = imported.scene.compile()
     states = list(random_states(model, count, scale=scale))
-    controls = np.random.default_rng(1).normal(size=(count, model.nu))
+    random = np.random.default_rng(1)
+    controls, activations = (random.normal(size=(count, size)) for size in (model.nu, model.na))
     names = list(imported.controls.values())
+    numbers = [model.actuator(own).id for own in imported.controls]
+    # Activations have the order of the actuators there, that of the groups of parts here.
+    filtered = {name.replace(".control", ".activation"): model.actuator_actadr[k] for k, name in zip(numbers, names)}
+    order = np.array([filtered[name] for name in system.state_names()], int)
 
     @jax.jit
-    def evaluate(q, u, control):
+    def evaluate(q, u, z, control):
         own = mb.with_parameters(system, dict(zip(names, control, strict=True))) if names else system
+        own = own.with_states(z) if model.na else own
         udot, _ = accelerations(own, Multipliers(), 0.0, q, u)
         unmet = jnp.max(jnp.abs(own.velocity_residual(0.0, q, u)), initial=0.0)
-        return udot, own.kinetic_energy(0.0, q, u), own.potential_energy(0.0, q), unmet
+        rates = own.state_rates(0.0, q, u) if model.na else z
+        return udot, rates, own.kinetic_energy(0.0, q, u), own.potential_energy(0.0, q), unmet
 
     offset = None
-    for (q, v), control in zip(states, controls, strict=True):
-        data.qpos, data.qvel, data.ctrl = q, v, control
+    for (q, v), control, activation in zip(states, controls, activations, strict=True):
+        data.qpos, data.qvel, data.ctrl, data.act = q, v, control, activation
         mujoco.mj_forward(model, data)
         mujoco.mj_energyPos(model, data)
         mujoco.mj_energyVel(model, data)
         state = imported.state(q, v)
-        udot, kinetic, potential, unmet = jax.tree.map(np.asarray, evaluate(state.q, state.u, list(control)))
+        found = evaluate(state.q, state.u, activation[order], list(control[numbers]))
+        udot, rates, kinetic, potential, unmet = jax.tree.map(np.asarray, found)
+        np.testing.assert_allclose(rates, data.act_dot[order], rtol=1e-12, atol=0)
         assert unmet < 1e-12
         expected = body_accelerations(model, data, imported)
         found = udot.reshape(-1, 6)[list(expected)]
@@ -210,7 +221,9 @@ def test_what_is_exact(joints, more, name, fields):
     own = part(model, name)
     for field, value in fields.items():
         np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
-    assert all(re.search("Equalities hold exactly|the shortest way", note) for note in model.notes)
+    assert all(
+        re.search("Equalities hold exactly|the shortest way|count up to half a turn", note) for note in model.notes
+    )
 
 
 def test_inertia_names_and_frames():
@@ -323,7 +336,9 @@ def test_collisions_are_refused_unless_left_out():
         importers.mjcf(text)
     model = importers.mjcf(text, ignore="collisions")
     assert "Left out, as ignore='collisions' asks: collisions." in model.notes
-    assert [shape.kind for shape in model.shapes] == ["plane", "capsule"]
+    (plane,), (bar, *ends) = model.shapes["ground"], model.shapes["a"]
+    assert isinstance(plane, shapes.Ground) and bar.radius == 0.03 and [ball.radius for ball in ends] == [0.03, 0.03]
+    assert model.shapes == model.collision_shapes
 
 
 def test_elements_are_left_out_by_kind_or_by_name():
