@@ -84,7 +84,10 @@ def check_dynamics(imported, count=20, *, scale=1.0):
     names = list(imported.controls.values())
     numbers = [model.actuator(own).id for own in imported.controls]
     # Activations have the order of the actuators there, that of the groups of parts here.
-    filtered = {name.replace(".control", ".activation"): model.actuator_actadr[k] for k, name in zip(numbers, names)}
+    filtered = {
+        name.replace(".control", ".activation"): model.actuator_actadr[k]
+        for k, name in zip(numbers, names, strict=True)
+    }
     order = np.array([filtered[name] for name in system.state_names()], int)
 
     @jax.jit
@@ -221,9 +224,7 @@ def test_what_is_exact(joints, more, name, fields):
     own = part(model, name)
     for field, value in fields.items():
         np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
-    assert all(
-        re.search("Equalities hold exactly|the shortest way|count up to half a turn", note) for note in model.notes
-    )
+    assert all(re.search("Equalities hold exactly|the shortest way|up to half a turn", note) for note in model.notes)
 
 
 def test_inertia_names_and_frames():

@@ -138,9 +138,7 @@ def _read_link(element, machine, place, notes):
         )
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
         if inertial.attributes.get("auto") in ("1", "true"):
-            notes.refused.append(
-                f"{inertial.where}the inertia of link {name!r} is to come from its shapes: write it out."
-            )
+            notes.refused.append(f"{inertial.where}the inertia of link {name!r} comes from its shapes: write it out.")
     else:
         notes.refused.append(f"{element.where}link {name!r} has no <inertial>: give it a mass and an inertia.")
     weighs = element.first("gravity")
@@ -207,9 +205,7 @@ def _read_axis(joint, axis, frame, machine, notes, kind):
         frame = np.eye(3)
     elif expressed:
         if expressed not in machine.links:
-            raise ValueError(
-                f"{xyz.where}the axis of joint {joint.name!r} is expressed in {expressed!r}, which is no link."
-            )
+            raise ValueError(f"{xyz.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
         frame = machine.links[expressed].rotation
     length = np.linalg.norm(direction)
     if length == 0:
