@@ -216,17 +216,18 @@ def test_what_sdf_has_beyond(text, message):
 
 
 def test_axes_of_sdf_in_other_frames():
-    """In the model's frame, and in that of another link."""
+    """In the frame of a model that is turned about x, and in that of another link."""
     for inside, axis in (
-        ("<xyz expressed_in='__model__'>0 -1 0</xyz>", (0, -1, 0)),
-        ("<xyz>0 -2 0</xyz><use_parent_model_frame>1</use_parent_model_frame>", (0, -1, 0)),
-        ("<xyz expressed_in='b'>1 0 0</xyz>", (0, 1, 0)),
+        ("<xyz expressed_in='__model__'>0 -1 0</xyz>", (0, 0, -1)),
+        ("<xyz>0 -2 0</xyz><use_parent_model_frame>1</use_parent_model_frame>", (0, 0, -1)),
+        ("<xyz expressed_in='b'>1 0 0</xyz>", (0, 0, 1)),
         ("<xyz>0 0 1</xyz>", (1, 0, 0)),
     ):
         found = importers.sdf(
             model(
                 body("a", "0 0 0 0 1.5708 0"),
                 body("b", "1 0 0 0 0 1.5708"),
+                "<pose>0 0 0 1.5708 0 0</pose>",
                 hinge("i", "world", "b"),
                 hinge("j", "world", "a", axis=inside),
             )
@@ -234,6 +235,7 @@ def test_axes_of_sdf_in_other_frames():
         np.testing.assert_allclose(part(found, "j").axis_a, axis, atol=1e-15)
 
 
+@pytest.mark.long
 def test_a_link_without_weight():
     text = model(body("a", inside="<gravity>0</gravity>" + body("x").partition("</pose>")[2].removesuffix("</link>")))
     found = importers.sdf(text)

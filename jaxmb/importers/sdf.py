@@ -74,7 +74,7 @@ def sdf(
         if static is not None and static.text.strip() in ("1", "true"):
             machine.joints.append(Joint(f"{element.need('name')} weld", "fixed", GROUND, element.need("name")))
     for element in model.all("joint"):
-        _read_joint(element, machine, notes)
+        _read_joint(element, machine, place[1], notes)
     if machine.collisions:
         notes.refuse("collisions", "", "Links have shapes for collisions")
     for element in root.unread():
@@ -157,7 +157,7 @@ def _read_shape(element, link, machine, notes):
     shapes += [(link, shape) for shape in own]
 
 
-def _read_joint(element, machine, notes):
+def _read_joint(element, machine, of_model, notes):
     name, kind = element.need("name"), element.need("type")
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
@@ -190,19 +190,19 @@ def _read_joint(element, machine, notes):
         pairs = [(joint, axes[0] if axes else None)]
     for joint, axis in pairs:
         if axis is not None:
-            _read_axis(joint, axis, frame, machine, notes, kind)
+            _read_axis(joint, axis, frame, of_model, machine, notes, kind)
         elif joint.kind in ("hinge", "slide"):
             raise ValueError(f"{element.where}joint {name!r} needs an <axis>.")
         machine.joints.append(joint)
 
 
-def _read_axis(joint, axis, frame, machine, notes, kind):
+def _read_axis(joint, axis, frame, of_model, machine, notes, kind):
     xyz = axis.first("xyz")
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
     in_model = axis.first("use_parent_model_frame")
     if (in_model is not None and in_model.text.strip() in ("1", "true")) or expressed == "__model__":
-        frame = np.eye(3)
+        frame = of_model
     elif expressed:
         if expressed not in machine.links:
             raise ValueError(f"{xyz.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
