@@ -227,11 +227,12 @@ def drag(poses, velocities, t, p):
     return -p["drag"] * jnp.sum(velocities**2) * velocities
 
 
-def of_joint(cls, parameter, *, rests=True, **options):
+def of_joint(cls, parameter, *, name=None, rests=True, **options):
     """A part of the angle of a pin."""
-    own = body_2d(f"{cls.__name__} body")
+    name = cls.__name__ if name is None else name
+    own = body_2d(f"{name} body")
     pin = pin_2d(own)
-    return Example(cls(cls.__name__, f"{pin.name}.angle", **options), [own], parameter, (pin,), (hold_2d(own),), rests)
+    return Example(cls(name, f"{pin.name}.angle", **options), [own], parameter, (pin,), (hold_2d(own),), rests)
 
 
 def controlled():
@@ -268,6 +269,16 @@ FUNCTIONS = [
     of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
     of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
     of_joint(mb.JointActuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
+    of_joint(
+        mb.JointActuator,
+        "lag",
+        name="JointActuator with a lag",
+        lag=0.05,
+        control=0.3,
+        gain=(5.0, 0.0, 0.0),
+        bias=(0.0, -5.0, -0.2),
+        rests=False,
+    ),
     coupled(),
     of_tendon(mb.FixedTendon("FixedTendon", "FixedTendon body pin.angle", coefficients=(0.4,)), "coefficients"),
     of_tendon(mb.Tendon("Tendon", [("ground", (0.0, 1.0)), ("Tendon body", (0.2, 0.1))]), "points"),
@@ -336,6 +347,38 @@ def rubbing_3d():
     return Example(part, [own], "coefficient", (pin,), (hold_3d(own),), ideal=False)
 
 
+def gimbal(name, **options):
+    """Axes of its own, where all its angles change."""
+    axes = {"axis_1_W": AXIS, "axis_2_W": (0.0, 1.0, 0.0), "axis_3_W": (-0.8, 0.0, 0.6)}
+    own = body_3d(f"{name} body", angular_velocity=(1.0, -2.0, 0.5))
+    return own, spatial.Gimbal(f"{name} gimbal", "ground", own.name, point=O, **axes, **options)
+
+
+def on_gimbal(parameter, name, build):
+    """What acts on the angles of a gimbal."""
+    own, joint = gimbal(name)
+    part, *more = build([f"{joint.name}.angle_{k}" for k in (1, 2, 3)])
+    return Example(part, [own], parameter, (joint,), (hold_3d(own), *more))
+
+
+def springs_on(angles):
+    free = enumerate((0.2, -0.3, 0.4))
+    return [mb.JointSpring(f"JointSpring on angle {k}", angles[k], stiffness=4.0, damping=0.1, free=x) for k, x in free]
+
+
+def tendon_on(angles):
+    part = mb.FixedTendon("FixedTendon on a gimbal", angles, coefficients=(0.4, -0.3, 0.2))
+    return part, mb.JointSpring("pull of angles", f"{part.name}.length", stiffness=9.0, free=0.1)
+
+
+def tendon_3d():
+    own = body_3d("Tendon body")
+    joint = spatial.Spherical("Tendon ball", "ground", own.name, point=O)
+    path = [("ground", (0.0, 0.0, 1.0)), (own.name, (0.2, 0.1, 0.1)), ("ground", (1.0, 0.2, 0.9))]
+    spring = mb.JointSpring("Tendon spring", "Tendon.length", stiffness=9.0, free=0.1)
+    return Example(mb.Tendon("Tendon", path), [own], "points", (joint,), (hold_3d(own), spring))
+
+
 O = (0.0, 0.0, 0.0)
 POINT_MASS_3D = spatial.PointMass("PointMass", mass=1.2, position=(0.4, 0.2, 0.1))
 BODY_3D = body_3d("Body", angular_velocity=(1.0, 2.0, 0.5))
@@ -350,6 +393,19 @@ SPATIAL = [
     of_ground_3d(
         spatial.Gimbal, "point_b", point=O, axis_1_W=AXIS, axis_2_W=(0.0, 1.0, 0.0), axis_3_W=(-0.8, 0.0, 0.6)
     ),
+    on_gimbal("stiffness", "JointSpring", springs_on),
+    on_gimbal("coefficients", "FixedTendon", tendon_on),
+    on_gimbal(
+        "coefficients",
+        "JointCoupling",
+        lambda angles: [mb.JointCoupling("JointCoupling on a gimbal", *angles[:2], coefficients=(0.0, 0.5, 0.1))],
+    ),
+    on_gimbal(
+        "force",
+        "JointFriction",
+        lambda angles: [mb.JointFriction("JointFriction on a gimbal", angles[1], force=0.3, transition_speed=0.5)],
+    ),
+    tendon_3d(),
     of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
     of_ground_3d(spatial.Prismatic, "point_b", point=O, axis=AXIS),

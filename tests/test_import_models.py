@@ -129,14 +129,13 @@ def soles(model, system, state):
     motions = dict(zip(system.body_names, np.asarray(system.poses(state.q)), strict=True))
     centres = {body.name: np.asarray(body.centre) for body in model.scene.bodies}
     balls, lowest = [], np.inf
-    for shape in model.shapes:
-        if shape.collides and "foot" in shape.body:
-            radius, half = shape.size
-            for way in (-half, half):
-                at = shape.position + way * matrix(shape.orientation)[:, 2]
-                pose = motions[shape.body]
-                lowest = min(lowest, (pose[:3] + matrix(pose[3:]) @ (at - centres[shape.body]))[2] - radius)
-                balls.append((shape.body, at, radius))
+    for body in ("left-foot", "right-foot"):
+        (roll,) = model.collision_shapes[body]
+        for way in (-0.5, 0.5):
+            at = roll.position + way * roll.length * matrix(roll.orientation)[:, 2]
+            pose = motions[body]
+            lowest = min(lowest, (pose[:3] + matrix(pose[3:]) @ (at - centres[body]))[2] - roll.radius)
+            balls.append((body, at, roll.radius))
     law = {"normal": contact.Linear(4e4), "damping": 400.0, "friction": contact.Coulomb(0.8, transition_speed=0.05)}
     floor = terrain.Flat(level=lowest - 0.002)
     return [

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxmb as mb
-from jaxmb import importers
+from jaxmb import importers, shapes
 from jaxmb.formulations import Multipliers, accelerations
 
 mujoco = pytest.importorskip("mujoco")
@@ -70,31 +71,47 @@ def body_accelerations(model, data, imported):
 
 
 def check_dynamics(imported, count=20, *, scale=1.0):
-    """Accelerations and energies are MuJoCo's, without what jaxmb approximates, at random states and controls."""
+    """Accelerations, energies and rates of activations are MuJoCo's, without what jaxmb approximates, at random states,
+    controls and activations.
+    """
     model = imported.locate.model
     bits = mujoco.mjtDisableBit
     model.opt.disableflags |= int(bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_FRICTIONLOSS)
     data = mujoco.MjData(model)
     system = imported.scene.compile()
     states = list(random_states(model, count, scale=scale))
-    controls = np.random.default_rng(1).normal(size=(count, model.nu))
+    random = np.random.default_rng(1)
+    controls, activations = (random.normal(size=(count, size)) for size in (model.nu, model.na))
     names = list(imported.controls.values())
+    # Those without a name are numbered.
+    known = {model.actuator(k).name or f"actuator {k}": k for k in range(model.nu)}
+    numbers = [known[own] for own in imported.controls]
+    # Activations have the order of the actuators there, that of the groups of parts here.
+    filtered = {
+        name.replace(".control", ".activation"): model.actuator_actadr[k]
+        for k, name in zip(numbers, names, strict=True)
+    }
+    order = np.array([filtered[name] for name in system.state_names()], int)
 
     @jax.jit
-    def evaluate(q, u, control):
+    def evaluate(q, u, z, control):
         own = mb.with_parameters(system, dict(zip(names, control, strict=True))) if names else system
+        own = own.with_states(z) if model.na else own
         udot, _ = accelerations(own, Multipliers(), 0.0, q, u)
         unmet = jnp.max(jnp.abs(own.velocity_residual(0.0, q, u)), initial=0.0)
-        return udot, own.kinetic_energy(0.0, q, u), own.potential_energy(0.0, q), unmet
+        rates = own.state_rates(0.0, q, u) if model.na else z
+        return udot, rates, own.kinetic_energy(0.0, q, u), own.potential_energy(0.0, q), unmet
 
     offset = None
-    for (q, v), control in zip(states, controls, strict=True):
-        data.qpos, data.qvel, data.ctrl = q, v, control
+    for (q, v), control, activation in zip(states, controls, activations, strict=True):
+        data.qpos, data.qvel, data.ctrl, data.act = q, v, control, activation
         mujoco.mj_forward(model, data)
         mujoco.mj_energyPos(model, data)
         mujoco.mj_energyVel(model, data)
         state = imported.state(q, v)
-        udot, kinetic, potential, unmet = jax.tree.map(np.asarray, evaluate(state.q, state.u, list(control)))
+        found = evaluate(state.q, state.u, activation[order], list(control[numbers]))
+        udot, rates, kinetic, potential, unmet = jax.tree.map(np.asarray, found)
+        np.testing.assert_allclose(rates, data.act_dot[order], rtol=1e-12, atol=0)
         assert unmet < 1e-12
         expected = body_accelerations(model, data, imported)
         found = udot.reshape(-1, 6)[list(expected)]
@@ -210,7 +227,7 @@ def test_what_is_exact(joints, more, name, fields):
     own = part(model, name)
     for field, value in fields.items():
         np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
-    assert all(re.search("Equalities hold exactly|the shortest way", note) for note in model.notes)
+    assert all(re.search("Equalities hold exactly|the shortest way|up to half a turn", note) for note in model.notes)
 
 
 def test_inertia_names_and_frames():
@@ -323,7 +340,9 @@ def test_collisions_are_refused_unless_left_out():
         importers.mjcf(text)
     model = importers.mjcf(text, ignore="collisions")
     assert "Left out, as ignore='collisions' asks: collisions." in model.notes
-    assert [shape.kind for shape in model.shapes] == ["plane", "capsule"]
+    (plane,), (bar, *ends) = model.shapes["ground"], model.shapes["a"]
+    assert isinstance(plane, shapes.Ground) and bar.radius == 0.03 and [ball.radius for ball in ends] == [0.03, 0.03]
+    assert model.shapes == model.collision_shapes
 
 
 def test_elements_are_left_out_by_kind_or_by_name():
@@ -389,3 +408,63 @@ def test_keyframes_are_states():
     state = model.states["up"]
     np.testing.assert_allclose(state.u[3:], [0, 2, 0], atol=1e-15)
     np.testing.assert_allclose(state.q[3:], [np.cos(0.75), 0, np.sin(0.75), 0], atol=1e-15)
+
+
+# Loops, angles and filters along a motion
+
+
+@pytest.mark.long
+def test_a_loop_that_cannot_be_closed():
+    """Two sites that no position brings together, and two couplings that contradict each other."""
+    apart = '<site name="far" pos="5 0 0"/>' + rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>')
+    closing = '<equality><connect name="loop" site1="tip" site2="far"/></equality>'
+    twice = "".join(f'<joint name="c{k}" joint1="hip" polycoef=".{k} 0 0 0 0"/>' for k in (1, 2))
+    for text, joint in ((file(apart, closing), "loop"), (file(rod("a", HINGE), f"<equality>{twice}</equality>"), "c2")):
+        with pytest.raises(ValueError, match=f"cannot be assembled.*{joint}"):
+            mb.assemble(importers.mjcf(text).scene.compile())
+
+
+@pytest.mark.long
+def test_springs_of_hinges_take_the_shortest_way_unless_limits_tell_another():
+    for limits, way in (("", 2 * np.pi - 3.5), ('range="-60 220"', 3.5), ('range="-200 200"', 2 * np.pi - 3.5)):
+        joint = f'<joint name="hip" axis="0 1 0" stiffness="2" damping=".1" {limits}/>'
+        model = importers.mjcf(
+            file(rod("a", joint), head='<option><flag gravity="disable"/></option>'), ignore="limits"
+        )
+        system, state = model.scene.compile(), model.state([3.5])
+        assert float(system.potential_energy(0.0, state.q)) == pytest.approx(way**2, rel=1e-12)
+        said = any("take the shortest way" in note and "'hip'" in note for note in model.notes)
+        assert said == (way != 3.5)
+
+
+@pytest.mark.long
+def test_a_servo_whose_control_is_filtered_moves_as_in_mujoco():
+    """MuJoCo's accelerations and rates of the activation, integrated by SciPy."""
+    servo = (
+        '<actuator><position name="m" joint="hip" kp="5" kv=".3" gear="2" timeconst=".1" ctrlrange="-1 1"/></actuator>'
+    )
+    imported = importers.mjcf(file(rod("a", '<joint name="hip" axis="0 1 0" range="-170 170"/>'), servo), ignore=OFF)
+    model = imported.locate.model
+    data = mujoco.MjData(model)
+
+    def right(t, y):
+        data.qpos, data.qvel, data.act, data.ctrl = y[0], y[1], y[2], 3.0 * np.sin(2 * t)
+        mujoco.mj_forward(model, data)
+        return [*data.qvel, *data.qacc, *data.act_dot]
+
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    # Until its control is clipped, and from there on.
+    clipped = 0.5 * np.arcsin(1 / 3)
+    y, expected = [0.4, 0.0, -0.3], []
+    for span in ((0.0, clipped), (clipped, 0.5)):
+        y = solve_ivp(right, span, y, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        expected.append(y)
+    system = imported.scene.compile()
+    state = mb.assemble(system, fix={"hip.angle": 0.4, "m.activation": -0.3})
+    ts = np.array([clipped, 0.5])
+    control = mb.Series(np.linspace(0.0, 0.5, 501), 3.0 * np.sin(2 * np.linspace(0.0, 0.5, 501)), "cubic")
+    motion = mb.simulate(
+        system, state, t1=0.5, saveat=ts, rtol=1e-10, jumps=ts[:1], inputs={imported.controls["m"]: control}
+    )
+    found = np.stack([motion["hip"].angle, motion["hip"].angle_rate, motion["m"].activation], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)

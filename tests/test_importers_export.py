@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from test_importers import check_dynamics
+from test_importers import check_dynamics, random_states
 
 import jaxmb as mb
 from jaxmb import importers, spatial
@@ -61,23 +61,57 @@ def test_a_scene_read_back_moves_alike():
     np.testing.assert_allclose(accelerations_at(again, state), accelerations_at(system, state), rtol=0, atol=1e-11)
 
 
-MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "cable")
+# Those of the library that MuJoCo can express. `rolling_disk`, `net`, `swash_plate`, `double_wishbone` and
+# `spherical_four_bar` have constraints or forces that it has not.
+MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "spatial_loop", "cable")
+
+
+def random_motions(mechanism, count=3):
+    """Consistent states near that of a mechanism."""
+    random, state, system = np.random.default_rng(0), mechanism.state, mechanism.system
+    for _ in range(count):
+        q = state.q + 0.05 * np.asarray(system.coordinate_scale()) * random.normal(size=state.q.shape)
+        u = state.u + np.asarray(system.velocity_scale()) * random.normal(size=state.u.shape)
+        yield mb.assemble(system, mb.State(q, u))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", MACHINES)
 def test_machines_of_the_library_read_back(name):
     own = mb.mechanisms.get(name)
-    exported = importers.to_mjcf(own.system, own.state)
-    mujoco.MjModel.from_xml_string(exported.text)
-    system = importers.mjcf(exported.text).scene.compile()
-    order = [own.system.body_names.index(body) for body in system.body_names]
-    places, speeds = own.system.poses(own.state.q), own.system.velocities(own.state.u)
-    state = mb.State(places[np.array(order)].reshape(-1), speeds[np.array(order)].reshape(-1))
-    expected = accelerations_at(own.system, own.state).reshape(-1, 6)[order]
-    found = accelerations_at(system, state).reshape(-1, 6)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
-    assert system.velocity_rank == own.system.velocity_rank
+    system = importers.mjcf(importers.to_mjcf(own.system, own.state).text).scene.compile()
+    assert system.nu - system.velocity_rank == own.system.nu - own.system.velocity_rank
+    order = np.array([own.system.body_names.index(body) for body in system.body_names])
+    for given in random_motions(own):
+        places, speeds = own.system.poses(given.q), own.system.velocities(given.u)
+        state = mb.State(places[order].reshape(-1), speeds[order].reshape(-1))
+        expected = accelerations_at(own.system, given).reshape(-1, 6)[order]
+        found = accelerations_at(system, state).reshape(-1, 6)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", MACHINES)
+def test_machines_of_the_library_in_mujoco(name):
+    """Without the constraints that close loops, accelerations and energies are MuJoCo's; these have its residuals."""
+    own = mb.mechanisms.get(name)
+    text = importers.to_mjcf(own.system, own.state).text
+    opened = importers.mjcf(text, ignore="loops")
+    opened.locate.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+    check_dynamics(opened, 5, scale=0.3)
+
+    closed = importers.mjcf(text)
+    model, system = closed.locate.model, closed.scene.compile()
+    rows, data = [part for part, _ in system.rows], mujoco.MjData(model)
+    assert np.all(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT)
+    for q, v in random_states(model, 5, scale=0.3):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(model, data)
+        residual = np.asarray(system.position_residual(0.0, closed.state(q, v).q))
+        for k in range(model.neq):
+            theirs = data.efc_pos[(data.efc_type == 0) & (data.efc_id == k)]
+            here = residual[rows.index(model.equality(k).name) :][:3]
+            assert np.linalg.norm(here) == pytest.approx(np.linalg.norm(theirs), rel=1e-10)
 
 
 @pytest.mark.parametrize(

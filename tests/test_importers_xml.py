@@ -248,3 +248,13 @@ def test_what_is_not_read_is_said():
     )
     assert "The text:4: <plugin> is not read." in found.notes
     assert any(re.search("do not act on the motion: <self_collide>", note) for note in found.notes)
+
+
+def test_what_collides_is_shown_where_a_mesh_is_missing():
+    seen = "<visual><geometry><mesh filename='none.stl'/></geometry></visual>"
+    box = "<collision><geometry><box size='.2 .4 .6'/></geometry></collision>"
+    text = robot(link("a", INERTIAL + seen + box), link("world", ""), joint("j", "world", "a", "continuous"))
+    model = importers.urdf(text, ignore="collisions")
+    assert any("none.stl" in note for note in model.notes)
+    (shown,) = model.shapes["a"]
+    np.testing.assert_allclose(shown.scale, (0.2, 0.4, 0.6))

@@ -16,8 +16,6 @@ from test_every_part import SPACES, compiled as built
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
 from jaxmb.cli.picture import check_picture, show_motion
-from jaxmb.importers.description import Shape
-from jaxmb.importers.pictures import pictures
 from jaxmb.linalg import rotations as rot
 from jaxmb.parts import contact
 from jaxmb.viz.solids import solids
@@ -291,13 +289,6 @@ def test_names_with_the_marks_of_a_page():
     shown = viz.show({"<i>one": motion, "two": motion}, points="</script><b>")
     assert "</script><b>" not in shown.html and "<i>one" not in shown.html
     assert "/<i>one/trails/</script><b>" in Page(shown.html).names()
-
-
-def test_what_collides_is_shown_where_nothing_else_can_be(tmp_path):
-    mesh = Shape("mesh", "link", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), str(tmp_path / "none.stl"))
-    box = dataclasses.replace(mesh, kind="box", size=(0.1, 0.2, 0.3), file="", collides=True)
-    (shown,) = pictures([mesh, box])["link"]
-    np.testing.assert_allclose(shown.scale, (0.2, 0.4, 0.6))
 
 
 def test_a_system_without_bodies():

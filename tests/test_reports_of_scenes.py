@@ -157,6 +157,28 @@ def test_stability_of_a_scene(oscillator, tmp_path):
 
 
 @pytest.mark.long
+def test_stability_of_a_scene_with_internal_states():
+    """A rod with a motor that lags: its force counts among the errors, and variants start with it."""
+    rod = planar.Body("rod", mass=2.0, inertia=0.3)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    motor = mb.Actuator("motor", "pin.angle", command=1.2, lag=0.1)
+    system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
+    state = mb.assemble(system, fix={"motor.force": 4.0}, rates={"pin.angle": 1.0})
+    report = stability(system, state, t1=0.5, rtol=1e-8, only=["rtol", "lengths", "initial speed", "doubled joint"])
+    cases = {(case.kind, case.case): case for case in report.cases}
+    assert "lengths: left out, the internal states motor.force are of no known power of a length" in str(report)
+    assert {kind for kind, _ in cases} == {"rtol", "initial speed", "doubled joint"}
+    assert cases["rtol", "1e-04"].error > cases["rtol", "1e-08"].error > 0
+    for key in (("rtol", "1e-08"), ("doubled joint", "the same"), ("initial speed", "× 1e+01")):
+        case = cases[key]
+        assert not case.message and (case.error is None or case.error < 1e-6), case
+    # A body too heavy for the motor moves uniformly, and what errors there are are those of the force.
+    idle = mb.with_parameters(system, {"rod.inertia": 1e9})
+    coarse = stability(idle, state, t1=0.5, only=["rtol"]).cases[0]
+    assert coarse.error > 1e-8
+
+
+@pytest.mark.long
 def test_stability_of_a_pendulum(pendulum):
     """Every kind of variant; the position below the pin is no singular one, but can be named."""
     system, state = pendulum

@@ -11,13 +11,14 @@ from ..parts.combinations import FixedTendon, JointCoupling, Tendon
 from ..parts.forces import Damper, Gravity, PointForce
 from ..parts.joint_laws import JointActuator, JointFriction, JointStop
 from ..parts.joint_parts import JointDriver, JointSpring
+from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body
 from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Revolute, Spherical
 from ..scene import Scene
 from . import chains
-from .description import Joint, Link, Machine, Shape, quaternion
+from .description import Joint, Link, Machine, quaternion
 from .fuse import Fused, fuse
 from .notes import Notes
 
@@ -33,7 +34,7 @@ class Built:
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
     of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each
-    rotor its joint.
+    rotor its joint; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
@@ -41,7 +42,8 @@ class Built:
     controls: dict[str, str]
     fused: Fused
     rotors: dict[str, str]
-    shapes: tuple[Shape, ...]
+    shapes: dict[str, tuple[AbstractShape, ...]]
+    collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
 
 def build(machine: Machine, notes: Notes) -> Built:
@@ -52,6 +54,7 @@ def build(machine: Machine, notes: Notes) -> Built:
 class _Builder:
     def __init__(self, machine: Machine, notes: Notes):
         self.machine, self.notes = machine, notes
+        self.of_name = {joint.name: joint for joint in machine.joints}
         self.fused = fuse(machine, notes)
         self.bodies: list[Any] = []
         self.joints: list[Any] = []
@@ -85,7 +88,9 @@ class _Builder:
             scene: Any = None
         else:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
-        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, self._shapes())
+        collisions = self._of_bodies(machine.collisions)
+        shapes = collisions | self._of_bodies(machine.shapes)
+        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, shapes, collisions)
 
     def _named(self, name, kind=""):
         """A name that nothing in the scene has yet."""
@@ -150,6 +155,7 @@ class _Builder:
                     stiffness=joint.stiffness if "springs" in wanted else 0.0,
                     damping=joint.damping if "damping" in wanted else 0.0,
                     free=joint.free - offset,
+                    middle=None if _near(joint, joint.free) else self._middle(joint.name) - offset,
                 )
             )
         if "springs" in wanted:
@@ -163,7 +169,7 @@ class _Builder:
             self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
 
     def _shortest(self, joint):
-        if joint.kind == "hinge" and joint.limits is None:
+        if joint.kind == "hinge" and _range(joint) is None:
             self.notes.say(
                 "Springs and servos of hinges without limits take the shortest way, up to half a turn: {}.", joint.name
             )
@@ -258,12 +264,19 @@ class _Builder:
                 own: dict[str, Any] = {"zero": zero, "other_zero": coupling.other_zero - other_offset}
                 powers = np.trim_zeros(coupling.coefficients, "b")
                 own["coefficients"] = powers if powers.size else np.zeros(1)
+                if not self._turns_without_end(coupling, powers):
+                    self._seen_up_to_half_a_turn(coupling.other, coupling.name, coupling.other_zero)
                 self.joints.append(JointCoupling(self._named(coupling.name, "coupling"), name, other, **own))
 
-    def _coordinate(self, joint, kind, of):
-        name, offset = self.coordinates.get(joint, (None, 0.0))
+    def _turns_without_end(self, coupling, powers):
+        """Whether full turns of the other hinge are full turns of this one."""
+        return self.of_name[coupling.joint].kind == "hinge" and len(powers) <= 2 and float(sum(powers[1:])).is_integer()
+
+    def _coordinate(self, what, kind, of, known=None):
+        """The coordinate of a joint, or of something else that is known, and what must be added to it."""
+        name, offset = (self.coordinates if known is None else known).get(what, (None, 0.0))
         if name is None:
-            self.notes.refuse(kind, of, f"{of!r} acts on {joint!r}, which has no coordinate of its own")
+            self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate of its own")
         return name, offset
 
     # Tendons and actuators
@@ -280,6 +293,8 @@ class _Builder:
                 if any(coordinate is None for (coordinate, _), _ in found):
                     continue
                 name = self._named(tendon.name, "tendon")
+                for joint, _ in tendon.joints:
+                    self._seen_up_to_half_a_turn(joint, tendon.name)
                 along, coefficients = [own for (own, _), _ in found], [c for _, c in found]
                 offset = sum(c * own for (_, own), c in found)
                 self.joints.append(FixedTendon(name, along, coefficients=coefficients))
@@ -304,10 +319,8 @@ class _Builder:
         for actuator in self.machine.actuators:
             if self.notes.leaves_out("actuators", actuator.name):
                 continue
-            if actuator.of in self.tendons:
-                coordinate, offset = self.tendons[actuator.of]
-            else:
-                coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name)
+            known = self.tendons if actuator.on_tendon else self.coordinates
+            coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name, known)
             if coordinate is None:
                 continue
             gear, shift = actuator.gear, actuator.gear * offset
@@ -323,13 +336,13 @@ class _Builder:
                     gear=gear,
                     gain=shifted(actuator.gain),
                     bias=shifted(actuator.bias),
-                    middle=self._middle(actuator.of) - offset,
+                    middle=0.0 if actuator.on_tendon else self._middle(actuator.of) - offset,
+                    lag=actuator.lag,
                     **ranges,
                 )
             )
-            for joint in self.machine.joints:
-                if joint.name == actuator.of and (actuator.gain[1] or actuator.bias[1]):
-                    self._shortest(joint)
+            if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
+                self._shortest(self.of_name[actuator.of])
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
                     "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
@@ -339,10 +352,14 @@ class _Builder:
 
     def _middle(self, name):
         """The middle of a joint's range, about which its angle counts; zero where it may turn as it likes."""
-        for joint in self.machine.joints:
-            if joint.name == name and joint.limits is not None and joint.limits[1] - joint.limits[0] < 2 * np.pi:
-                return 0.5 * (joint.limits[0] + joint.limits[1])
-        return 0.0
+        limits = _range(self.of_name[name])
+        return 0.0 if limits is None else 0.5 * (limits[0] + limits[1])
+
+    def _seen_up_to_half_a_turn(self, name, of, zero=0.0):
+        """Note that something sees the angle of a joint up to half a turn from a zero, if it may leave this range."""
+        joint = self.of_name[name]
+        if joint.kind == "hinge" and (_range(joint) is None or not _near(joint, zero)):
+            self.notes.say("Tendons and couplings see angles of hinges up to half a turn from their zeros: {}.", of)
 
     # Frames, weights and pictures
 
@@ -366,13 +383,26 @@ class _Builder:
                 "Weight is compensated by constant forces, which do not follow a change of gravity: {}.", name
             )
 
-    def _shapes(self):
-        out = []
-        for shape in self.machine.shapes:
-            body, position = self.fused.point(shape.body, shape.position)
-            orientation = quaternion(self.fused.rotation(shape.body) @ shape.orientation)
-            out.append(dataclasses.replace(shape, body=body, position=position, orientation=orientation))
-        return tuple(out)
+    def _of_bodies(self, shapes):
+        """Shapes of links by the name of the body that they are on."""
+        out: dict[str, tuple[AbstractShape, ...]] = {}
+        for link, shape in shapes:
+            body, position = self.fused.point(link, np.zeros(3))
+            placed = shape.moved(position, quaternion(self.fused.rotation(link)))
+            out[body] = (*out.get(body, ()), placed)
+        return out
+
+
+def _range(joint: Joint):
+    """The limits of a joint, of a hinge only if they allow less than a full turn: others are left out."""
+    limits = joint.limits
+    return None if limits is None or (joint.kind == "hinge" and limits[1] - limits[0] >= 2 * np.pi) else limits
+
+
+def _near(joint: Joint, zero: Any):
+    """Whether the limits of a hinge, if it has any, keep it within half a turn of a zero."""
+    limits = _range(joint)
+    return joint.kind != "hinge" or limits is None or max(abs(limit - zero) for limit in limits) <= np.pi
 
 
 def _body(carrier: Link):

@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..parts.shapes import AbstractShape
+
 GROUND = "ground"
 
 Kind = Literal["hinge", "slide", "ball", "free", "fixed"]
@@ -107,16 +109,18 @@ class TendonPath:
 
 @dataclasses.dataclass
 class Actuator:
-    """An actuator of a joint or tendon; its numbers as in `jaxmb.JointActuator`."""
+    """An actuator of a joint, or of a tendon; its numbers as in `jaxmb.JointActuator`."""
 
     name: str
     of: str
+    on_tendon: bool = False
     gear: float = 1.0
     gain: tuple[float, float, float] = (1.0, 0.0, 0.0)
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     control: float = 0.0
     control_range: tuple[float, float] | None = None
     force_range: tuple[float, float] | None = None
+    lag: float | None = None
 
 
 @dataclasses.dataclass
@@ -129,32 +133,12 @@ class Mark:
     rotation: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Shape:
-    """A shape for the picture.
-
-    **Fields:** `kind`: `"box"`, `"sphere"`, `"cylinder"`, `"capsule"`, `"ellipsoid"`, `"plane"` or `"mesh"`; `body`, a
-    body of the scene or `"ground"`; `position` [m], shape (3,), and `orientation`, Euler parameters, in the body's
-    frame; `size` [m]: half edges of a box, radius and half length of a cylinder or capsule, radii; scales of a mesh;
-    `file` of a mesh, or its `vertices` [m] and `faces` in the shape's axes; `colour`, red, green, blue and opacity in
-    [0, 1]; `collides`: whether it is there for collisions.
-    """
-
-    kind: str
-    body: str
-    position: Any
-    orientation: Any
-    size: tuple[float, ...] = ()
-    file: str = ""
-    colour: tuple[float, ...] = (0.5, 0.5, 0.5, 1.0)
-    collides: bool = False
-    vertices: Any = None
-    faces: Any = None
-
-
 @dataclasses.dataclass
 class Machine:
-    """A machine as a file describes it. `shapes` have links in place of bodies, and rotation matrices."""
+    """A machine as a file describes it.
+
+    `shapes`, and `collisions` for shapes that may collide: pairs of a link and a shape in its frame.
+    """
 
     name: str
     gravity: np.ndarray
@@ -165,7 +149,8 @@ class Machine:
     tendons: list[TendonPath] = dataclasses.field(default_factory=list)
     actuators: list[Actuator] = dataclasses.field(default_factory=list)
     marks: list[Mark] = dataclasses.field(default_factory=list)
-    shapes: list[Any] = dataclasses.field(default_factory=list)
+    shapes: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
+    collisions: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
     buoyancy: dict[str, float] = dataclasses.field(default_factory=dict)
 
 

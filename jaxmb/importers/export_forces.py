@@ -119,6 +119,9 @@ class _Writer:
         element.set("gainprm", numbers(own.gain))
         element.set("biastype", "affine")
         element.set("biasprm", numbers(own.bias))
+        if own.lag is not None:
+            element.set("dyntype", "filterexact")
+            element.set("dynprm", numbers(own.lag))
         for name, given in (("ctrlrange", own.control_range), ("forcerange", own.force_range)):
             if given is not None:
                 element.set(name, numbers(given))

@@ -124,13 +124,14 @@ def _acts_on(group, part, k):
 
 
 def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> Tree:
-    """The tree of a system's bodies. Joints are taken in their order, first those of bodies that are reached."""
+    """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
     tree = Tree(places)
     parts = [p for p in parts_of(system, system.constraints, places) if not notes.leaves_out("joints", p.name)]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
     waiting = [p for p in parts if p.kind in _JOINTS and all(rotates.get(body, True) for body in p.bodies)]
     closing = [p for p in parts if p not in waiting]
+    waiting.sort(key=lambda part: part.kind in _CLOSING)
     reached, left = {GROUND}, list(system.body_names)
     while left:
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)

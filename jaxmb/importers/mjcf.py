@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from .._types import State
+from ..parts.shapes import Box, Cylinder, Ellipsoid, Ground, Mesh, Sphere, capsule
 from .build import build
 from .description import (
     GROUND,
@@ -16,10 +17,10 @@ from .description import (
     Loop,
     Machine,
     Mark,
-    Shape,
     TendonPath,
     matrix,
 )
+from .geometry import color_of
 from .mjcf_actuators import read_actuators
 from .mjcf_file import compiled, load_mujoco
 from .mjcf_refusals import refuse_unknown
@@ -54,6 +55,8 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     machine = Machine(names.model, np.array(model.opt.gravity))
     disabled = {word for word in mujoco.mjtDisableBit.__members__.values() if model.opt.disableflags & int(word)}
     off = {str(word).rpartition("mjDSBL_")[2] for word in disabled}
+    if "CONSTRAINT" in off:
+        off |= {"EQUALITY", "LIMIT", "FRICTIONLOSS"}
     if "GRAVITY" in off:
         machine.gravity = np.zeros(3)
     _read_links(model, data, names, machine)
@@ -62,7 +65,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
         _read_equalities(mujoco, model, names, machine, notes)
     _read_tendons(mujoco, model, names, machine, off)
     if "ACTUATION" not in off:
-        machine.actuators = read_actuators(mujoco, model, names, notes)
+        machine.actuators = read_actuators(mujoco, model, names, notes, off)
     _read_marks(model, names, machine)
     _read_shapes(mujoco, model, names, machine)
     built = build(machine, notes)
@@ -73,7 +76,8 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
         for k in range(model.nkey)
     }
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
-    return ImportedModel(names.model, built.scene, said, coordinates, built.controls, states, built.shapes, locate)
+    seen = built.shapes, built.collision_shapes
+    return ImportedModel(names.model, built.scene, said, coordinates, built.controls, states, *seen, locate)
 
 
 class _Names:
@@ -221,37 +225,40 @@ def _read_marks(model, names, machine):
         machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k])))
 
 
-_SHAPES = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
-
-
 def _read_shapes(mujoco, model, names, machine):
     for k in range(model.ngeom):
-        kind = _SHAPES.get(int(model.geom_type[k]))
-        if kind is None:
-            continue
-        file, vertices, faces = "", None, None
-        if kind == "mesh":
-            mesh = model.geom_dataid[k]
-            start = model.mesh_pathadr[mesh]
-            file = model.paths[start : model.paths.find(b"\0", start)].decode() if start >= 0 else ""
+        color, body = color_of(model.geom_rgba[k]), names("body", model.geom_bodyid[k])
+        place = {"position": np.array(model.geom_pos[k]), "orientation": np.array(model.geom_quat[k]), "color": color}
+        own = [(body, shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
+        if model.geom_contype[k] or model.geom_conaffinity[k]:
+            machine.collisions += own
+        elif color is not None:
+            machine.shapes += own
+
+
+def _shape(kinds, model, k, place):
+    """The shapes of a geom; none of height fields and signed distances."""
+    size = np.array(model.geom_size[k])
+    match kinds(int(model.geom_type[k])):
+        case kinds.mjGEOM_PLANE:
+            return (Ground(**place),)
+        case kinds.mjGEOM_SPHERE:
+            return (Sphere(size[0], **place),)
+        case kinds.mjGEOM_CAPSULE:
+            return capsule(size[0], 2 * size[1], **place)
+        case kinds.mjGEOM_ELLIPSOID:
+            return (Ellipsoid(size, **place),)
+        case kinds.mjGEOM_CYLINDER:
+            return (Cylinder(size[0], 2 * size[1], **place),)
+        case kinds.mjGEOM_BOX:
+            return (Box(2 * size, **place),)
+        case kinds.mjGEOM_MESH:
             # As MuJoCo places it, in the mesh's principal axes.
-            of_mesh = lambda first, count, rows, m=mesh: np.array(rows[first[m] : first[m] + count[m]])
+            mesh = model.geom_dataid[k]
+            of_mesh = lambda first, count, rows: np.array(rows[first[mesh] : first[mesh] + count[mesh]])
             vertices = of_mesh(model.mesh_vertadr, model.mesh_vertnum, model.mesh_vert)
-            faces = of_mesh(model.mesh_faceadr, model.mesh_facenum, model.mesh_face)
-        machine.shapes.append(
-            Shape(
-                kind,
-                names("body", model.geom_bodyid[k]),
-                np.array(model.geom_pos[k]),
-                matrix(model.geom_quat[k]),
-                tuple(map(float, model.geom_size[k])),
-                file,
-                tuple(map(float, model.geom_rgba[k])),
-                bool(model.geom_contype[k] or model.geom_conaffinity[k]),
-                vertices,
-                faces,
-            )
-        )
+            return (Mesh(vertices, of_mesh(model.mesh_faceadr, model.mesh_facenum, model.mesh_face), **place),)
+    return ()
 
 
 class _Locate:

@@ -1,5 +1,6 @@
 """Actuators of MJCF whose force depends on the control and on the length and speed of a joint or tendon."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -8,24 +9,42 @@ from .description import Actuator
 from .notes import Notes
 
 
-def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes) -> list[Actuator]:
-    """The actuators of a model; the others are refused."""
-    return [
-        actuator
-        for k in range(model.nu)
-        if (actuator := _read(mujoco, model, names, notes, k, names("actuator", k))) is not None
-    ]
+def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes, off: Collection[str]) -> list[Actuator]:
+    """The actuators of a model; the others are refused. `off`: names of MuJoCo's flags that are disabled."""
+    out = []
+    for k in range(len(model.actuator_trntype)):
+        name = names("actuator", k)
+        if model.opt.disableactuator & (1 << int(model.actuator_group[k])):
+            notes.say("Actuators of disabled groups are left out: {}.", name)
+            continue
+        actuator = _read(mujoco, model, names, notes, k, name)
+        if actuator is not None:
+            if "CLAMPCTRL" in off:
+                actuator.control_range = None
+            out.append(actuator)
+    return out
 
 
 def _read(mujoco, model, names, notes, k, name):
     transmissions, kind = mujoco.mjtTrn, mujoco.mjtTrn(int(model.actuator_trntype[k]))
-    gear, target = np.array(model.actuator_gear[k]), int(model.actuator_trnid[k][0])
+    target = int(model.actuator_trnid[k][0])
+    # Before MuJoCo 4 every actuator has one control and one force.
+    control, out = (int(getattr(model, f"actuator_{own}adr", range(model.nu))[k]) for own in ("ctrl", "out"))
+    gear = float(model.actuator_gear[out][0])
+    control_range = tuple(model.actuator_ctrlrange[control]) if model.actuator_ctrllimited[control] else None
 
     def refuse(what):
         notes.refuse("actuators", name, f"Actuator {name!r} {what}")
 
-    if model.actuator_dyntype[k] != mujoco.mjtDyn.mjDYN_NONE:
-        return refuse("has dynamics of its own, such as a filter or a muscle")
+    dynamics, lag = mujoco.mjtDyn(int(model.actuator_dyntype[k])), None
+    if dynamics in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+        lag = float(model.actuator_dynprm[k][0])
+        if lag <= 0:
+            return refuse("has a filter whose time constant is not positive")
+        if model.actuator_actlimited[k] and not _within(control_range, model.actuator_actrange[k]):
+            return refuse("has a range of its activation that the control may leave")
+    elif dynamics != mujoco.mjtDyn.mjDYN_NONE:
+        return refuse("has dynamics of its own that are no filter, such as an integrator or a muscle")
     if kind in (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT):
         if mujoco.mjtJoint(int(model.jnt_type[target])) not in (
             mujoco.mjtJoint.mjJNT_HINGE,
@@ -49,18 +68,45 @@ def _read(mujoco, model, names, notes, k, name):
         return refuse("has a bias that is not affine in length and speed")
     force_range = tuple(model.actuator_forcerange[k]) if model.actuator_forcelimited[k] else None
     if kind != transmissions.mjTRN_TENDON and model.jnt_actfrclimited[target]:
-        own = (model.actuator_trntype == int(kind)) & (model.actuator_trnid[:, 0] == target)
-        if np.sum(own) > 1:
+        if len(_acting_on(mujoco, model, target)) > 1:
             return refuse(f"shares the limit of the actuator force of joint {of!r} with others")
-        own = np.sort(np.array(model.jnt_actfrcrange[target]) / gear[0])
+        own = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)
         given = own if force_range is None else np.array(force_range)
         force_range = (max(own[0], given[0]), min(own[1], given[1]))
+    if kind == transmissions.mjTRN_TENDON:
+        for joint in np.flatnonzero(model.jnt_actfrclimited):
+            if k in _acting_on(mujoco, model, joint):
+                return refuse(f"acts on joint {names.joint(joint)!r}, which limits the force of its actuators")
     return Actuator(
         name,
         of,
-        gear=float(gear[0]),
+        on_tendon=kind == transmissions.mjTRN_TENDON,
+        gear=gear,
         gain=tuple(gain),
         bias=tuple(bias),
-        control_range=tuple(model.actuator_ctrlrange[k]) if model.actuator_ctrllimited[k] else None,
+        control_range=control_range,
         force_range=force_range,
+        lag=lag,
     )
+
+
+def _acting_on(mujoco, model, joint):
+    """Numbers of the actuators that may act on a joint, by themselves or by a tendon."""
+    kinds, found = mujoco.mjtTrn, []
+    for k, (kind, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
+        if kind == kinds.mjTRN_TENDON:
+            wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
+            is_other = lambda w: model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT and model.wrap_objid[w] != joint
+            if not all(is_other(w) for w in wraps):
+                found.append(k)
+        elif kind not in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT) or target == joint:
+            found.append(k)
+    return found
+
+
+def _within(control_range, activation_range):
+    """Whether a filtered control never leaves the range of its activation, which starts at zero."""
+    if control_range is None:
+        return False
+    (low, high), (least, most) = control_range, activation_range
+    return least <= min(low, 0.0) and max(high, 0.0) <= most

@@ -55,7 +55,10 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {listed}.")
     if np.any(model.key_ctrl) or np.any(model.key_act):
-        notes.say("Controls of keyframes are not read: give them with the parameters in `controls`.")
+        notes.say(
+            "Controls and activations of keyframes are not read: give them with the parameters in `controls`, and to "
+            "assemble as fix={'motor.activation': …}."
+        )
     if model.neq:
         notes.say("Equalities hold exactly: their solref and solimp have no effect.")
     moved = np.flatnonzero(model.body_mocapid >= 0)

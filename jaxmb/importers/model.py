@@ -9,8 +9,6 @@ import numpy as np
 from .._types import State
 from ..parts.shapes import AbstractShape
 from ..scene import Scene
-from .description import Shape
-from .pictures import pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +26,8 @@ class ImportedModel:
     - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
         `simulate(..., inputs=)`.
     - `states`: the named states of the file, such as keyframes of MJCF, for `assemble`.
-    - `shapes`: what the links look like, as the file says; see `pictures`.
+    - `shapes`: what each body looks like, those for collisions where it has no others, for `viz.show(trajectory,
+        shapes=model.shapes)`; `collision_shapes`: those that the file has for collisions, for contacts of your own.
     """
 
     name: str
@@ -37,13 +36,9 @@ class ImportedModel:
     coordinates: Mapping[str, str]
     controls: Mapping[str, str] = dataclasses.field(default_factory=dict)
     states: Mapping[str, State] = dataclasses.field(default_factory=dict)
-    shapes: tuple[Shape, ...] = ()
+    shapes: Mapping[str, tuple[AbstractShape, ...]] = dataclasses.field(default_factory=dict, repr=False)
+    collision_shapes: Mapping[str, tuple[AbstractShape, ...]] = dataclasses.field(default_factory=dict, repr=False)
     locate: Callable[[np.ndarray, np.ndarray], State] | None = dataclasses.field(default=None, repr=False)
-
-    @property
-    def pictures(self) -> dict[str, tuple[AbstractShape, ...]]:
-        """What the bodies look like, for `viz.show(trajectory, shapes=model.pictures)`. Meshes need `jaxmb[view]`."""
-        return pictures(self.shapes)
 
     def state(self, qpos: Any, qvel: Any = None) -> State:
         """The state of the bodies at MuJoCo's coordinates and velocities, for models from MJCF.

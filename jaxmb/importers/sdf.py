@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from .build import build
-from .description import GROUND, Joint, Kind, Link, Machine, Shape, roll_pitch_yaw
+from .description import GROUND, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
+from .geometry import read_geometry
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
 from .source import file_name, text_of
@@ -24,6 +25,7 @@ _KINDS: dict[str, Kind] = {
 }
 # From this size on a limit of a joint is none.
 _UNLIMITED = 1e15
+_GREY = (128, 128, 128)
 # Elements that do not act on the motion.
 _EFFECTLESS = {"sensor", "light", "material", "self_collide", "allow_auto_disable", "audio_source", "transparency"}
 
@@ -64,14 +66,16 @@ def sdf(
     place = _pose(model, notes)
     for nested in (*model.all("model"), *model.all("include"), *model.all("frame")):
         notes.refused.append(f"{nested.where}<{nested.tag}> within a model is not read; write the model out.")
+    if "placement_frame" in model.attributes:
+        notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's own frame.")
     static = model.first("static")
     for element in model.all("link"):
         _read_link(element, machine, place, notes)
         if static is not None and static.text.strip() in ("1", "true"):
             machine.joints.append(Joint(f"{element.need('name')} weld", "fixed", GROUND, element.need("name")))
     for element in model.all("joint"):
-        _read_joint(element, machine, notes)
-    if any(shape.collides for shape in machine.shapes):
+        _read_joint(element, machine, place[1], notes)
+    if machine.collisions:
         notes.refuse("collisions", "", "Links have shapes for collisions")
     for element in root.unread():
         if element.tag not in _EFFECTLESS:
@@ -82,7 +86,9 @@ def sdf(
     built = build(machine, notes)
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
     said = notes.finish(file)
-    return ImportedModel(machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes)
+    return ImportedModel(
+        machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes, built.collision_shapes
+    )
 
 
 def _pose(element: Element, notes: Notes):
@@ -131,8 +137,13 @@ def _read_link(element, machine, place, notes):
             for i in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+        if inertial.attributes.get("auto") in ("1", "true"):
+            notes.refused.append(f"{inertial.where}the inertia of link {name!r} comes from its shapes: write it out.")
     else:
         notes.refused.append(f"{element.where}link {name!r} has no <inertial>: give it a mass and an inertia.")
+    weighs = element.first("gravity")
+    if weighs is not None and weighs.text.strip() in ("0", "false"):
+        machine.buoyancy[name] = 1.0
     machine.links[name] = link
     for tag in ("visual", "collision"):
         for own in element.all(tag):
@@ -141,31 +152,12 @@ def _read_link(element, machine, place, notes):
 
 def _read_shape(element, link, machine, notes):
     position, rotation = _pose(element, notes)
-    geometry = element.first("geometry")
-    shape = geometry.children[0] if geometry is not None and geometry.children else None
-    if shape is None:
-        raise ValueError(f"{element.where}<{element.tag}> needs a <geometry>.")
-    shape.read = True
-    kind, size, file = shape.tag, (), ""
-    if kind == "box":
-        edges = shape.first("size")
-        size = () if edges is None else tuple(0.5 * edges.numbers())
-    elif kind == "sphere":
-        size = (shape.number("radius"),)
-    elif kind in ("cylinder", "capsule"):
-        size = (shape.number("radius"), 0.5 * shape.number("length"))
-    elif kind == "mesh":
-        scale, uri = shape.first("scale"), shape.first("uri")
-        size = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers())
-        file = "" if uri is None else uri.text.strip()
-    else:
-        for child in shape.children:
-            child.read = True
-    own = Shape(kind, link, position, rotation, size, file, collides=element.tag == "collision")
-    machine.shapes.append(own)
+    own = read_geometry(element, notes, position=position, orientation=quaternion(rotation), color=_GREY)
+    shapes = machine.collisions if element.tag == "collision" else machine.shapes
+    shapes += [(link, shape) for shape in own]
 
 
-def _read_joint(element, machine, notes):
+def _read_joint(element, machine, of_model, notes):
     name, kind = element.need("name"), element.need("type")
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
@@ -198,21 +190,23 @@ def _read_joint(element, machine, notes):
         pairs = [(joint, axes[0] if axes else None)]
     for joint, axis in pairs:
         if axis is not None:
-            _read_axis(joint, axis, frame, machine, notes, kind)
+            _read_axis(joint, axis, frame, of_model, machine, notes, kind)
         elif joint.kind in ("hinge", "slide"):
             raise ValueError(f"{element.where}joint {name!r} needs an <axis>.")
         machine.joints.append(joint)
 
 
-def _read_axis(joint, axis, frame, machine, notes, kind):
+def _read_axis(joint, axis, frame, of_model, machine, notes, kind):
     xyz = axis.first("xyz")
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
     in_model = axis.first("use_parent_model_frame")
     if (in_model is not None and in_model.text.strip() in ("1", "true")) or expressed == "__model__":
-        frame = np.eye(3)
+        frame = of_model
     elif expressed:
-        frame = machine.links[expressed].rotation if expressed in machine.links else frame
+        if expressed not in machine.links:
+            raise ValueError(f"{xyz.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
+        frame = machine.links[expressed].rotation
     length = np.linalg.norm(direction)
     if length == 0:
         raise ValueError(f"{axis.where}the axis of joint {joint.name!r} is zero.")

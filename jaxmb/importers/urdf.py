@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from .build import build
-from .description import GROUND, Coupling, Joint, Kind, Link, Machine, Shape, roll_pitch_yaw
+from .description import GROUND, Coupling, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
+from .geometry import color_of, read_geometry
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
 from .source import file_name, text_of
@@ -55,19 +56,21 @@ def urdf(
         raise ValueError(f"{root.where}the file has xacro macros: run xacro on it first.")
     machine = Machine(root.attributes.get("name", "robot"), np.asarray(gravity, float))
     for element in root.all("link"):
-        _read_link(element, machine)
+        _read_link(element, machine, notes)
     joints = [_read_joint(element, machine, notes) for element in root.all("joint")]
     _place(machine, joints, base, root)
     for joint, element, _ in joints:
         machine.joints.append(joint)
         _read_mimic(joint, element, machine)
-    if any(shape.collides for shape in machine.shapes):
+    if machine.collisions:
         notes.refuse("collisions", "", "Links have shapes for collisions")
     _say_unread(root, notes)
     built = build(machine, notes)
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
     said = notes.finish(file)
-    return ImportedModel(machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes)
+    return ImportedModel(
+        machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes, built.collision_shapes
+    )
 
 
 def _origin(element: Element | None):
@@ -79,7 +82,7 @@ def _origin(element: Element | None):
     return position, roll_pitch_yaw(own.numbers(own.attributes.get("rpy", "0 0 0")))
 
 
-def _read_link(element, machine):
+def _read_link(element, machine, notes):
     name = element.need("name")
     if name in machine.links:
         raise ValueError(f"{element.where}link {name!r} is there twice.")
@@ -96,33 +99,20 @@ def _read_link(element, machine):
     machine.links[name] = link
     for tag in ("visual", "collision"):
         for own in element.all(tag):
-            _read_shape(own, name, machine)
+            _read_shape(own, name, machine, notes)
 
 
-def _read_shape(element, link, machine):
+def _read_shape(element, link, machine, notes):
     position, rotation = _origin(element)
-    geometry = element.first("geometry")
-    colour = (0.5, 0.5, 0.5, 1.0)
     material = element.first("material")
-    if material is not None and (own := material.first("color")) is not None:
-        colour = tuple(own.numbers(own.attributes.get("rgba", "0.5 0.5 0.5 1"), 4))
-    shape = geometry.children[0] if geometry is not None and geometry.children else None
-    if shape is None:
-        raise ValueError(f"{element.where}<{element.tag}> needs a <geometry>.")
-    shape.read = True
-    file, size = "", ()
-    if shape.tag == "box":
-        size = tuple(0.5 * shape.numbers(shape.need("size")))
-    elif shape.tag == "sphere":
-        size = (shape.attribute_number("radius"),)
-    elif shape.tag in ("cylinder", "capsule"):
-        size = (shape.attribute_number("radius"), 0.5 * shape.attribute_number("length"))
-    elif shape.tag == "mesh":
-        file, size = shape.need("filename"), tuple(shape.numbers(shape.attributes.get("scale", "1 1 1")))
-    else:
-        raise ValueError(f"{shape.where}unknown geometry <{shape.tag}>.")
-    own = Shape(shape.tag, link, position, rotation, size, file, colour, element.tag == "collision")
-    machine.shapes.append(own)
+    given = None if material is None else material.first("color")
+    rgba = (0.5, 0.5, 0.5, 1.0) if given is None else given.numbers(given.attributes.get("rgba", "0.5 0.5 0.5 1"), 4)
+    color = color_of(rgba)
+    own = read_geometry(element, notes, position=position, orientation=quaternion(rotation), color=color)
+    if element.tag == "collision":
+        machine.collisions += [(link, shape) for shape in own]
+    elif color is not None:
+        machine.shapes += [(link, shape) for shape in own]
 
 
 def _read_joint(element, machine, notes):

@@ -48,7 +48,7 @@ def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
     found = {}
     for prefix, own in (((), part), *inner_parts(part)):
         for name, declared in declarations(type(own)).items():
-            if declared.kind == "internal":
+            if declared.kind == "internal" and getattr(own, name) is not None:
                 found[name] = (*prefix, name)
             elif declared.kind == "internals":
                 found |= {key: (*prefix, name, key) for key in getattr(own, name)}

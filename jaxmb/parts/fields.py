@@ -281,13 +281,16 @@ def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
     return _field(Declaration("state", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
 
 
-def internal_state(*, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0) -> Any:
+def internal_state(
+    *, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0, optional: bool = False
+) -> Any:
     """An internal state, a number that changes by an equation of first order; see `AbstractDynamicForce`.
 
     The kernels of the part see the current value in this field; the value that is given here is that of the initial
-    guess. It is not a parameter.
+    guess. It is not a parameter. `optional`: default None, with which the part has no such state.
     """
-    return _field(Declaration("internal", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
+    declaration = Declaration("internal", shape=shape, unit=unit, optional=optional)
+    return _field(declaration, converter=_optional(_NUMBER), default=None if optional else default, kw_only=True)
 
 
 def internal_states_by_name() -> Any:

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import fields
-from .base import AbstractForce, AbstractPotentialForce
+from .base import AbstractDynamicForce, AbstractForce, AbstractPotentialForce
 from .forces import generalized_force
-from .joint_parts import AbstractCoordinatePart, shortest
+from .joint_parts import AbstractCoordinatePart
 from .smooth import ramp
 
 
@@ -18,10 +18,6 @@ class AbstractScalarPart(AbstractCoordinatePart):
         if given.size != 1:
             raise ValueError(f"{self.label}: {self.coordinate!r} must be a number, it has shape {given.shape}.")
         return self
-
-    def near(self, value, middle):
-        """The coordinate [rad, m]; of an angle known up to full turns the one within half a turn of `middle`."""
-        return middle + shortest(value - middle) if self.within in self.joint.periodic else value
 
 
 class JointStop(AbstractScalarPart, AbstractPotentialForce):
@@ -85,16 +81,20 @@ class JointFriction(AbstractScalarPart, AbstractForce):
         return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
 
 
-class JointActuator(AbstractScalarPart, AbstractForce):
+class JointActuator(AbstractScalarPart, AbstractDynamicForce):
     """An actuator with a control: a motor, or a position or velocity servo, with a gear.
 
     With the length `l = gear x` of the coordinate x, it exerts the generalized force `gear f`,
     `f = (gain · (1, l, l̇)) control + bias · (1, l, l̇)`: a motor has gain (1, 0, 0) and no bias; a position servo has
     gain (k, 0, 0) and bias (0, −k, −d); a velocity servo gain (d, 0, 0) and bias (0, 0, −d).
 
+    With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
+    `lag · d(activation)/dt = control − activation`. Of an `Actuator` it is the force that follows.
+
     **Arguments:** `coordinate`, such as `"hip.angle"`, of which x counts in (−π, π] about `middle`; `control`, default
     zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`;
-    `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by default they are not.
+    `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by default they are not;
+    `lag` [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)
@@ -104,17 +104,26 @@ class JointActuator(AbstractScalarPart, AbstractForce):
     middle: fields.Number = fields.parameter(unit="rad or m", default=0.0)
     control_range: fields.Number = fields.parameter(shape=(2,), optional=True)
     force_range: fields.Number = fields.parameter(shape=(2,), optional=True)
+    lag: fields.Number = fields.parameter(unit="s", sign="positive", optional=True)
+    activation: fields.Number = fields.internal_state(optional=True)
 
     def validate(self):
         for name in ("control_range", "force_range"):
             given = getattr(self, name)
             if given is not None and not given[0] < given[1]:
                 raise ValueError(f"{self.label}: {name} must be two numbers that increase, got {given.tolist()}.")
+        if self.lag is None and self.activation is not None:
+            raise ValueError(f"{self.label}: an activation needs a lag.")
+
+    def with_numbers(self, given):
+        part = super().with_numbers(given)
+        return part if self.lag is None else part.filled(activation=0.0)
 
     def force(self, length, rate):
         """f [N m, N] at a length [rad, m] and its rate."""
         terms = jnp.stack([jnp.ones_like(length), length, rate])
-        force = jnp.dot(self.gain, terms) * _clipped(self.control, self.control_range) + jnp.dot(self.bias, terms)
+        control = self._clipped_control() if self.lag is None else self.activation
+        force = jnp.dot(self.gain, terms) * control + jnp.dot(self.bias, terms)
         return _clipped(force, self.force_range)
 
     def wrenches(self, space, poses, velocities, t):
@@ -123,6 +132,16 @@ class JointActuator(AbstractScalarPart, AbstractForce):
             return self.gear * self.force(self.gear * x[0], self.gear * v[0])[None]
 
         return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+    def state_rates(self, space, poses, velocities, t):
+        return {} if self.lag is None else {"activation": (self._clipped_control() - self.activation) / self.lag}
+
+    def state_sizes(self):
+        size = jnp.abs(self.control) if self.control_range is None else jnp.max(jnp.abs(self.control_range))
+        return {"activation": jnp.where(size > 0, size, 1.0)}
+
+    def _clipped_control(self):
+        return _clipped(self.control, self.control_range)
 
 
 def _clipped(value, limits):

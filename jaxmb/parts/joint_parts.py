@@ -70,6 +70,10 @@ class AbstractCoordinatePart(AbstractLink):
         out = value - target.reshape(-1)
         return shortest(out) if self.within in self.joint.periodic else out
 
+    def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
+        return middle.reshape(-1) + self.difference(value, middle) if self.within in self.joint.periodic else value
+
     def _check_shape(self, field: str, given: np.ndarray) -> None:
         shape = np.shape(getattr(self, field))
         if shape != given.shape:
@@ -100,24 +104,32 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
 
     **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
     ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
-    spring of an angle takes the shortest way to it, up to half a turn.
+    spring of an angle takes the shortest way to it, up to half a turn; with `middle` [rad], of the range in which the
+    angle stays, it takes the way within half a turn of that.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
     damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
     free: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    middle: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
 
     def with_numbers(self, given):
         part = self.filled(free=given)
-        part._check_shape("free", given)
+        for field in ("free",) if part.middle is None else ("free", "middle"):
+            part._check_shape(field, given)
         return part
 
+    def _stretch(self, value):
+        if self.middle is None:
+            return self.difference(value, self.free)
+        return self.near(value, self.middle) - self.free.reshape(-1)
+
     def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -self.stiffness * self.difference(x, self.free) - self.damping * v
+        law = lambda x, v: -self.stiffness * self._stretch(x) - self.damping * v
         return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
 
     def energy(self, space, poses, t):
-        return 0.5 * self.stiffness * jnp.sum(self.difference(self.measured(space, poses), self.free) ** 2)
+        return 0.5 * self.stiffness * jnp.sum(self._stretch(self.measured(space, poses)) ** 2)
 
 
 class JointForce(AbstractCoordinatePart, AbstractForce):

@@ -96,6 +96,27 @@ class Sphere(AbstractShape):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Ellipsoid(AbstractShape):
+    """An ellipsoid with its centre at the position.
+
+    **Arguments:** `radii` [m], shape (3,), along its own axes.
+    """
+
+    radii: VectorLike
+    primitive = "sphere"
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_lengths(self, radii=self.radii)
+        if np.shape(self.radii) != (3,):
+            raise ValueError(f"Ellipsoid: radii must be three lengths, got {self.radii}.")
+
+    @property
+    def scale(self):
+        return np.asarray(self.radii, float)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Cylinder(AbstractShape):
     """A cylinder along its own z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
 
@@ -144,10 +165,11 @@ class Mesh(AbstractShape):
         return np.ones(3)
 
     @classmethod
-    def read(cls, path: str | Path, *, scale: float = 1.0, **place: Any) -> "Mesh":
+    def read(cls, path: str | Path, *, scale: VectorLike = 1.0, **place: Any) -> "Mesh":
         """From a file that trimesh reads, such as STL, OBJ, PLY or GLB.
 
-        **Arguments:** `scale` [m per unit of the file]; `position`, `orientation` and `color` as of all shapes.
+        **Arguments:** `scale` [m per unit of the file], one number or one along each axis, where a negative one
+        mirrors; `position`, `orientation` and `color` as of all shapes.
 
         **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs.
         """
@@ -155,10 +177,12 @@ class Mesh(AbstractShape):
             import trimesh
         except ImportError as error:
             raise ImportError('Mesh.read needs trimesh; install it with: pip install "jaxmb[view]"') from error
-        mesh = trimesh.load_mesh(path)
+        mesh, scales = trimesh.load_mesh(path), np.broadcast_to(np.asarray(scale, float), (3,))
         if not len(mesh.faces):
             raise ValueError(f"Mesh.read: there are no triangles in {str(path)!r}.")
-        return cls(scale * np.asarray(mesh.vertices), np.asarray(mesh.faces), **place)
+        # A mirrored triangle is seen from its other side.
+        faces = np.asarray(mesh.faces)[:, :: -1 if np.prod(scales) < 0 else 1]
+        return cls(scales * np.asarray(mesh.vertices), faces, **place)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -197,6 +221,14 @@ def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place:
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     return Cylinder(radius, length, position=0.5 * (start + end), orientation=along(end - start), **place)
+
+
+def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
+    """A cylinder along its own z axis with a half ball at either end; `length` [m]: without these."""
+    middle = Cylinder(radius, length, **place)
+    half = rot.rotate(middle.orientation, np.array([0.0, 0.0, 0.5 * length]))
+    ends = (Sphere(radius, **(place | {"position": middle.position + way * half})) for way in (-1.0, 1.0))
+    return middle, *ends
 
 
 def wheel(

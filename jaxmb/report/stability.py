@@ -316,9 +316,10 @@ def _compiled(system, state, t1, rtol, solver):
     )
 
 
-def _natural(system: Any, ys: State) -> tuple[np.ndarray, np.ndarray]:
+def _natural(system: Any, ys: State) -> tuple[np.ndarray, ...]:
     scaled = lambda values, scale: np.asarray(values) / np.asarray(scale)
-    return scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
+    own = scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
+    return own if ys.z is None else (*own, scaled(ys.z, system.state_scale()))
 
 
 def _distance(motion: Any, truth: Any) -> float:

@@ -229,7 +229,9 @@ def _reach(shape):
     """The largest distance of a point of a shape from its position."""
     if shape.primitive == "own":
         return float(np.max(np.linalg.norm(shape.vertices, axis=1)))
-    half = {"box": (0.5, 0.5, 0.5), "sphere": (1.0, 0.0, 0.0), "cylinder": (1.0, 0.0, 0.5)}[shape.primitive]
+    if shape.primitive == "sphere":
+        return float(np.max(shape.scale))
+    half = {"box": (0.5, 0.5, 0.5), "cylinder": (1.0, 0.0, 0.5)}[shape.primitive]
     return float(np.linalg.norm(half * shape.scale))
 
 
