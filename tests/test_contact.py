@@ -2,10 +2,12 @@
 
 import dataclasses
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_quickly
 from oracles import tracked_vehicle as oracle
 from scipy.integrate import quad
 
@@ -264,6 +266,28 @@ def test_point_bounces_without_loss():
 def primitives(part):
     wrenches = lambda q, v: part.resolve(PLANE, jnp.zeros((3, 3))).wrenches(PLANE, q, v, 0.0)
     return str(jax.make_jaxpr(wrenches)(jnp.zeros((3, 3)), jnp.zeros((3, 3))))
+
+
+@pytest.mark.long
+def test_derivatives_through_an_impact_converge():
+    """A disc bounces off a floor whose level is a parameter: what it gains in height is twice that of the floor."""
+    floor = planar.Contact(
+        "floor", ("disc",), radius=0.2, terrain=terrain.Flat(level=0.0), normal=contact.Linear(4e4), smoothing=1e-4
+    )
+    disc = planar.Body("disc", mass=2.0, inertia=0.04, position=(0.0, 0.3), velocity=(0.0, -3.0))
+    system = mb.Scene([disc], forces=[floor]).compile()
+    state = mb.assemble(system)
+
+    def height(level, rtol, adjoint=None):
+        moved = mb.with_parameters(system, {"floor.terrain.level": level})
+        return mb.simulate(moved, state, t1=0.15, rtol=rtol, adjoint=adjoint)["disc"].position[-1, 1]
+
+    reverse = jit_quickly(jax.grad(height))
+    forward = jit_quickly(jax.jacfwd(lambda level, rtol: height(level, rtol, diffrax.ForwardMode())))
+    for rtol in (1e-8, 1e-10):
+        slope = reverse(jnp.zeros(()), rtol)
+        assert abs(slope - 2.0) < 1e4 * rtol
+        np.testing.assert_allclose(forward(jnp.zeros(()), rtol), slope, rtol=1e-9)
 
 
 def test_nothing_of_friction_without_friction():

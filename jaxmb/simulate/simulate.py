@@ -136,9 +136,11 @@ def simulate(
     step to step. So a run that is differentiated also controls the error of a tangent of the state, from a start that
     excites all modes, at ten times `rtol`; its values differ within the tolerance from those of the same run without
     derivatives. A parameter that excites a mode late, after the tangent has died away, needs its `direction`:
-    `{"kick.strength": 1.0}` adds the effect of this change to the tangent. A controller of the user's is treated in the
-    same way if it is, or wraps, a `MultistepController` or a `diffrax.PIDController`; others choose the same steps with
-    and without derivatives, and so does `diffrax.diffeqsolve` when it is called directly.
+    `{"kick.strength": 1.0}` adds the effect of this change to the tangent. Where a force sets in almost at once, as in
+    an impact, derivatives are less accurate than the motion: for a ball on a stiff floor their error is about
+    5000 `rtol`. Compare them with those of a tolerance that is a hundred times tighter. A controller of the user's is
+    treated in the same way if it is, or wraps, a `MultistepController` or a `diffrax.PIDController`; others choose the
+    same steps with and without derivatives, and so does `diffrax.diffeqsolve` when it is called directly.
     """
     check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
     if inputs is not None:
