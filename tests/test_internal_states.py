@@ -379,6 +379,22 @@ def test_program_does_not_grow_with_the_number_of_motors():
     assert lines[1] < 1.1 * lines[0]
 
 
+def test_equal_controllers_are_computed_together():
+    hold = lambda t, measured, states, p: (-p["gain"] * measured["angle"], {})
+    rods = [planar.Body(f"rod{k}", mass=1.0, inertia=1 / 12, position=(2.0 * k + 0.5, 0.0)) for k in range(3)]
+    pins = [planar.Revolute(f"pin{k}", "ground", f"rod{k}", point=(2.0 * k, 0.0)) for k in range(3)]
+    angle = lambda k: f"pin{k}.angle"
+    forces = [
+        mb.Controller(f"hold{k}", hold, {"angle": angle(k)}, angle(k), parameters={"gain": 1.0 + k}) for k in range(3)
+    ]
+    system = mb.Scene(rods, joints=pins, forces=forces).compile()
+    assert len(system.forces) == 1
+    state = mb.assemble(system, fix={angle(k): 0.1 * (k + 1) for k in range(3)})
+    found = mb.simulate(system, state, t1=0.1, saveat=np.array([0.0, 0.1]))
+    expected = [-(1.0 + k) * 0.1 * (k + 1) / (1 / 12 + 1 / 4) for k in range(3)]
+    np.testing.assert_allclose([found[f"pin{k}"].angle_acceleration[0] for k in range(3)], expected, rtol=1e-10)
+
+
 def test_frames_carry_parts_with_states():
     """A tyre on a frame in the wheel is one with another centre."""
     wheel = planar.Body("wheel", mass=20.0, inertia=0.9, position=(0.0, 0.3), velocity=(3.0, 0.0))

@@ -27,7 +27,8 @@ def check_kinds(part: Any, label: str) -> None:
             if not isinstance(value, str):
                 raise ValueError(f"{label}: {field} must be a name, got {value!r}.")
         elif declared.kind in ("identities", "bodies"):
-            if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not value:
+            given = value or declared.optional
+            if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not given:
                 what = "a body" if declared.kind == "bodies" else "a part"
                 raise ValueError(f"{label}: {field} must be the name of {what} or several names, got {value!r}.")
         elif declared.kind == "choice":

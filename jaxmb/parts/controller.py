@@ -34,8 +34,9 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
     **Arguments:**
 
     - `function`: of the time [s] and dictionaries of the measurements, the internal states and the parameters. It
-        returns the force [N m, N] on the coordinate that the controller `acts_on`, or a dictionary with the force on
-        each; and the rates of the internal states by name, `{}` if there are none.
+        returns the force [N m, N] on the coordinate that the controller `acts_on`, or by their names those on several;
+        and the rates of the internal states by name, `{}` if there are none. Controllers with the same function are
+        computed together.
     - `measures`: measured quantities by the name that the function knows them by: a joint's coordinate
         `"hinge.angle"` or its rate `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m,
         m/s] (world axes), `angular_velocity` [rad/s] (in space in the axes of the body or frame), in the plane
@@ -61,9 +62,13 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
     acts_on: Any = eqx.field(static=True, converter=_names)  # pyright: ignore[reportGeneralTypeIssues]
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
-    # Filled in by the scene: joints and frames by name, and the places of their bodies among all bodies.
+    # Filled in by the scene: joints and frames, the places of their bodies among all bodies, and the names by which the
+    # function returns several forces. Numbers then stand for the names of sources in `measures` and `acts_on`, so that
+    # equal controllers of other parts stack.
     held: Any = fields.parts()
     places: Any = eqx.field(static=True, default=(), kw_only=True)
+    source_names: tuple[str, ...] = fields.names(optional=True)
+    force_names: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
     takes_bodies: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -90,12 +95,24 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     @property
     def bodies(self):
-        of_source = lambda name: self.held[name].bodies if self._is_joint(name) else (name,)
-        return tuple(dict.fromkeys(body for name, _ in self.places for body in of_source(name)))
+        of_source = lambda k: self.held[k].bodies if self._is_joint(k) else (self.source_names[int(k)],)
+        return tuple(dict.fromkeys(body for k, _ in self.places for body in of_source(k)))
 
     def of_sources(self, parts, places):
-        held = {name: part for name, part in zip(self.sources, parts, strict=True) if part is not None}
-        return self.with_fields(held=held, places=tuple(zip(self.sources, places, strict=True)))
+        numbers = {name: str(k) for k, name in enumerate(self.sources)}
+
+        def numbered(name):
+            source, quantity = name.split(".")
+            return f"{numbers[source]}.{quantity}"
+
+        return self.with_fields(
+            held={str(k): part for k, part in enumerate(parts) if part is not None},
+            places=tuple((str(k), own) for k, own in enumerate(places)),
+            measures=tuple((label, numbered(name)) for label, name in self.measures),
+            acts_on=tuple(numbered(name) for name in self.acts_on),
+            source_names=self.sources,
+            force_names=self.acts_on if len(self.acts_on) > 1 else (),
+        )
 
     def complete(self, space, poses):
         self._check_names(space)
@@ -108,10 +125,17 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
             acted = name in self.acts_on
             allowed = known if acted or not self._is_joint(source) else [*known, *(f"{own}_rate" for own in known)]
             if acted and not self._is_joint(source):
-                raise ValueError(f"{self.label}: it acts on coordinates of joints, and {source!r} is none.")
+                raise ValueError(
+                    f"{self.label}: it acts on coordinates of joints, and {self.source_names[int(source)]!r} is none."
+                )
             if quantity not in allowed:
-                listed = [f"{source}.{own}" for own in allowed]
-                raise ValueError(f"{self.label}: {unknown('quantity', name, listed)}")
+                listed = [self._called(f"{source}.{own}") for own in allowed]
+                raise ValueError(f"{self.label}: {unknown('quantity', self._called(name), listed)}")
+
+    def _called(self, name):
+        """The name of a quantity, with that of its source in place of the number."""
+        source, quantity = name.split(".")
+        return f"{self.source_names[int(source)]}.{quantity}"
 
     def _is_joint(self, source):
         return source in self.held and not isinstance(self.held[source], AbstractFrame)
@@ -148,12 +172,13 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     def _row(self, space, poses, forces):
         """The forces [N m, N] on all coordinates, raveled one after the other."""
-        forces = forces if isinstance(forces, dict) else {self.acts_on[0]: forces}
-        if set(forces) != set(self.acts_on):
-            raise ValueError(f"the function of {self.label} must return the force on {' and '.join(self.acts_on)}.")
+        names = self.force_names or tuple(map(self._called, self.acts_on))
+        forces = forces if self.force_names else {names[0]: forces}
+        if not isinstance(forces, dict) or set(forces) != set(names) or isinstance(forces[names[0]], dict):
+            raise ValueError(f"the function of {self.label} must return the force on {' and '.join(names)}.")
         rows = []
-        for name in self.acts_on:
-            shape, force = self._coordinate(space, poses, name).shape, jnp.asarray(forces[name], poses.dtype)
+        for name, own in zip(names, self.acts_on, strict=True):
+            shape, force = self._coordinate(space, poses, own).shape, jnp.asarray(forces[name], poses.dtype)
             if force.shape != shape:
                 raise ValueError(
                     f"the function of {self.label} must return a force of shape {shape} on {name!r}, got {force.shape}."

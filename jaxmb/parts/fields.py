@@ -159,9 +159,12 @@ def name() -> Any:
     return _field(Declaration("identity"))
 
 
-def names() -> Any:
-    """The names of any number of other parts that it refers to; a single name becomes a tuple."""
-    return _field(Declaration("identities"), converter=_NAMES)
+def names(*, optional: bool = False) -> Any:
+    """The names of any number of other parts that it refers to; a single name becomes a tuple. `optional`: none by
+    default.
+    """
+    keyword = {"default": (), "kw_only": True} if optional else {}
+    return _field(Declaration("identities", optional=optional), converter=_NAMES, **keyword)
 
 
 def body_name(*, default: Any = dataclasses.MISSING) -> Any:
