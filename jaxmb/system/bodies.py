@@ -154,7 +154,8 @@ class AbstractBodySystem(AbstractSystem):
     @property
     def rows(self) -> tuple[tuple[str, int], ...]:
         """Name and number within its part of every row of A."""
-        return tuple((name, k) for g in self.joints for name in g.group.names for k in range(g.rows))
+        groups = [(g.group.names, range(g.rows)) for g in self.joints]
+        return tuple((name, k) for names, rows in groups for name in names for k in rows)
 
     def coordinate_names(self):
         return coordinate_names(self.layout, self.body_names)
@@ -411,11 +412,9 @@ class AbstractBodySystem(AbstractSystem):
         return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
 
     def normalize_fixed(self, q, fixed):
-        whole = [
-            row[3:]
-            for row in self.layout.pose_index[:-1]
-            if self.spatial and row[-1] < self.nq and fixed[row[3:]].all()
-        ]
+        rotating = np.array(self.layout.rotates) & self.spatial
+        turns = self.layout.pose_index[:-1][rotating, 3:]
+        whole = turns[np.all(fixed[turns], axis=1)]
         for index in whole:
             q = q.at[index].set(normalize(q[index]))
         return q, len(whole)
