@@ -323,8 +323,9 @@ def _check_nearby(system, q, parts, found, scale):
             pivots, sizes = eliminate(parts, blocks, layout, *given)
             # What remains of a row is not zero where it became a pivot.
             off = np.isin(place, pivots.order[: pivots.rank]).astype(q.dtype)
-            by = lambda bad: {k for r in place[bad].tolist() for k in pivots.shares(r) if not later[k]}
-            return Remains(off, sizes[place], lambda bad: own.rows[sorted(by(bad))])
+            implied_by = {share.row: share.by for share in own.shares}
+            by = lambda bad: np.unique(np.concatenate([implied_by[row] for row in dropped[bad].tolist()]))
+            return Remains(off, sizes[place], by)
 
         return Nearby(unmet, step, remains)
 
