@@ -23,7 +23,7 @@ from .parts.base import (
 )
 from .parts.boundary import check_kernels
 from .parts.contents import anonymous, inner_parts
-from .parts.fields import declarations
+from .parts.fields import declarations, values_of
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
@@ -223,14 +223,15 @@ def _check_kinds(scene: Scene):
 def _check_names(scene: Scene):
     seen = {GROUND}
     for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
-        if part.name in seen:
+        name = part.name
+        if name in seen:
             raise ValueError(
-                f"The name {part.name!r} is used twice; every body, joint, force and frame needs its own"
-                + (" ('ground' is the fixed world)." if part.name == GROUND else ".")
+                f"The name {name!r} is used twice; every body, joint, force and frame needs its own"
+                + (" ('ground' is the fixed world)." if name == GROUND else ".")
             )
-        if not part.name or "." in part.name:
+        if not name or "." in name:
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
-        seen.add(part.name)
+        seen.add(name)
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
@@ -245,11 +246,12 @@ def _check_names(scene: Scene):
         elif isinstance(part, _OF_OTHERS):
             _check_sources(part, "joint", joints)
         elif isinstance(part, AbstractLink):
-            for name in part.bodies:
+            own = part.bodies
+            for name in own:
                 if name not in known:
                     raise ValueError(f"{part.label}: {unknown('body', name, known)}")
-            twice = [name for name in part.bodies if part.bodies.count(name) > 1]
-            if twice and (twice[0] != GROUND or set(part.bodies) == {GROUND}):
+            twice = [name for name in own if own.count(name) > 1]
+            if twice and (twice[0] != GROUND or set(own) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
 
 
@@ -294,12 +296,14 @@ def _held(part):
 
 def _length(parts, guess, layout):
     """The scene's size [m]: the largest arm of a joint or distance between neighbours."""
-    sizes = [
-        float(np.max(np.abs(getattr(part, name)), initial=0.0))
+    lengths = (
+        values[name]
         for part in parts
+        for values in [values_of(part)]
         for name, own in declarations(type(part)).items()
-        if own.sizes and getattr(part, name) is not None
-    ]
+        if own.sizes
+    )
+    sizes = [float(np.max(np.abs(value), initial=0.0)) for value in lengths if value is not None]
     size = max(sizes, default=0.0)
     if size == 0.0:
         dimension = layout.space.dimension

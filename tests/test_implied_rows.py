@@ -2,6 +2,7 @@
 motion starts, and along the motion. Scripts of a user's kind.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import lagrangian, mechanisms, planar
+from jaxmb import lagrangian, mechanisms, planar, spatial
 from jaxmb.manifold import Baumgarte
+from jaxmb.states import independence, structure
 
 GRAVITY = mb.Gravity((0.0, -9.81))
 
@@ -100,6 +102,93 @@ def test_a_four_bar_near_its_flat_pose_is_accepted():
     lifted = [(0.0, 0.0), (np.cos(0.01), np.sin(0.01)), (2.0 + np.cos(0.01), np.sin(0.01)), (2.0, 0.0)]
     system = chain(lifted, [1.0, 2.0, 1.0]).compile()
     assert system.velocity_rank == 8
+
+
+# Components of many rows, without dense matrices
+
+
+def ladder(n):
+    """Two chains of spatial bodies on parallel hinges with rungs between them; three rows of each loop are implied."""
+    bodies, joints = [], []
+
+    def body(name, x, y):
+        bodies.append(spatial.Body(name, mass=1.0, inertia=np.diag([0.1, 0.1, 0.1]), position=(x, y, 0.0)))
+
+    def hinge(name, a, b, x, y):
+        joints.append(spatial.Revolute(name, a, b, point=(x, y, 0.0), axis=(0.0, 0.0, 1.0)))
+
+    for k in range(n):
+        for side, x in (("l", 0.0), ("r", 1.0)):
+            body(f"{side}{k}", x, -k - 0.5)
+            hinge(f"{side}{k}_pin", f"{side}{k - 1}" if k else "ground", f"{side}{k}", x, -float(k))
+        body(f"rung{k}", 0.5, -k - 0.8)
+        hinge(f"rung{k}_l", f"l{k}", f"rung{k}", 0.0, -k - 0.8)
+        hinge(f"rung{k}_r", f"rung{k}", f"r{k}", 1.0, -k - 0.8)
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81, 0.0))])
+
+
+@pytest.fixture
+def sparse(monkeypatch):
+    """Let all components count as those of many rows."""
+    monkeypatch.setattr(structure, "subsets", functools.partial(independence.subsets, dense=-1))
+
+
+@pytest.mark.long
+def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
+    n = 4
+    systems = [ladder(n).compile()]
+    monkeypatch.setattr(structure, "subsets", functools.partial(independence.subsets, dense=-1))
+    systems.append(ladder(n).compile())
+    for system in systems:
+        A = np.asarray(system.jacobian(0.0, system.guess.q, system.guess.u))
+        assert system.velocity_rank == np.linalg.matrix_rank(A) and len(system.implied) == 3 * n
+        of_rows = {row: k for k, row in enumerate(system.rows)}
+        dropped = [of_rows[own.name, own.row] for own in system.implied]
+        kept = np.setdiff1d(np.arange(len(A)), dropped)
+        assert np.linalg.matrix_rank(A[kept]) == kept.size
+        for own, row in zip(system.implied, dropped, strict=True):
+            by = np.array([k for k in kept if system.rows[k][0] in (*own.by, own.name)])
+            shares = np.linalg.lstsq(A[by].T, A[row], rcond=None)[0]
+            np.testing.assert_allclose(A[by].T @ shares, A[row], rtol=0, atol=1e-12)
+            names = {system.rows[k][0] for k in by[np.abs(shares) > 1e-6]} - {own.name}
+            assert names == set(own.by)
+
+
+@pytest.mark.long
+def test_a_long_ladder_has_no_dense_matrix(monkeypatch):
+    n, largest = 300, 0
+
+    def watched(function):
+        def call(matrix, *arguments, **options):
+            nonlocal largest
+            largest = max(largest, *matrix.shape)
+            return function(matrix, *arguments, **options)
+
+        return call
+
+    for name in ("lstsq", "svd"):
+        monkeypatch.setattr(np.linalg, name, watched(getattr(np.linalg, name)))
+    system = ladder(n).compile()
+    assert len(system.implied) == 3 * n and system.velocity_rank == system.nu - n
+    assert {own.name for own in system.implied} <= {f"rung{k}_{side}" for k in range(n) for side in "lr"} | {
+        f"{side}{k}_pin" for k in range(n) for side in "lr"
+    }
+    assert largest <= 1000
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", [case for case in SINGULAR if "bar" in case])
+def test_singular_poses_are_refused_without_dense_matrices(sparse, case):
+    with pytest.raises(ValueError, match=r"is singular: row \d of .* implied by .* there, but not near it"):
+        SINGULAR[case][0]()
+
+
+@pytest.mark.long
+def test_motions_that_contradict_are_refused_without_dense_matrices(sparse):
+    with pytest.raises(ValueError, match=r"row 0 of \w+ is implied by \w+ at t = 0, but no more at t = "):
+        crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
+    with pytest.raises(ValueError, match="first, second contradict each other"):
+        crank(driver("first", lambda t: t), driver("second", lambda t: 2.0 * t)).compile()
 
 
 # Prescribed motions

@@ -138,3 +138,13 @@ def test_coordinates_of_joints_are_held(monkeypatch):
     h = 1e-5
     difference = (own(0.3 + h) - own(0.3 - h)) / (2 * h)
     np.testing.assert_allclose(found[1], difference, rtol=0, atol=1e-8 * (1 + np.max(np.abs(difference))))
+
+
+def test_poses_that_close_are_kept():
+    """The given poses of a machine that closes are its closest configuration; others are not."""
+    system = mb.mechanisms.get("tree", n=5).system
+    kept = mb.assemble(system)
+    np.testing.assert_array_equal(kept.q, system.guess.q)
+    opened = mb.assemble(system, mb.State(system.guess.q.at[0].add(1e-9), system.guess.u))
+    np.testing.assert_allclose(system.position_residual(0.0, opened.q), 0.0, rtol=0, atol=1e-14)
+    assert 0 < np.max(np.abs(opened.q - system.guess.q)) <= 1e-9

@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from compiling import jit_quickly
 from oracles.sprung_chain import sprung_chain
@@ -167,13 +168,13 @@ def test_resolvents_are_those_of_dense_matrices(build, n):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("damping", [0.0, 20.0])
-def test_the_spectrum_is_that_near_the_step(damping):
+@pytest.mark.parametrize("n, damping", [(6, 0.0), (6, 20.0), (2, 20.0)])
+def test_the_spectrum_is_that_near_the_step(n, damping):
     """Of the dense Jacobian in independent coordinates, by `linearise` at rest: the eigenvalue nearest to an
-    undamped vibration with `|h λ|` of a few, which decides on formulas, is found.
+    undamped vibration with `|h λ|` of a few, which decides on formulas, is found, and nothing that is none.
     """
-    system = chain(6, stiffness=1e3, damping=damping)
-    hanging = mb.assemble(system, fix={f"rod{k}.angle": -np.pi / 2 for k in range(6)})
+    system = chain(n, stiffness=1e3, damping=damping)
+    hanging = mb.assemble(system, fix={f"rod{k}.angle": -np.pi / 2 for k in range(n)})
     expected = np.asarray(mb.linearise(system, hanging).eigenvalues)
     jacobian = motion_jacobian(system, 0.0, hanging)
     r = jnp.asarray(1 / (1.4 * np.max(np.abs(expected.imag)) * (0.8 - 0.6j)))
@@ -182,6 +183,8 @@ def test_the_spectrum_is_that_near_the_step(damping):
     nearest = expected[np.argsort(np.abs(1 / (1 - complex(r) * expected)))[-3:]]
     for own in nearest:
         assert np.min(np.abs(found - own)) <= 1e-6 * abs(own)
+    for own in found[found != 0]:
+        assert np.min(np.abs(expected - own)) <= 1e-6 * abs(own)
 
 
 # Motions
@@ -242,6 +245,48 @@ def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
         assert max(math.prod(map(int, shape[:-1].split("x"))) for shape in found) < 3000 * n
         lines.append(text.count("\n"))
     assert lines[1] <= 1.3 * lines[0]
+
+
+@pytest.mark.long
+def test_events_and_dense_output():
+    """The first rod reaches a given angle, and states between steps are on the constraints."""
+    system, target = chain(2), 0.2
+    event = diffrax.Event(lambda t, y, args, **kwargs: y.q[2] - target, optx.Newton(1e-10, 1e-10))
+    saveat = diffrax.SaveAt(ts=jnp.array([0.02, 0.07]), t1=True, dense=True)
+    sol = run(system, mb.assemble(system), rtol=1e-8, t1=1.0, manifold=Projection(), event=event, saveat=saveat)
+    assert sol.result == mb.RESULTS.event_occurred
+    end = float(sol.ts[2])
+    assert 0.07 < end < 1.0
+    times = np.array([0.02, 0.05, 0.07, end])
+    expected = sprung_chain(times, n=2, stiffness=1e4, damping=20.0)
+    angles = lambda y: np.concatenate([y.q[:, 2::3], y.u[:, 2::3]], axis=1)
+    between = sol.at(jnp.asarray(times))
+    assert expected[-1, 0] == pytest.approx(target, abs=1e-8)
+    np.testing.assert_allclose(angles(sol.ys)[:3], expected[[0, 2, 3]], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(angles(between), expected, rtol=0, atol=1e-7)
+    for y in (sol.ys, between):
+        for k in range(3):
+            np.testing.assert_allclose(system.position_residual(0.0, y.q[k]), 0.0, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(system.velocity_residual(0.0, y.q[k], y.u[k]), 0.0, rtol=0, atol=1e-11)
+
+
+@pytest.mark.long
+def test_a_batch_equals_the_loop():
+    system = chain(2, curl=0.2)
+    state = mb.assemble(system)
+
+    def end(mass, stiffness):
+        moved = mb.with_parameters(system, {"rod1.mass": mass, "spring1.stiffness": jnp.zeros(3).at[2].set(stiffness)})
+        sol = run(moved, state, rtol=1e-8, t1=0.05, manifold=Projection())
+        return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]), sol.stats["num_steps"]
+
+    cases = jnp.array([0.5, 1.0, 4.0]), jnp.array([1e3, 1e4, 1e5])
+    single = jit_quickly(end)
+    alone, steps = zip(*(single(*case) for case in zip(*cases, strict=True)), strict=True)
+    assert len(set(map(int, steps))) == 3
+    together, of_all = jit_quickly(jax.vmap(end))(*cases)
+    np.testing.assert_array_equal(of_all, steps)
+    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-10)
 
 
 @pytest.mark.long

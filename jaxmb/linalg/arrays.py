@@ -9,6 +9,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+# Types of values that hold no tracers.
+_CONCRETE = (float, int, np.ndarray, np.generic)
+
 
 def namespace(*arrays: Any) -> ModuleType:
     """`numpy` if all arrays are NumPy's, else `jax.numpy`."""
@@ -17,6 +20,8 @@ def namespace(*arrays: Any) -> ModuleType:
 
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of a pytree is traced."""
+    if isinstance(tree, _CONCRETE):
+        return False
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 

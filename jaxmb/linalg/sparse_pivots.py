@@ -8,6 +8,7 @@ Science 3(3), 1957; I. S. Duff, A. M. Erisman and J. K. Reid, "Direct Methods fo
 (threshold pivoting).
 """
 
+import dataclasses
 import heapq
 from collections.abc import Sequence
 
@@ -20,10 +21,39 @@ _THRESHOLD = 0.1
 _SEARCHED = 4
 
 
-def pivot_rows(
-    rows: Sequence[dict[int, float]], level: Sequence[int], *, zero: float, rounding: float
-) -> tuple[Int[np.ndarray, "m"], int]:
-    """The rows in the order in which they became pivots, then those that depend on them, and the number of the first.
+@dataclasses.dataclass(frozen=True)
+class SparsePivots:
+    """The result of an elimination.
+
+    **Fields:** `order`: the rows in the order in which they became pivots, then those that depend on them; `rank`, the
+    number of the first; `ratios`: for each row the multiples of pivots, as these were then, that were subtracted.
+    """
+
+    order: Int[np.ndarray, "m"]
+    rank: int
+    ratios: dict[int, list[tuple[int, float]]]
+
+    def shares(self, row: int) -> dict[int, float]:
+        """The multiples of rows that became pivots whose sum is this one, up to what was left of it."""
+        place = {pivot: k for k, pivot in enumerate(self.order[: self.rank].tolist())}
+        own = dict(self.ratios[row])
+        out: dict[int, float] = {}
+        # A pivot was a row less multiples of those before it: the last one first.
+        heap = [-place[pivot] for pivot in own]
+        heapq.heapify(heap)
+        while heap:
+            pivot = int(self.order[-heapq.heappop(heap)])
+            out[pivot] = own.pop(pivot)
+            for before, ratio in self.ratios[pivot]:
+                if before not in own:
+                    own[before] = 0.0
+                    heapq.heappush(heap, -place[before])
+                own[before] -= out[pivot] * ratio
+        return out
+
+
+def pivot_rows(rows: Sequence[dict[int, float]], level: Sequence[int], *, zero: float, rounding: float) -> SparsePivots:
+    """Independent rows, and how the others depend on them.
 
     **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
     become pivots first; `zero`: the largest entry that may be left of a row that depends on others; `rounding`: entries
@@ -34,16 +64,19 @@ def pivot_rows(
     for own in sorted(set(level)):
         kept += elimination.run([r for r in range(len(rows)) if level[r] == own], zero)
     others = sorted(set(range(len(rows))) - set(kept))
-    return np.array(kept + others, int), len(kept)
+    return SparsePivots(np.array(kept + others, int), len(kept), elimination.ratios)
 
 
 class _Elimination:
-    """Rows that are left, by column; and for each column those of the rows that have an entry in it."""
+    """Rows that are left, by column; for each column those of the rows that have an entry in it; and for each row the
+    multiples of others that were subtracted.
+    """
 
     def __init__(self, rows, rounding):
         self.rounding = rounding
         self.rows = {r: dict(own) for r, own in enumerate(rows)}
         self.columns: dict[int, set[int]] = {}
+        self.ratios: dict[int, list[tuple[int, float]]] = {r: [] for r in self.rows}
         for r, own in self.rows.items():
             for c in own:
                 self.columns.setdefault(c, set()).add(r)
@@ -108,6 +141,7 @@ class _Elimination:
         for r in changed:
             own = self.rows[r]
             ratio = own.pop(column) / value
+            self.ratios[r].append((row, ratio))
             for c, entry in pivot.items():
                 new = own.get(c, 0.0) - ratio * entry
                 if abs(new) > self.rounding:

@@ -31,6 +31,10 @@ class Shoes:
     Shoes touch sprocket, idler and wheels on their inner side, and the ground at two points, a quarter of their pitch
     from their middle.
 
+    Stiffness and damping are those of one shoe, not of a length of track. Discs rest on the flat sides of shoes: one
+    sinks in between shoes that bend towards it. The default track runs without this; one of half the pitch, with the
+    same numbers, buckles under the wheels in half a second.
+
     **Fields:** `number` of shoes, default the one for which the idler stands closest to its design position; `pitch`
     [m], the distance of their pins, and `height` [m]; `mass` [kg] of a shoe; radii [m] and masses [kg] of `sprocket`
     and `idler`, which are discs; `rim_stiffness` [N/m] of the contact of shoes with these and with wheels;

@@ -71,7 +71,8 @@ class AbstractPart(eqx.Module):
 
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
-        missing = {name: fields.as_parameter(value) for name, value in values.items() if getattr(self, name) is None}
+        own = fields.values_of(self)
+        missing = {name: fields.as_parameter(value) for name, value in values.items() if own[name] is None}
         return type(self).with_fields(self, **missing) if missing else self
 
     def named(self, name: str) -> Self:
@@ -81,8 +82,8 @@ class AbstractPart(eqx.Module):
     def with_fields(self, **values: Any) -> Self:
         """A copy with some fields replaced."""
         out = object.__new__(type(self))
-        for field in fields.field_names(type(self)):
-            object.__setattr__(out, field, values[field] if field in values else getattr(self, field))
+        for field, value in (fields.values_of(self) | values).items():
+            object.__setattr__(out, field, value)
         return out
 
 
@@ -133,8 +134,8 @@ class _Bodies:
     def __get__(self, part: Any, owner: type | None = None) -> Any:
         if part is None:
             return self
-        declared = fields.declarations(type(part))
-        return tuple(getattr(part, name) for name, own in declared.items() if own.kind == "body")
+        values = fields.values_of(part)
+        return tuple(values[name] for name, own in fields.declarations(type(part)).items() if own.kind == "body")
 
 
 class AbstractLaw(eqx.Module):
@@ -344,9 +345,9 @@ class AbstractNonIdeal(AbstractPart):
 
 def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
     """A copy with world points and directions made body-fixed, and directions normalised."""
-    declared, values = fields.declarations(type(part)), {}
+    declared, given, values = fields.declarations(type(part)), fields.values_of(part), {}
     for name, own in declared.items():
-        value = getattr(part, name)
+        value = given[name]
         if own.centred and value is None:
             values[name] = fields.as_parameter(np.zeros(space.dimension))
         elif own.gives:
@@ -365,8 +366,9 @@ def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
 
 def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
     """Check that a point or direction is given either in the world or in the body frames."""
-    given = [name for name in own.gives if getattr(part, name) is not None]
-    in_world = getattr(part, world) is not None
+    values = fields.values_of(part)
+    given = [name for name in own.gives if values[name] is not None]
+    in_world = values[world] is not None
     if len(own.gives) == 1:
         if in_world == bool(given) and (in_world or own.needed):
             (fixed,) = own.gives

@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..linalg.arrays import is_traced
-from .fields import Declaration, declarations
+from .fields import Declaration, declarations, values_of
 
 # A direction counts as a unit vector if its length differs from one by no more than this.
 _UNIT = 1e-6
@@ -16,8 +16,9 @@ _UNIT = 1e-6
 
 def check_kinds(part: Any, label: str) -> None:
     """Raise a `ValueError` if the value of a field is not of the declared kind."""
+    values = values_of(part)
     for field, declared in declarations(type(part)).items():
-        value = getattr(part, field)
+        value = values[field]
         if declared.is_number:
             if not _is_number(value) and not (value is None and declared.optional):
                 raise ValueError(
@@ -73,8 +74,9 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
     """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
     vectors, in the part and its laws.
     """
+    values = values_of(part)
     for field, declared in declarations(type(part)).items():
-        value, shown = getattr(part, field), prefix + field
+        value, shown = values[field], prefix + field
         if declared.kind == "law":
             if value is not None:
                 check_numbers(value, label, dimension, f"{shown}.")

@@ -1,19 +1,20 @@
 """What a part contains: its parameters, its internal states, and other parts that it holds."""
 
+import functools
 from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 
-from .fields import Declaration, declarations, field_names
+from .fields import Declaration, declarations, field_names, values_of
 
 
 def anonymous(part: Any) -> Any:
     """The part without the names that distinguish stacked parts, and without the initial guess of bodies."""
-    declared = declarations(type(part))
+    declared, values = declarations(type(part)), values_of(part)
     out = object.__new__(type(part))
     for field in field_names(type(part)):
-        value, kind = getattr(part, field), declared[field].kind if field in declared else None
+        value, kind = values[field], declared[field].kind if field in declared else None
         if kind in ("identity", "body"):
             value = ""
         elif kind in ("identities", "bodies"):
@@ -30,17 +31,18 @@ def anonymous(part: Any) -> Any:
 
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
-    for name, own in declarations(type(part)).items():
+    for name in _fields_of_parts(type(part)):
         value: Any = getattr(part, name)
-        if own.kind == "part" and value is not None:
-            held = [((*prefix, name), value)]
-        elif own.kind == "parts":
-            held = [((*prefix, name, key), inner) for key, inner in (value or {}).items()]
-        else:
-            continue
-        for keys, inner in held:
+        held = value if isinstance(value, dict) else {} if value is None else {None: value}
+        for key, inner in held.items():
+            keys = (*prefix, name) if key is None else (*prefix, name, key)
             yield keys, inner
             yield from inner_parts(inner, keys)
+
+
+@functools.cache
+def _fields_of_parts(cls: type) -> tuple[str, ...]:
+    return tuple(name for name, own in declarations(cls).items() if own.kind in ("part", "parts"))
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import is_traced
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
 # converters of these helpers.
@@ -88,6 +88,13 @@ def declarations(cls: type) -> dict[str, Declaration]:
     return {field.name: field.metadata["declaration"] for field in fields if "declaration" in field.metadata}
 
 
+def values_of(part: Any) -> dict[str, Any]:
+    """The values of all fields of a part by name, at once: each attribute of a module that is asked for takes a
+    microsecond, too long for those of thousands of parts.
+    """
+    return vars(part)
+
+
 @functools.cache
 def field_names(cls: type) -> tuple[str, ...]:
     """The names of all fields of a class, declared or not."""
@@ -104,13 +111,16 @@ def as_parameter(value: Any) -> Any:
 
     **Raises:** `ValueError` for anything but a real number or an array of real numbers.
     """
-    if not is_traced(value):
-        kind = np.asarray(value).dtype.kind if not isinstance(value, dict) else "O"
-        if kind not in "fiub":
-            raise ValueError(f"expected a real number or an array of real numbers, got {value!r}")
-    out = as_array(value, jnp.result_type(float))
-    if isinstance(out, np.ndarray):
-        out.flags.writeable = False
+    # Much faster than `jnp.result_type`, which counts for thousands of parts.
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    if is_traced(value):
+        return jnp.asarray(value, dtype)
+    given = np.asarray(value) if not isinstance(value, dict) else np.array(None)
+    if given.dtype.kind not in "fiub":
+        raise ValueError(f"expected a real number or an array of real numbers, got {value!r}")
+    # A copy, since `jax.device_put` may alias NumPy memory that the caller changes later.
+    out = given.astype(dtype)
+    out.flags.writeable = False
     return out
 
 

@@ -31,6 +31,8 @@ from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 _ARNOLDI = 16
 # Eigenvalues of the inverse below this belong to components that decay, or change, in much less than a step.
 _SMALL = 0.02
+# The part of a vector outside the space of those before it that is rounding errors.
+_ROUNDING = 1e-10
 # A matrix is renewed after a step whose corrections shrank more slowly than by this factor, and in a step where more
 # than about this number of iterations would follow.
 _SLOW, _PATIENCE = 0.35, 8
@@ -153,13 +155,17 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
 
     def extend(basis, k):
         x = scale * inverses.resolvent.solve(basis[k] / scale)
-        column = jnp.zeros(m + 1, x.dtype)
+        column, whole = jnp.zeros(m + 1, x.dtype), size(x)
         # Twice is enough.
         for _ in range(2):
             along = jnp.conj(basis) @ x
             column, x = column + along, x - along @ basis
-        length = size(x).astype(x.dtype)
-        return basis.at[k + 1].set(x / length), column.at[k + 1].set(length)
+        # Small machines have fewer eigenvalues than there are steps. What is left of x then is rounding errors, whose
+        # direction is no part of a basis.
+        length = size(x)
+        found = length > _ROUNDING * whole
+        x = jnp.where(found, x / length.astype(x.dtype), jnp.zeros_like(x))
+        return basis.at[k + 1].set(x), column.at[k + 1].set(jnp.where(found, length, 0.0).astype(x.dtype))
 
     _, columns = lax.scan(extend, basis, jnp.arange(m))
     found = eigenvalues(columns[:, :m].T)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..linalg.sparse_pivots import pivot_rows
+from ..linalg.sparse_pivots import SparsePivots, pivot_rows
 from ..system.block_cut_tree import components
 from ..system.layout import Layout
 
@@ -20,6 +20,8 @@ from ..system.layout import Layout
 _ZERO = 0.5
 # A dense component of so many rows takes 0.1 s, and the time grows with the cube.
 _DENSE = 300
+# A row is implied by others whose share of it, both of unit norm, exceeds this.
+_NEGLIGIBLE = 1e-6
 
 
 class Part(NamedTuple):
@@ -34,7 +36,8 @@ class Subset(NamedTuple):
     """Rows of A that depend on each other only, in columns that determine their rank.
 
     **Fields:** `parts`: their numbers; `rows` and `columns` of A; `kept`: those of the rows that are independent, of
-    low levels first; `dropped`: the others.
+    low levels first; `dropped`: the others; `is_sparse`: whether there are too many rows for dense matrices; then
+    `shares` of kept rows in those that are dropped.
     """
 
     parts: tuple[int, ...]
@@ -42,6 +45,16 @@ class Subset(NamedTuple):
     columns: Int[np.ndarray, "n"]
     kept: Int[np.ndarray, "r"]
     dropped: Int[np.ndarray, "d"]
+    is_sparse: bool
+    shares: tuple["Share", ...]
+
+
+class Share(NamedTuple):
+    """A `row` that is the sum of these multiples of the rows `by`."""
+
+    row: int
+    by: Int[np.ndarray, "k"]
+    multiples: Float[np.ndarray, "k"]
 
 
 def matrix(
@@ -81,21 +94,44 @@ def subsets(
     """
     ground = layout.bodies
     vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(parts)]
+    found = components(vertices, ground)
+    alone = {own.joints[0]: own.top for own in found if len(own.joints) == 1}
+    regular = _regular_parts(parts, blocks, layout, scale, alone)
     out = []
-    for component in components(vertices, ground):
+    for component in found:
         bodies = sorted({body for p in component.joints for body in vertices[p]} - {component.top, ground})
         columns = layout.velocity_index[bodies].ravel() if bodies else np.zeros(0, int)
         columns = np.sort(columns[columns < layout.nu])
         rows = np.concatenate([np.arange(parts[p].first, parts[p].first + parts[p].rows) for p in component.joints])
-        if rows.size > dense:
-            order, rank = _sparse_pivot_rows(
-                parts, blocks, layout, component.joints, set(columns.tolist()), scale, level[rows]
-            )
+        own, shares, is_sparse = component.joints, (), rows.size > dense
+        if len(own) == 1 and own[0] in regular:
+            order, rank = np.argsort(level[rows], kind="stable"), rows.size
+        elif is_sparse:
+            pivots, sizes = eliminate(parts, blocks, layout, own, columns, scale, level[rows], _ZERO)
+            order, rank = pivots.order, pivots.rank
+            shares = tuple(_sparse_share(pivots, sizes, rows, r) for r in order[rank:].tolist())
         else:
-            own = matrix(parts, blocks, layout, component.joints, columns) * scale[columns]
-            order, rank = _pivot_rows(own, level[rows])
-        out.append(Subset(component.joints, rows, columns, rows[order[:rank]], rows[order[rank:]]))
+            whole = matrix(parts, blocks, layout, own, columns)
+            order, rank = _pivot_rows(whole * scale[columns], level[rows])
+            shares = _dense_shares(whole, rows, order[:rank], order[rank:]) if rank < rows.size else ()
+        out.append(Subset(own, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
     return out
+
+
+def _dense_shares(whole, rows, kept, dropped):
+    sizes, own_sizes = (np.linalg.norm(whole[own], axis=1) for own in (kept, dropped))
+    unit = np.linalg.lstsq((whole[kept] / sizes[:, None]).T, (whole[dropped] / own_sizes[:, None]).T, rcond=None)[0].T
+    found = [np.flatnonzero(np.abs(own) > _NEGLIGIBLE) for own in unit]
+    return tuple(
+        Share(int(rows[r]), rows[kept[by]], own[by] * size / sizes[by])
+        for r, by, own, size in zip(dropped, found, unit, own_sizes, strict=True)
+    )
+
+
+def _sparse_share(pivots, sizes, rows, r):
+    own = {k: x for k, x in pivots.shares(r).items() if abs(x) > _NEGLIGIBLE}
+    by = np.array(list(own), int)
+    return Share(int(rows[r]), rows[by], np.array(list(own.values())) * sizes[r] / sizes[by])
 
 
 def absolute_parts(
@@ -108,14 +144,55 @@ def absolute_parts(
     """
     ground = motions.shape[1] - 1
     out = set()
-    for p, part in enumerate(parts):
-        if ground in part.bodies:
-            continue
-        change = np.einsum("rkv,dkv->rd", blocks[p], motions[:, list(part.bodies)])
-        size = np.einsum("rkv,dkv->rd", np.abs(blocks[p]), np.abs(motions[:, list(part.bodies)]))
-        if len(part.bodies) == 1 or np.any(np.abs(change) > np.finfo(change.dtype).eps ** 0.75 * (size + 1e-300)):
-            out.add(p)
+    for numbers, bodies, own in _alike(parts, blocks, range(len(parts))):
+        change = np.einsum("prkv,dpkv->prd", own, motions[:, bodies])
+        size = np.einsum("prkv,dpkv->prd", np.abs(own), np.abs(motions[:, bodies]))
+        moved = np.abs(change) > np.finfo(change.dtype).eps ** 0.75 * (size + 1e-300)
+        bound = np.any(moved, axis=(1, 2)) | (bodies.shape[1] == 1)
+        out.update(numbers[bound & ~np.any(bodies == ground, axis=1)].tolist())
     return frozenset(out)
+
+
+def _alike(parts, blocks, numbers):
+    """Parts with blocks of one shape: their numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for p in numbers:
+        groups.setdefault(blocks[p].shape, []).append(p)
+    for own in groups.values():
+        yield np.array(own), np.array([parts[p].bodies for p in own]), np.stack([blocks[p] for p in own])
+
+
+def _regular_parts(parts, blocks, layout, scale, held):
+    """Those of some parts whose rows are all independent, each with one of its bodies held: `_pivot_rows` of many
+    matrices at once.
+    """
+    out = set()
+    of_bodies = np.append(scale, 0.0)[np.minimum(layout.velocity_index, layout.nu)]
+    of_bodies[layout.bodies] = 0.0
+    for numbers, bodies, own in _alike(parts, blocks, held):
+        top = np.array([held[p] for p in numbers])
+        free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])
+        work = (own * free[:, None]).reshape(*own.shape[:2], -1)
+        size = np.linalg.norm(work, axis=2)
+        work = work / np.maximum(size, _floor(size))[:, :, None]
+        number, rows = np.arange(len(work)), work.shape[1]
+        independent = np.full(len(work), rows <= work.shape[2])
+        for _ in range(rows):
+            pivot = np.argmax(np.abs(work).reshape(len(work), -1), axis=1)
+            r, c = np.divmod(pivot, work.shape[2])
+            value, row = work[number, r, c], work[number, r]
+            independent &= np.abs(value) > np.finfo(work.dtype).eps ** _ZERO
+            ratio = work[number, :, c] / np.where(independent, value, 1.0)[:, None]
+            work = work - ratio[:, :, None] * row[:, None]
+            work[number, r] = 0.0
+        out.update(numbers[independent].tolist())
+    return out
+
+
+def _floor(sizes):
+    """The norm of a row that counts as zero, for each set of rows."""
+    info = np.finfo(sizes.dtype)
+    return np.maximum(info.eps**0.75 * np.max(sizes, axis=-1, initial=0.0, keepdims=True), info.tiny)
 
 
 def _pivot_rows(A, level):
@@ -123,8 +200,7 @@ def _pivot_rows(A, level):
     m, n = A.shape
     eps = float(np.finfo(A.dtype).eps)
     size = np.linalg.norm(A, axis=1)
-    floor = max(eps**0.75 * np.max(size, initial=0.0), float(np.finfo(A.dtype).tiny))
-    work = A / np.maximum(size, floor)[:, None]
+    work = A / np.maximum(size, _floor(size))[:, None]
     left = np.ones(m, bool)
     kept = []
     for own in np.unique(level):
@@ -140,20 +216,31 @@ def _pivot_rows(A, level):
     return np.array([*kept, *np.flatnonzero(left)], int), len(kept)
 
 
-def _sparse_pivot_rows(parts, blocks, layout, own, columns, scale, level):
-    """`_pivot_rows` of some parts in some columns, without a dense matrix; pivots follow from sparsity."""
+def eliminate(
+    parts: Sequence[Part],
+    blocks: Sequence[Float[np.ndarray, "rows k v"]],
+    layout: Layout,
+    own: Sequence[int],
+    columns: Int[np.ndarray, "n"],
+    scale: Float[np.ndarray, "nu"],
+    level: Int[np.ndarray, "m"],
+    zero: float,
+) -> tuple[SparsePivots, Float[np.ndarray, "m"]]:
+    """Independent rows of some parts in some columns without a dense matrix, and the norms of the rows. Pivots follow
+    from sparsity; those below this power `zero` of eps are none.
+    """
     rows: list[dict[int, float]] = []
+    known, scales = set(columns.tolist()), scale.tolist()
     for p in own:
-        index = layout.velocity_index[list(parts[p].bodies)].ravel()
-        values = blocks[p].reshape(parts[p].rows, -1)
-        for row in values:
+        index = layout.velocity_index[list(parts[p].bodies)].ravel().tolist()
+        for row in blocks[p].reshape(parts[p].rows, -1).tolist():
             entries: dict[int, float] = {}
-            for c, value in zip(index.tolist(), row.tolist(), strict=True):
-                if value and c in columns:
-                    entries[c] = entries.get(c, 0.0) + value * float(scale[c])
+            for c, value in zip(index, row, strict=True):
+                if value and c in known:
+                    entries[c] = entries.get(c, 0.0) + value * scales[c]
             rows.append(entries)
     eps = float(np.finfo(scale.dtype).eps)
-    sizes = [math.sqrt(sum(x * x for x in entries.values())) for entries in rows]
-    floor = max(eps**0.75 * max(sizes, default=0.0), float(np.finfo(scale.dtype).tiny))
-    unit = [{c: x / max(size, floor) for c, x in entries.items()} for entries, size in zip(rows, sizes, strict=True)]
-    return pivot_rows(unit, level.tolist(), zero=eps**_ZERO, rounding=4 * eps)
+    sizes = np.array([math.sqrt(sum(x * x for x in entries.values())) for entries in rows], scale.dtype)
+    sizes = np.maximum(sizes, _floor(sizes))
+    unit = [{c: x / size for c, x in entries.items()} for entries, size in zip(rows, sizes.tolist(), strict=True)]
+    return pivot_rows(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes

@@ -21,7 +21,7 @@ from ..system import AbstractSystem
 _POSES = 3
 _DISPLACEMENT = 1 / 8
 # The largest relative difference that counts as zero, as a power of eps: 1e-6.
-_ZERO = 3 / 8
+ZERO = 3 / 8
 # Rows that depend on time are followed to these times [s], as far as the coordinates move less than this.
 _TIMES = tuple(10.0**k for k in range(-9, 7))
 _NEAR = 0.2
@@ -55,13 +55,43 @@ class Group(NamedTuple):
 class Nearby(NamedTuple):
     """What is known at a displaced configuration.
 
-    **Fields:** `unmet`: Φ, and the coordinates' invariants; `of_positions(rows)`: derivatives of some of these with
-    respect to the displacement of the group `number`; `jacobian(rows)`: these rows of A, its columns scaled.
+    **Fields:** `unmet`: Φ, and the coordinates' invariants; `step(number, rows)`: the smallest displacement of a group,
+    to first order, to where these of its positions are met; `remains(number, kept, dropped)`: what remains of rows of A
+    that are no sum of others.
     """
 
     unmet: Float[np.ndarray, "mq"]
-    of_positions: Callable[[int, np.ndarray], np.ndarray]
-    jacobian: Callable[[int, np.ndarray], np.ndarray]
+    step: Callable[[int, np.ndarray], np.ndarray]
+    remains: Callable[[int, np.ndarray, np.ndarray], "Remains"]
+
+
+class Remains(NamedTuple):
+    """What is left of rows of unit norm less the multiples of others that come closest to them.
+
+    **Fields:** its norms `off`; the `sizes` of the rows; `by(bad)`: the others that have a share in some of them.
+    """
+
+    off: Float[np.ndarray, "d"]
+    sizes: Float[np.ndarray, "d"]
+    by: Callable[[np.ndarray], np.ndarray]
+
+
+def smallest_step(jacobian: Float[np.ndarray, "m n"], unmet: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n"]:
+    """`Nearby.step`, with a full matrix of derivatives."""
+    if not np.all(np.isfinite(jacobian)):
+        return np.full(jacobian.shape[1], np.nan, jacobian.dtype)
+    return np.linalg.lstsq(jacobian, -unmet, rcond=None)[0]
+
+
+def dense_remains(
+    jacobian: Float[np.ndarray, "m n"], kept: Int[np.ndarray, "r"], dropped: Int[np.ndarray, "d"]
+) -> Remains:
+    """`Nearby.remains`, with a full matrix."""
+    (own, _), (others, sizes) = (_unit_rows(jacobian[rows]) for rows in (kept, dropped))
+    share, *_ = np.linalg.lstsq(own.T, others.T, rcond=None)
+    zero = np.finfo(jacobian.dtype).eps ** ZERO
+    by = lambda bad: kept[np.any(np.abs(share[:, bad]) > zero, axis=1)]
+    return Remains(np.linalg.norm(others - share.T @ own, axis=1), sizes, by)
 
 
 def check_implied(
@@ -82,7 +112,7 @@ def check_implied(
     if not groups:
         return
     eps = float(np.finfo(dtype).eps)
-    zero = eps**_ZERO
+    zero = eps**ZERO
     shifts = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSES, size)) * eps**_DISPLACEMENT
     times = () if system.drift_free else _TIMES
     for t, shift in [*((0.0, shift) for shift in shifts), *((t, np.zeros(size)) for t in times)]:
@@ -104,11 +134,10 @@ def _settled(groups, places, evaluate, t, moved):
             break
         moved = moved.copy()
         for k in sorted(going):
-            own = near.of_positions(k, groups[k].positions)
-            if not (np.all(np.isfinite(own)) and np.max(np.abs(moved[places[k]]), initial=0.0) <= _NEAR):
+            step = near.step(k, groups[k].positions)
+            if not (np.all(np.isfinite(step)) and np.max(np.abs(moved[places[k]]), initial=0.0) <= _NEAR):
                 going.discard(k)
                 continue
-            step = np.linalg.lstsq(own, -near.unmet[groups[k].positions], rcond=None)[0]
             moved[places[k]] += step
             if np.max(np.abs(step), initial=0.0) <= small:
                 going.discard(k)
@@ -120,15 +149,12 @@ def _settled(groups, places, evaluate, t, moved):
 def _check_near(system, t, group, number, near, zero, bodies):
     """Raise the error where rows of a group that are not independent do not follow from the others."""
     dropped = np.setdiff1d(group.rows, group.independent)
-    (kept, _), (others, sizes) = (_unit_rows(near.jacobian(number, rows)) for rows in (group.independent, dropped))
-    share, *_ = np.linalg.lstsq(kept.T, others.T, rcond=None)
-    off = np.linalg.norm(others - share.T @ kept, axis=1)
+    off, sizes, by = near.remains(number, group.independent, dropped)
     of_positions = near.unmet[: system.position_rows]
     left = np.abs(np.pad(of_positions, (0, system.acceleration_rows - system.position_rows))[dropped]) / sizes
     bad = np.maximum(off, left) > zero
     if np.any(bad):
-        by = group.independent[np.any(np.abs(share[:, bad]) > zero, axis=1)]
-        raise ValueError(_not_implied(system, t, dropped[bad], by, bodies))
+        raise ValueError(_not_implied(system, t, dropped[bad], by(bad), bodies))
 
 
 def _unit_rows(jacobian):
@@ -149,14 +175,14 @@ def check_implied_as_one(
     dtype = q.dtype
 
     def evaluate(t, moved):
-        found = map(np.asarray, _evaluate(system, np.asarray(t, dtype), q, moved))
-        unmet, of_coordinates, jacobian = found
-        return Nearby(unmet, lambda _, own: of_coordinates[own], lambda _, own: jacobian[own])
+        unmet, of_coordinates, jacobian = map(np.asarray, _evaluate(system, np.asarray(t, dtype), q, moved))
+        step = lambda _, own: smallest_step(of_coordinates[own], unmet[own])
+        return Nearby(unmet, step, lambda _, kept, dropped: dense_remains(jacobian, kept, dropped))
 
     # Coordinates may need more rows than velocities: those that keep invariants of the coordinates come last.
     coordinate_rows = np.arange(system.coordinate_rows)
     first = np.append(positions, np.arange(system.position_rows, system.coordinate_rows)).astype(int)
-    of_coordinates = evaluate(0.0, np.zeros(q.size, dtype)).of_positions(0, coordinate_rows)
+    of_coordinates = np.asarray(_evaluate(system, np.zeros((), dtype), q, np.zeros(q.size, dtype))[1])
     kept = _independent_rows(of_coordinates, [*first, *np.setdiff1d(coordinate_rows, first)])
     check_implied(system, [Group(rows, independent, kept)], [np.arange(q.size)], evaluate, q.size, dtype)
 

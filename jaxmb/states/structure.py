@@ -21,20 +21,28 @@ from ..system.bodies import Implied
 from ..system.displacement import displaced
 from ..system.equation import Ranks
 from ..system.joint_graph import elimination_order, joint_order
+from ..system.padded_rows import binding_velocities, position_rows
 from ..system.rigid_bodies import RigidBodySystem
 from .assembly import violated_joints
 from .closest import tolerance
 from .closest_sparse import largest_residual, meet_sparse
-from .independence import Part, absolute_parts, matrix, subsets
-from .redundancy import Group, Nearby, check_gradients, check_implied
+from .independence import Part, absolute_parts, eliminate, matrix, subsets
+from .redundancy import (
+    ZERO,
+    Group,
+    Nearby,
+    Remains,
+    check_gradients,
+    check_implied,
+    dense_remains,
+    smallest_step,
+)
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
 # bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
 # mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
-# A row is implied by others whose share of it, both of unit norm, exceeds this.
-_NEGLIGIBLE = 1e-6
 
 
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
@@ -64,14 +72,14 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     absolute = absolute_parts(parts, blocks, np.asarray(at.as_one))
     found = subsets(parts, blocks, system.layout, scale, level, absolute)
     dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
-    components = [_shares(parts, blocks, system.layout, own) for own in found if own.dropped.size]
+    shares = [share for own in found for share in own.shares]
 
     order = joint_order(system, dropped, absolute)
-    _check_contradictions(dataclasses.replace(system, elimination=order), q, components)
-    _check_locked(system, parts, blocks, scale)
-    implied = _implied(system, components)
+    _check_contradictions(dataclasses.replace(system, elimination=order), q, shares)
+    _check_locked(system, parts, blocks, scale, found)
+    implied = _implied(system, shares)
     _check_determined(system, implied)
-    _check_nearby(of_positions, q, parts, found, scale)
+    _check_nearby(dataclasses.replace(of_positions, elimination=order), q, parts, found, scale)
     position, velocity, acceleration = (sum(int(np.sum(level[own.kept] <= k)) for own in found) for k in range(3))
     return dataclasses.replace(
         system,
@@ -81,19 +89,10 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     )
 
 
-def _shares(parts, blocks, layout, own):
-    """Rows that are dropped, the ones that are kept, and the share of these in each of those."""
-    whole = matrix(parts, blocks, layout, own.parts, own.columns)
-    kept, dropped = (whole[np.searchsorted(own.rows, rows)] for rows in (own.kept, own.dropped))
-    sizes, own_sizes = (np.linalg.norm(rows, axis=1) for rows in (kept, dropped))
-    unit = np.linalg.lstsq((kept / sizes[:, None]).T, (dropped / own_sizes[:, None]).T, rcond=None)[0].T
-    shares = np.where(np.abs(unit) > _NEGLIGIBLE, unit, 0.0) * own_sizes[:, None] / sizes
-    return own.dropped, own.kept, shares
-
-
 def _parts(system):
     """Bodies, first row and number of rows of every part."""
-    sizes = [(own, g.rows) for g in system.joints for own in g.group.bodies]
+    groups = [(g.group.bodies, g.rows) for g in system.joints]
+    sizes = [(own, rows) for bodies, rows in groups for own in bodies]
     starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
     return [Part(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
 
@@ -172,25 +171,32 @@ def _motions_as_one(system, q):
     return jnp.pad(jnp.concatenate([moved, turned]), ((0, 0), (0, 1), (0, 0)))
 
 
-def _check_contradictions(system, q, components):
+@eqx.filter_jit
+def _way_back(system, t, q, moved):
+    """The smallest displacement from there to the constraints, in multiples of scales."""
+    scale = system.velocity_scale()
+    q = displaced(system, t, q, scale * moved)
+    jacobian = binding_velocities(system, t, q, jnp.zeros_like(scale))
+    return jacobian.projector(DiagonalInertia(1 / scale**2)).cancel(position_rows(system, t, q)) / scale
+
+
+def _check_contradictions(system, q, shares):
     """Refuse rows that contradict those that imply them, in velocities or accelerations.
 
-    **Arguments:** `components`: rows that are dropped, those that imply them, and the shares of these.
+    **Arguments:** `shares` of kept rows in those that are dropped.
     """
-    if not components or not system.linear or (system.drift_free and not system.servos):
+    if not shares or not system.linear or (system.drift_free and not system.servos):
         return
     for what, asked in zip(("velocities", "accelerations"), map(np.asarray, _asked(system, q)), strict=True):
         least = 1e-6 * max(np.max(np.abs(asked), initial=0.0), 1e-6)
         names, largest = set(), 0.0
-        for dropped, kept, shares in components:
-            for row, share in zip(dropped, shares, strict=True):
-                by = kept[share != 0]
-                if row >= asked.size or np.any(by >= asked.size):
-                    continue
-                left = abs(asked[row] - share @ asked[np.minimum(kept, asked.size - 1)])
-                if left > least:
-                    names |= {system.rows[r][0] for r in (row, *by)}
-                    largest = max(largest, float(left))
+        for row, by, multiples in shares:
+            if row >= asked.size or np.any(by >= asked.size):
+                continue
+            left = abs(asked[row] - multiples @ asked[by])
+            if left > least:
+                names |= {system.rows[k][0] for k in (row, *by)}
+                largest = max(largest, float(left))
         if names:
             raise ValueError(
                 f"The {what} prescribed by {', '.join(sorted(names))} contradict each other (largest residual "
@@ -198,16 +204,20 @@ def _check_contradictions(system, q, components):
             )
 
 
-def _check_locked(system, parts, blocks, scale):
+def _check_locked(system, parts, blocks, scale, found):
     """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
 
     Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
     if at all, where they lock. No row is implied there, but some nearly are.
     """
+    independent = np.zeros(system.acceleration_rows, bool)
+    for subset in found:
+        independent[subset.kept] = True
     for bodies, own in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = np.sort(columns[columns < system.nu])
-        if sum(parts[p].rows for p in own) < len(columns):
+        # Where rows are fewer than columns, or some implied by others, the bodies move.
+        if sum(np.sum(independent[parts[p].first : parts[p].first + parts[p].rows]) for p in own) < len(columns):
             continue
         scaled = matrix(parts, blocks, system.layout, own, columns) * scale[columns]
         scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
@@ -237,7 +247,7 @@ def _connected(system, parts):
             body = parent[body]
         return body
 
-    rheonomic = [g.rheonomic for g in system.constraints for _ in g.group.bodies]
+    rheonomic = [moving for g in system.constraints for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
     for own in moving:
         for k in own[1:]:
@@ -254,7 +264,8 @@ def _connected(system, parts):
 
 def _bodies_of_joints(system):
     """Names of the bodies of each joint, without the ground."""
-    bodies = lambda own: tuple(system.body_names[k] for k in own if k < system.layout.bodies)
+    known, ground = system.body_names, system.layout.bodies
+    bodies = lambda own: tuple(known[k] for k in own if k < ground)
     groups = [g.group for g in system.joints]
     return {name: bodies(own) for g in groups for name, own in zip(g.names, g.bodies, strict=True)}
 
@@ -271,33 +282,52 @@ def _check_determined(system, implied):
                 )
 
 
-def _implied(system, components):
+def _implied(system, shares):
     """The names of rows that are dropped, and of the joints that imply them."""
-    out = []
-    for dropped, kept, shares in components:
-        for row, share in zip(dropped, shares, strict=True):
-            if row >= system.velocity_rows:
-                continue
-            by = {system.rows[r][0] for r in kept[share != 0]}
-            name, k = system.rows[row]
-            out.append(Implied(name, k, tuple(sorted(by - {name})) or (name,)))
+    out, rows = [], system.rows
+    for row, by, _ in shares:
+        if row < system.velocity_rows:
+            name, k = rows[row]
+            names = {rows[r][0] for r in by}
+            out.append(Implied(name, k, tuple(sorted(names - {name})) or (name,)))
     return tuple(sorted(out, key=lambda item: (item.name, item.row)))
 
 
 def _check_nearby(system, q, parts, found, scale):
     """Refuse rows that are implied at this configuration, but not near it."""
     groups = [own for own in found if own.dropped.size]
+    is_sparse, layout = any(own.is_sparse for own in groups), system.layout
 
     def evaluate(t, moved):
-        at = _displaced(system, np.asarray(t, q.dtype), q, moved)
-        blocks = _of_parts(at.blocks)
+        t = np.asarray(t, q.dtype)
+        at = _displaced(system, t, q, moved)
+        blocks, unmet = _of_parts(at.blocks), np.asarray(at.unmet)
+        back: Any = np.asarray(_way_back(system, t, q, moved)) if is_sparse else None
 
-        def rows_of(k, rows):
+        def dense(own):
+            return matrix(parts, blocks, layout, own.parts, own.columns) * scale[own.columns]
+
+        def step(k, rows):
             own = groups[k]
-            whole = matrix(parts, blocks, system.layout, own.parts, own.columns) * scale[own.columns]
-            return whole[np.searchsorted(own.rows, rows)]
+            if own.is_sparse:
+                return back[own.columns]
+            return smallest_step(dense(own)[np.searchsorted(own.rows, rows)], unmet[rows])
 
-        return Nearby(np.asarray(at.unmet), rows_of, rows_of)
+        def remains(k, kept, dropped):
+            own = groups[k]
+            if not own.is_sparse:
+                off, sizes, by = dense_remains(dense(own), *(np.searchsorted(own.rows, x) for x in (kept, dropped)))
+                return Remains(off, sizes, lambda bad: own.rows[by(bad)])
+            place, later = np.searchsorted(own.rows, dropped), np.isin(own.rows, dropped)
+            given = own.parts, own.columns, scale, later.astype(int), ZERO
+            pivots, sizes = eliminate(parts, blocks, layout, *given)
+            # What remains of a row is not zero where it became a pivot.
+            off = np.isin(place, pivots.order[: pivots.rank]).astype(q.dtype)
+            implied_by = {share.row: share.by for share in own.shares}
+            by = lambda bad: np.unique(np.concatenate([implied_by[row] for row in dropped[bad].tolist()]))
+            return Remains(off, sizes[place], by)
+
+        return Nearby(unmet, step, remains)
 
     holonomic = lambda own: own.kept[own.kept < system.position_rows]
     check_implied(

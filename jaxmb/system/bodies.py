@@ -129,7 +129,8 @@ class AbstractBodySystem(AbstractBodies):
     @property
     def rows(self) -> tuple[tuple[str, int], ...]:
         """Name and number within its part of every row of A."""
-        return tuple((name, k) for g in self.joints for name in g.group.names for k in range(g.rows))
+        groups = [(g.group.names, range(g.rows)) for g in self.joints]
+        return tuple((name, k) for names, rows in groups for name in names for k in rows)
 
     # Internal states
 

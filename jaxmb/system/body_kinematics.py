@@ -109,11 +109,9 @@ class AbstractBodies(AbstractSystem):
         return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
 
     def normalize_fixed(self, q, fixed):
-        whole = [
-            row[3:]
-            for row in self.layout.pose_index[:-1]
-            if self.spatial and row[-1] < self.nq and fixed[row[3:]].all()
-        ]
+        rotating = np.array(self.layout.rotates) & self.spatial
+        turns = self.layout.pose_index[:-1][rotating, 3:]
+        whole = turns[np.all(fixed[turns], axis=1)]
         for index in whole:
             q = q.at[index].set(normalize(q[index]))
         return q, len(whole)

@@ -36,13 +36,13 @@ def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
 
 def _names(layout, bodies, index, fields, groups):
     names = {}
-    for body, row, rotates in zip(bodies, index[:-1], layout.rotates, strict=True):
+    for body, row, rotates in zip(bodies, index[:-1].tolist(), layout.rotates, strict=True):
         own = len(fields) if rotates else layout.space.dimension
         for k in range(own):
-            names[f"{body}.{fields[k]}"] = [int(row[k])]
+            names[f"{body}.{fields[k]}"] = [row[k]]
         for group, where in groups.items():
             if where.stop <= own:
-                names[f"{body}.{group}"] = [int(k) for k in row[where]]
+                names[f"{body}.{group}"] = row[where]
     return names
 
 

@@ -352,7 +352,8 @@ class AbstractSystem(eqx.Module):
     @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
         """Numbers of the rows of A that C depends on the multipliers of."""
-        return np.array([k for k, (name, _) in enumerate(self.rows) if name in self.friction_parts], int)
+        parts = self.friction_parts
+        return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
 
     @property
     def ideal_on_velocities(self) -> bool:
