@@ -145,9 +145,12 @@ def test_actuators_that_are_refused(more, message):
 
 
 def test_a_limit_of_the_force_at_a_joint_holds_behind_a_gear():
-    bar = rod("a", '<joint name="hip" axis="0 1 0" actuatorfrcrange="-1 2"/>')
-    found = importers.mjcf(file(bar, '<actuator><motor name="m" joint="hip" gear="-4" forcerange="-.4 1"/></actuator>'))
+    inner = rod("b", '<joint name="knee" axis="0 1 0" actuatorfrcrange="-3 5"/>')
+    bar = rod("a", '<joint name="hip" axis="0 1 0" actuatorfrcrange="-1 2"/>', inner)
+    motors = '<motor name="m" joint="hip" gear="-4" forcerange="-.4 1"/><motor name="n" joint="knee"/>'
+    found = importers.mjcf(file(bar, f"<actuator>{motors}</actuator>"))
     np.testing.assert_allclose(part(found, "m").force_range, [-0.4, 0.25])
+    np.testing.assert_allclose(part(found, "n").force_range, [-3, 5])
 
 
 # URDF

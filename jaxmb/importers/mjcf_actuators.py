@@ -93,7 +93,8 @@ def _read(mujoco, model, names, notes, k, name):
 def _acting_on(mujoco, model, joint):
     """Numbers of the actuators that may act on a joint, by themselves or by a tendon."""
     kinds, found = mujoco.mjtTrn, []
-    for k, (kind, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
+    for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
+        kind = kinds(int(number))
         if kind == kinds.mjTRN_TENDON:
             wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
             is_other = lambda w: model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT and model.wrap_objid[w] != joint

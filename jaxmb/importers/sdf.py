@@ -205,7 +205,7 @@ def _read_axis(joint, axis, frame, of_model, machine, notes, kind):
         frame = of_model
     elif expressed:
         if expressed not in machine.links:
-            raise ValueError(f"{xyz.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
+            raise ValueError(f"{axis.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
         frame = machine.links[expressed].rotation
     length = np.linalg.norm(direction)
     if length == 0:

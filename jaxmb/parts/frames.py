@@ -26,7 +26,7 @@ class AbstractFrame(AbstractPart):
 
     @abc.abstractmethod
     def own_pose(self, space: AbstractSpace, pose: Pose) -> Pose:
-        """The frame's pose from that of its base."""
+        """The frame's pose from that of its base, with or without prepared quantities."""
 
     @abc.abstractmethod
     def own_velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
@@ -50,7 +50,7 @@ class AbstractFrame(AbstractPart):
     def pose(self, space: AbstractSpace, pose: Pose) -> Pose:
         """The frame's pose from that of the body; with prepared quantities if the body's has them."""
         found = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
-        return space.prepare(found) if pose.shape[0] > space.pose_size else found
+        return space.prepare(found) if pose.shape[0] > found.shape[0] else found
 
     def velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
         """The frame's velocity from pose and velocity of the body."""
@@ -79,9 +79,9 @@ class LinkFrame(AbstractFrame):
     centre: fields.Number = fields.parameter(shape=("d",), unit="m")
 
     def own_pose(self, space, pose):
+        # What is prepared belongs to the attitude, which is the body's.
         xp = namespace(pose, self.centre)
-        d = space.dimension
-        return xp.concatenate([space.point(pose, -self.centre), pose[d : space.pose_size]])
+        return xp.concatenate([space.point(pose, -self.centre), pose[space.dimension :]])
 
     def own_velocity(self, space, pose, velocity):
         d = space.dimension

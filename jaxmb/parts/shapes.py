@@ -226,7 +226,8 @@ def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place:
 def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
     """A cylinder along its own z axis with a half ball at either end; `length` [m]: without these."""
     middle = Cylinder(radius, length, **place)
-    half = rot.rotate(middle.orientation, np.array([0.0, 0.0, 0.5 * length]))
+    top: Any = np.array([0.0, 0.0, 0.5 * length])
+    half = rot.rotate(middle.orientation, top)
     ends = (Sphere(radius, **(place | {"position": middle.position + way * half})) for way in (-1.0, 1.0))
     return middle, *ends
 
