@@ -19,10 +19,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, VectorLike
 from .arrays import as_array, namespace
-
-# Each product of rotation algebra is a sum with a small constant tensor, written term by term, which XLA fuses. Stacks
-# of components would become separate kernels. A reduction of some thousand numbers becomes a library call: with those
-# the accelerations of the rows of a chain of 200 ball joints take 85 µs instead of 18.
+from .bilinear import BilinearMap
+from .blocks import matrix_products
 
 
 def _tables():
@@ -36,23 +34,16 @@ def _tables():
     product[1:, 0, 1:] = product[1:, 1:, 0] = np.eye(3)
     product[1:, 1:, 1:] = epsilon
     conjugate = np.array([1.0, -1.0, -1.0, -1.0])
-    # R v is the vector part of p v p*.
+    # R v is the vector part of p v p*, quadratic in p.
     rotation = np.einsum("iam,akj,m->ijkm", product[1:], product[:, :, 1:], conjugate)
+    rotation = np.triu(rotation) + np.triu(rotation.swapaxes(2, 3), 1)
     return epsilon, product, conjugate, rotation, 0.5 * product[:, :, 1:]
 
 
-_CROSS, _MULTIPLY, _CONJUGATE, _ROTATION, _RATES = _tables()
-
-
-def _constant(table: np.ndarray, like: Array) -> np.ndarray:
-    return table.astype(like.dtype, copy=False)
-
-
-def _bilinear(table: np.ndarray, a: Float[Array, "j"], b: Float[Array, "k"]) -> Float[Array, "i"]:
-    """`Σ table[..., j, k] a_j b_k`, its other axes raveled."""
-    table = _constant(table.reshape(-1, *table.shape[-2:]), a)
-    of_b = lambda row: _sum([row[:, k] * b[k] for k in range(row.shape[1]) if np.any(row[:, k])])
-    return _sum([of_b(table[:, j]) * a[j] for j in range(table.shape[1])])
+_EPSILON, _PRODUCT, _CONJUGATE, _OF_MATRIX, _OF_RATES = _tables()
+_CROSS, _MULTIPLY, _RATES = map(BilinearMap.of, (_EPSILON, _PRODUCT, _OF_RATES))
+_PULL_BACK = _RATES.transpose(2, 1, 0)
+_ROTATION = BilinearMap.of(_OF_MATRIX.reshape(9, 4, 4))
 
 
 def _sum(terms):
@@ -75,45 +66,47 @@ def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array,
 
 def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Matrix from body to world components, `(e0² − e·e) I + 2 e eᵀ + 2 e0 ẽ`."""
-    return _bilinear(_ROTATION, p, p).reshape(3, 3)
+    return _ROTATION(p, p).reshape(3, 3)
 
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """World components of the body vector `v`."""
-    matrix = rotation_matrix(p)
-    return _sum([matrix[:, j] * v[j] for j in range(3)])
+    return turned(rotation_matrix(p), v)
 
 
 def unrotate(p: Float[Array, "4"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
     """Body components of the world vector `v_W`."""
-    matrix = rotation_matrix(p)
-    return _sum([matrix[j] * v_W[j] for j in range(3)])
+    return turned_back(rotation_matrix(p), v_W)
+
+
+def turned(matrix: Float[Array, "3 3"], v: Float[Array, "3"]) -> Float[Array, "3"]:
+    """World components of the body vector `v`, by the rotation matrix."""
+    return matrix_products(matrix, v[:, None])[:, 0]
+
+
+def turned_back(matrix: Float[Array, "3 3"], v_W: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Body components of the world vector `v_W`, by the rotation matrix."""
+    return matrix_products(v_W[None], matrix)[0]
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     """Vector product."""
-    return _bilinear(_CROSS, a, b)
-
-
-def skew(a: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The matrix `ã` of the vector product, `ã b = a × b`."""
-    table: Any = _constant(_CROSS, a)
-    return _sum([table[:, j] * a[j] for j in range(3)])
+    return _CROSS(a, b)
 
 
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:
     """Euler parameters of the inverse rotation."""
-    return p * _constant(_CONJUGATE, p)
+    return p * _CONJUGATE.astype(p.dtype, copy=False)
 
 
 def multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """Euler parameters of rotation `b` followed, in the world, by rotation `a`: R(a b) = R(a) R(b)."""
-    return _bilinear(_MULTIPLY, a, b)
+    return _MULTIPLY(a, b)
 
 
 def rates(p: Float[Array, "4"], omega: Float[Array, "3"]) -> Float[Array, "4"]:
     """`ṗ = ½ Lᵀ ω′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
-    return _bilinear(_RATES, p, omega)
+    return _RATES(p, omega)
 
 
 def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array, "3"]:
@@ -121,13 +114,13 @@ def pull_back(p: Float[Array, "4"], gradient: Float[Array, "4"]) -> Float[Array,
 
     This is the adjoint of `rates`.
     """
-    return _bilinear(_RATES.transpose(2, 1, 0), p, gradient)
+    return _PULL_BACK(p, gradient)
 
 
 def matrix_rates(R: Float[Array, "3 3"], omega: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """`Ṙ = R ω̃′` [1/s] for the angular velocity `omega` [rad/s] in the body frame."""
-    turn = skew(omega)
-    return _sum([R[:, j, None] * turn[None, j] for j in range(3)])
+    xp = namespace(R, omega)
+    return _CROSS(R, xp.broadcast_to(omega, R.shape))
 
 
 def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -135,7 +128,8 @@ def pull_back_matrix(R: Float[Array, "3 3"], gradient: Float[Array, "3 3"]) -> F
 
     This is the adjoint of `matrix_rates`.
     """
-    return _sum([cross(gradient[i], R[i]) for i in range(3)])
+    of_rows = _CROSS(gradient, R)
+    return of_rows[0] + of_rows[1] + of_rows[2]
 
 
 def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Array, "3"]:

@@ -302,7 +302,7 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         step, along = self._attempted(terms, t1, before, y0, args, state)
-        newton = step.newton
+        newton = freeze(step.newton)
         failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
 
         around = jnp.asarray(ladder(self.past_points))[k]
@@ -364,8 +364,9 @@ class Hermite(AbstractMultistep):
         return y1, estimate, dense_info, new_state, failed
 
     def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
-        size = lambda correction: self._size(correction, scale, like)
         field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
+        matrix, scale = freeze((matrix, scale))
+        size = lambda correction: self._size(correction, scale, like)
         if matrix.is_structured:
             renew = lambda y, rate: structured(freeze(terms), t, y, like, freeze(args))
         else:

@@ -21,10 +21,9 @@ def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     # The coordinate axis least parallel to `axis` (no fixed one serves all): a choice without derivative.
     xp = namespace(axis)
     k = xp.argmin(abs(axis if xp is np else jax.lax.stop_gradient(axis)))
-    skew = rot.skew(axis)
-    u = (skew * (np.arange(3) == k).astype(axis.dtype)[:, None]).sum(axis=0)
+    u = rot.cross((np.arange(3) == k).astype(axis.dtype), axis)
     u = u / xp.sqrt((u * u).sum())
-    return xp.stack([u, (skew * u[None, :]).sum(axis=1)])
+    return xp.stack([u, rot.cross(axis, u)])
 
 
 def direction_in_a(space, poses: Float[Array, "k p"], v_b: Vector3) -> Vector3:

@@ -24,7 +24,7 @@ def _places_of_moves():
             for i in np.flatnonzero(changed):
                 place[3 + k, 3 + i] = stored["half"] + j + (0 if changed[i] > 0 else 4)
         for j in range(9):
-            changed = (np.eye(9)[j].reshape(3, 3) @ rot.skew(unit)).reshape(-1)
+            changed = rot.matrix_rates(np.eye(9)[j].reshape(3, 3), unit).reshape(-1)
             for i in np.flatnonzero(changed):
                 place[3 + k, 7 + i] = stored["matrix"] + j + (0 if changed[i] > 0 else 9)
     return place
@@ -98,14 +98,11 @@ def _matrix(pose):
 
 
 def _turned(pose, v):
-    # Written term by term, which XLA fuses; a batched dot of 3 × 3 blocks is a library call.
-    matrix = _matrix(pose)
-    return matrix[:, 0] * v[0] + matrix[:, 1] * v[1] + matrix[:, 2] * v[2]
+    return rot.turned(_matrix(pose), v)
 
 
 def _turned_back(pose, v):
-    matrix = _matrix(pose)
-    return matrix[0] * v[0] + matrix[1] * v[1] + matrix[2] * v[2]
+    return rot.turned_back(_matrix(pose), v)
 
 
 SPACE = SpatialSpace()

@@ -1,0 +1,151 @@
+"""Bilinear functions as JAX primitives, whose derivatives are bilinear functions of the same kind.
+
+The products of rotation algebra and of small blocks are written term by term, which XLA fuses with what surrounds them.
+Differentiated term by term, each slice becomes a padded sum that XLA does not fuse: reverse derivatives of rotations
+took five times as long, and half of the operations of a spatial machine's program were those of its rotations.
+"""
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+from .arrays import namespace
+
+# A longer result is assembled from columns: a concatenation of many components is a kernel of its own.
+_FEW = 4
+
+
+def bilinear_primitive(
+    name: str,
+    evaluate: Callable[..., Array],
+    shape: Callable[..., tuple[int, ...]],
+    gradient_a: Callable[..., Array],
+    gradient_b: Callable[..., Array],
+    parameters: tuple[str, ...] = (),
+) -> Callable[..., Array]:
+    """A primitive for a bilinear function of two arrays of one type.
+
+    **Arguments:** `evaluate(a, b, **static)`, which takes any leading axes that a and b share; `shape`, of the
+    result, likewise; `gradient_a(c, b, **static)` and `gradient_b(c, a, **static)`: the gradients of
+    `Σ c · evaluate(a, b)`; names of the static `parameters`.
+    """
+
+    def batched(operands, axes, **static):
+        size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+        front = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(operands, axes, strict=True)
+        ]
+        return own.bind(*front, **static), 0
+
+    own = Primitive(name)
+    own.def_impl(jax.jit(evaluate, static_argnames=parameters))
+    own.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
+    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.defbilinear(
+        own,
+        lambda c, a, b, **static: gradient_a(c, b, **static),
+        lambda c, a, b, **static: gradient_b(c, a, **static),
+    )
+    batching.primitive_batchers[own] = batched
+
+    def bind(a: Any, b: Any, **static: Any) -> Array:
+        dtype = jnp.result_type(a, b)
+        return own.bind(jnp.asarray(a, dtype), jnp.asarray(b, dtype), **static)
+
+    return bind
+
+
+@dataclasses.dataclass(frozen=True)
+class BilinearMap:
+    """`c_i = Σ table[i, j, k] a_j b_k` of short vectors. NumPy in, NumPy out.
+
+    **Arguments:** `shape`: lengths of c, a and b; `terms`: the entries of the table that are not zero, each as
+    (i, j, k, value).
+    """
+
+    shape: tuple[int, int, int]
+    terms: tuple[tuple[int, int, int, float], ...]
+
+    @staticmethod
+    def of(table: Float[np.ndarray, "i j k"]) -> "BilinearMap":
+        """The map with a table."""
+        places = np.argwhere(table).tolist()
+        return BilinearMap(table.shape, tuple((i, j, k, float(table[i, j, k])) for i, j, k in places))
+
+    @functools.cached_property
+    def table(self) -> Float[np.ndarray, "i j k"]:
+        """All entries."""
+        table = np.zeros(self.shape)
+        for *place, value in self.terms:
+            table[tuple(place)] = value
+        return table
+
+    def transpose(self, *axes: int) -> "BilinearMap":
+        """The map with a transposed table: `transpose(1, 0, 2)` takes (c, b) to the gradient with respect to a."""
+        return _transposed(self, axes)
+
+    def __call__(self, a: Float[Array, "*n j"], b: Float[Array, "*n k"]) -> Float[Array, "*n i"]:
+        if namespace(a, b) is np:
+            return np.einsum("ijk,...j,...k->...i", self.table, a, b)
+        return _apply(a, b, of=self)
+
+
+@functools.cache
+def _transposed(own, axes):
+    return BilinearMap.of(own.table.transpose(axes))
+
+
+def _evaluate(a, b, *, of):
+    return _by_components(a, b, of) if of.shape[0] <= _FEW else _by_columns(a, b, of)
+
+
+def _by_components(a, b, of):
+    components = lambda x: [x[..., k : k + 1] for k in range(x.shape[-1])]
+    of_a, of_b = components(a), components(b)
+    sums: list = [None] * of.shape[0]
+    for i, j, k, value in of.terms:
+        product = of_a[j] * of_b[k]
+        if abs(value) != 1:
+            product = product * np.asarray(abs(value), a.dtype)
+        if sums[i] is None:
+            sums[i] = product if value > 0 else -product
+        else:
+            sums[i] = sums[i] + product if value > 0 else sums[i] - product
+    zero = jnp.zeros((*a.shape[:-1], 1), a.dtype)
+    return jnp.concatenate([zero if own is None else own for own in sums], axis=-1)
+
+
+def _by_columns(a, b, of):
+    # Sums of constant columns. A reduction of some thousand numbers would be a library call.
+    # The leading axes of the operands, of length one.
+    table = of.table.astype(a.dtype).reshape(*(1,) * (a.ndim - 1), *of.shape)
+
+    def column(j):
+        return _sum(table[..., j, k] * b[..., k : k + 1] for k in np.flatnonzero(of.table[:, j].any(axis=0)))
+
+    return _sum(column(j) * a[..., j : j + 1] for j in np.flatnonzero(of.table.any(axis=(0, 2))))
+
+
+def _sum(terms):
+    return functools.reduce(operator.add, terms)
+
+
+_apply = bilinear_primitive(
+    "bilinear_map",
+    _evaluate,
+    lambda a, b, *, of: (*a.shape[:-1], of.shape[0]),
+    lambda c, b, *, of: _apply(c, b, of=of.transpose(1, 0, 2)),
+    lambda c, a, *, of: _apply(a, c, of=of.transpose(2, 1, 0)),
+    parameters=("of",),
+)
