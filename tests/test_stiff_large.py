@@ -291,7 +291,7 @@ def test_a_batch_equals_the_loop():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 2, 0.1)])
+@pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 3, 0.1)])
 def test_derivatives_three_ways(build, n, t1):
     system = build(n)
     state = mb.assemble(system)

@@ -176,16 +176,18 @@ def _restore_state(system, t, q, u, linearized_at, split, tol):
         step = solved.right_inverse @ system.velocity_residual(t, q, u)
         u = u - step
         failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(u))))
-    inertia = system.inertia(t, q, u)
-    multipliers = solved.right_inverse.T @ (inertia.product(udot) - system.force(t, q, u))
-    udot = udot + _solve_linear(inertia, solved, *_equations(system, t, q, u, udot, multipliers))
+    # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ`.
+    unbalanced = _unbalanced(system, t, q, u, udot)
+    multipliers = solved.right_inverse.T @ unbalanced
+    constraint_residual = system.acceleration_residual(t, q, u, udot)
+    force_residual = unbalanced - system.constraint_force(t, q, u, multipliers)
+    udot = udot + _solve_linear(system.inertia(t, q, u), solved, constraint_residual, force_residual)
     return RestoredState(q, u, udot, iterations, failed)
 
 
-def _equations(system, t, q, u, udot, multipliers):
-    """Residuals of the equations of motion: `A u̇ − γ` and `M u̇ − F − Aᵀ λ`."""
-    applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
-    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
+def _unbalanced(system, t, q, u, udot):
+    """`M u̇ − F`, what the constraints have to balance."""
+    return system.inertia(t, q, u).product(udot) - system.force(t, q, u)
 
 
 def _solve_linear(inertia, solved, constraint_residual, force_residual):
@@ -274,10 +276,11 @@ def _push_velocities(at, along, solved):
 
 def _push_accelerations(at, along, udot, solved):
     system, t, q, u = at
-    inertia = system.inertia(t, q, u)
-    multipliers = solved.right_inverse.T @ (inertia.product(udot) - system.force(t, q, u))
-    residuals = _push(lambda s, t, q, u: _equations(s, t, q, u, udot, multipliers), at, along)
-    return _solve_linear(inertia, solved, *residuals)
+    unbalanced, of_unbalanced = eqx.filter_jvp(lambda s, t, q, u: _unbalanced(s, t, q, u, udot), at, along)
+    multipliers = solved.right_inverse.T @ unbalanced
+    of_acceleration = _push(lambda s, t, q, u: s.acceleration_residual(t, q, u, udot), at, along)
+    of_multipliers = _push(lambda s, t, q, u: s.constraint_force(t, q, u, multipliers), at, along)
+    return _solve_linear(system.inertia(t, q, u), solved, of_acceleration, of_unbalanced - of_multipliers)
 
 
 def _push(fn, primals, tangents):
