@@ -127,8 +127,8 @@ def _by_components(a, b, of):
 
 
 def _by_columns(a, b, of):
-    # Sums of constant columns. A reduction of some thousand numbers would be a library call.
-    # The leading axes of the operands, of length one.
+    # Sums of constant columns, with the leading axes of the operands. A reduction of some thousand numbers would be a
+    # library call: with those the accelerations of the rows of a chain of 200 ball joints take 85 µs instead of 18.
     table = of.table.astype(a.dtype).reshape(*(1,) * (a.ndim - 1), *of.shape)
 
     def column(j):
