@@ -262,6 +262,13 @@ def test_inertia_names_and_frames():
             "Spherical",
             "their solref and solimp have no effect",
         ),
+        (
+            HINGE,
+            '<tendon><fixed name="t" stiffness="1"><joint joint="hip" coef="2"/></fixed></tendon>',
+            "t",
+            "FixedTendon",
+            "Tendons and couplings see angles of hinges up to half a turn from their zeros: 't'",
+        ),
     ],
 )
 def test_what_is_approximated_is_said(joints, more, name, kind, note):
@@ -278,6 +285,10 @@ def test_mocap_bodies_move_as_prescribed():
     assert any("Mocap bodies are held by a joint" in note and "'hand'" in note for note in model.notes)
 
 
+PLANE = (
+    '<joint name="px" type="slide" axis="1 0 0" {}/><joint name="pz" type="slide" axis="0 0 1"/>'
+    '<joint name="py" axis="0 1 0"/>'
+)
 SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0"/>'
 
 
@@ -321,6 +332,31 @@ SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0
         ),
         ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
         ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
+        (HINGE, '<actuator><motor name="m" joint="hip" delay=".1" nsample="2"/></actuator>', "", "'m' has delays"),
+        (
+            HINGE,
+            '<tendon><spatial name="t" stiffness="1" springlength=".1 .2"><site site="o"/><site site="s"/></spatial>'
+            "</tendon>",
+            "",
+            "The spring of tendon 't' has a slack range",
+        ),
+        (
+            HINGE,
+            '<actuator><plugin joint="hip" plugin="mujoco.pid"><config key="kp" value="1"/></plugin></actuator>',
+            '<extension><plugin plugin="mujoco.pid"/></extension>',
+            "Plugins are not known; remove them from the file",
+        ),
+        (PLANE.format('stiffness="2"'), "", "", "springs of 'px', a slide of a planar joint"),
+        (PLANE.format('damping="2"'), "", "", "damping of 'px', a slide of a planar joint"),
+        (PLANE.format('limited="true" range="-1 1"'), "", "", "limits of 'px', a slide of a planar joint"),
+        (PLANE.format('armature=".1"'), "", "", "armature of 'px', a slide of a planar joint"),
+        (PLANE.format('frictionloss=".1"'), "", "", "friction of 'px', a slide of a planar joint"),
+        (
+            PLANE.format(""),
+            '<actuator><motor name="m" joint="px"/></actuator>',
+            "",
+            "'m' acts on 'px', which has no coordinate of its own",
+        ),
     ],
 )
 def test_what_is_refused_is_named(joints, more, head, message):
@@ -332,6 +368,23 @@ def test_what_is_refused_is_named(joints, more, head, message):
     )
     with pytest.raises(ValueError, match=message):
         importers.mjcf(text)
+
+
+def test_flexible_bodies_are_refused():
+    grid = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" mass="1" dim="2">'
+    text = file(rod("a", HINGE) + f'{grid}<edge equality="true"/></flexcomp>')
+    with pytest.raises(ValueError, match="Deformable bodies") as error:
+        importers.mjcf(text)
+    assert "is of type flex (ignore='loops' leaves it out)" in str(error.value)
+
+
+def test_files_that_are_included(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "bar.xml").write_text(f"<mujocoinclude>{rod('a', HINGE)}</mujocoinclude>")
+    (tmp_path / "machine.xml").write_text(file('<include file="parts/bar.xml"/>'))
+    found, expected = importers.mjcf(tmp_path / "machine.xml"), importers.mjcf(file(rod("a", HINGE)))
+    assert kinds(found) == kinds(expected)
+    assert float(part(found, "a").mass) == float(part(expected, "a").mass)
 
 
 def test_collisions_are_refused_unless_left_out():
