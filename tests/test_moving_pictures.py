@@ -237,6 +237,30 @@ def test_parts_on_frames_are_drawn_there():
     assert np.allclose(picture.parts["hinge"].points[0], (0.0, 1.5, 0.0))
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_given_shapes_stand_in_the_frame_of_their_body(dimension):
+    """Also where the origin of that frame is not the mass centre, as in files."""
+    bodies = {
+        2: planar.Body("arm", mass=1.0, inertia=1.0, position=(1.0, 2.0), angle=np.pi / 2, centre=(0.3, 0.1)),
+        3: spatial.Body(
+            "arm",
+            mass=1.0,
+            inertia=np.eye(3),
+            position=(1.0, 2.0, 0.0),
+            orientation=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
+            centre=(0.3, 0.1, 0.0),
+        ),
+    }
+    picture = at_rest(mb.Scene([bodies[dimension]]).compile())
+    picture = picture.system.picture(picture.ts, picture.ys)
+    given = {"arm": shapes.Box((0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0), orientation=(0.0, 1.0, 0.0, 0.0))}
+    ((name, box),) = solids(picture, given, None)
+    turn = np.asarray(rot.rotation_matrix(picture.orientations[name][0]))
+    # The frame's origin is at (1, 2), and its x axis points upward.
+    assert np.allclose(picture.positions[name][0] + turn @ box.position, (1.0, 2.5, 0.0))
+    assert np.allclose(box.orientation, (0.0, 1.0, 0.0, 0.0))
+
+
 # What is refused
 
 

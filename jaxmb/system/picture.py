@@ -38,6 +38,7 @@ class Picture(NamedTuple):
     - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name,
         those of the ground last.
     - `parts` by name; `shapes` of parts, with the names of the bodies that they are fixed in; `paths` of parts by name.
+    - `centres` [m]: the mass centres of bodies whose frame has its origin elsewhere, in that frame.
     - `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies by name, zero for point masses.
     """
 
@@ -49,6 +50,7 @@ class Picture(NamedTuple):
     parts: dict[str, Anchors]
     shapes: list[tuple[str, AbstractShape]]
     paths: dict[str, Line]
+    centres: dict[str, Float[np.ndarray, "3"]]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
 
 
@@ -84,8 +86,15 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         parts=parts,
         shapes=shapes,
         paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
+        centres={name: np.asarray(space.in_space(own)) for g in system.bodies for name, own in _centres(g.group)},
         inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
     )
+
+
+def _centres(group):
+    """The mass centres of bodies with their names, where they are not the origins."""
+    given = getattr(group.part, "centre", None)
+    return () if given is None else zip(group.names, np.asarray(given), strict=True)
 
 
 def _unstacked(group):

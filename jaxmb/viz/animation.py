@@ -75,8 +75,8 @@ def show(
     - `points`: the name of a body (its mass centre), frame or joint that leaves a trail, or several.
     - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
         on the last body of a joint, and on each body of a force element.
-    - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, in place of the default; `"ground"` as
-        well.
+    - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, each placed in the frame of its body, in
+        place of the default; `"ground"` as well.
     - `frames`: how many of the saved times are shown at most.
     - `speed`: of playing, 1 for real time; the default is 1, but for motions that are over within 2 s or last for more
         than a minute what makes them last so long. The slider shows the time of playing, the picture that of the

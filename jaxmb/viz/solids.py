@@ -43,6 +43,9 @@ def solids(
         if name in given:
             own = given[name]
             own = [own] if isinstance(own, AbstractShape) else list(own)
+            if name in picture.centres:
+                # Bodies are placed by their mass centres.
+                own = [shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in own]
         elif name == GROUND:
             own = [_support(point, picture.up, width) for point in points[name]]
         else:
