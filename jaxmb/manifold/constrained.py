@@ -280,11 +280,12 @@ def _push_accelerations(at, along, udot, solved):
     multipliers = solved.right_inverse.T @ unbalanced
     of_acceleration = _push(lambda s, t, q, u: s.acceleration_residual(t, q, u, udot), at, along)
     of_multipliers = _push(lambda s, t, q, u: s.constraint_force(t, q, u, multipliers), at, along)
-    return _solve_linear(system.inertia(t, q, u), solved, of_acceleration, of_unbalanced - of_multipliers)
+    of_force = _dense(of_unbalanced, unbalanced) - of_multipliers
+    return _solve_linear(system.inertia(t, q, u), solved, of_acceleration, of_force)
 
 
 def _push(fn, primals, tangents):
-    return eqx.filter_jvp(fn, primals, tangents)[1]
+    return _dense(*reversed(eqx.filter_jvp(fn, primals, tangents)))
 
 
 def _dense(tangent, primal):
