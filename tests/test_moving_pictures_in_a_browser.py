@@ -40,7 +40,11 @@ def page(tmp_path):
 def check_it_plays(page):
     """It shows more than a ground; another time looks different, and the first one again as before."""
     page.wait(LOADED)
-    page.value(f"{DOCUMENT}.querySelectorAll('.mantine-Notification-root').forEach(own => own.remove())")
+    # A notice of software rendering would come at any time.
+    page.value(
+        f"(() => {{ const own = {DOCUMENT}; const style = own.createElement('style'); "
+        "style.textContent = '.mantine-Notification-root {display: none}'; own.head.append(style); })()"
+    )
     box = page.value(
         f"(() => {{ const a = document.querySelector('iframe')?.getBoundingClientRect() ?? {{x: 0, y: 0}}; "
         f"const b = {SLIDER}.getBoundingClientRect(); "
