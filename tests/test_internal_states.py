@@ -419,14 +419,14 @@ def test_frames_carry_parts_with_states():
 
 def test_a_controller_sees_frames_bodies_and_joints_on_frames():
     """What the function is given is what the trajectory shows."""
-    record = lambda t, measured, states, p: ({"hip.angle": 0.0}, measured)
+    record = lambda t, measured, states, p: (0.0, measured)
     rod = planar.Body("rod", mass=1.0, inertia=0.1, centre=(0.4, 0.0), position=(0.0, 0.0))
     frames = [planar.Frame("tip", "rod", position=(0.9, 0.1), angle=0.3)]
     pin = planar.Revolute("hip", "ground", "rod", point=(0.0, 0.0))
     names = ["tip.position", "tip.velocity", "tip.angle", "rod.position", "rod.angular_velocity", "hip.angle_rate"]
     shapes = {"position": np.zeros(2), "velocity": np.zeros(2)}
     states = {f"seen{k}": shapes.get(quantity.split(".")[1], 0.0) for k, quantity in enumerate(names)}
-    watcher = mb.Controller("watcher", record, dict(zip(states, names, strict=True)), ["hip.angle"], states=states)
+    watcher = mb.Controller("watcher", record, dict(zip(states, names, strict=True)), "hip.angle", states=states)
     system = mb.Scene([rod], joints=[pin], frames=frames, forces=[watcher]).compile()
     state = mb.assemble(system, fix={"hip.angle": 0.5}, rates={"hip.angle": 1.5})
     sol = mb.simulate(system, state, t1=0.01, saveat=[0.0])
