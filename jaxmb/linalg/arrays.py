@@ -1,5 +1,8 @@
 """Choose NumPy for concrete values, where nothing is compiled, and JAX for tracers and JAX arrays."""
 
+import functools
+import operator
+from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
@@ -45,3 +48,8 @@ def replaced(array: Array, index: Any, value: Any) -> Array:
 def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
     """`values[index]` as a gather without checks: the indices are in bounds by construction."""
     return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def add_up(terms: Iterable[Any]) -> Any:
+    """The sum of some arrays, one at least, term by term; Python's `sum` would add a zero to them."""
+    return functools.reduce(operator.add, terms)

@@ -7,7 +7,6 @@ took five times as long, and half of the operations of a spatial machine's progr
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
-from .arrays import namespace
+from .arrays import add_up, namespace
 
 # A longer result is assembled from columns: a concatenation of many components is a kernel of its own.
 _FEW = 4
@@ -132,13 +131,9 @@ def _by_columns(a, b, of):
     table = of.table.astype(a.dtype).reshape(*(1,) * (a.ndim - 1), *of.shape)
 
     def column(j):
-        return _sum(table[..., j, k] * b[..., k : k + 1] for k in np.flatnonzero(of.table[:, j].any(axis=0)))
+        return add_up(table[..., j, k] * b[..., k : k + 1] for k in np.flatnonzero(of.table[:, j].any(axis=0)))
 
-    return _sum(column(j) * a[..., j : j + 1] for j in np.flatnonzero(of.table.any(axis=(0, 2))))
-
-
-def _sum(terms):
-    return functools.reduce(operator.add, terms)
+    return add_up(column(j) * a[..., j : j + 1] for j in np.flatnonzero(of.table.any(axis=(0, 2))))
 
 
 _apply = bilinear_primitive(

@@ -8,15 +8,13 @@ Sources: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIA
 "Symmetric quasidefinite matrices", SIAM J. Optim. 5(1), 1995.
 """
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .arrays import unchecked_take
+from .arrays import add_up, unchecked_take
 from .elimination import gauss_jordan
 from .elimination_order import NodeOrder
 
@@ -45,7 +43,7 @@ class BlockFactor(eqx.Module):
             x = x.at[order.rest].set(rest.reshape(-1, x.shape[1]), mode="promise_in_bounds", unique_indices=True)
         for stage, inverses, multiples in reversed(list(zip(order.stages, self.inverses, self.multiples, strict=True))):
             own = jnp.moveaxis(unchecked_take(x, stage.nodes), 2, 1)
-            own = _sum([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
+            own = add_up([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
             x = lax.scan(_backward, x, (stage.nodes, stage.later, own, multiples), reverse=True)[0]
         return x[:-1]
 
@@ -81,11 +79,11 @@ def _eliminate(blocks, step):
     inverse = lax.optimization_barrier(_inverse(jnp.moveaxis(unchecked_take(blocks, diagonal), 0, 2)))
     column = jnp.transpose(unchecked_take(blocks, columns), (2, 3, 1, 0))
     size = inverse.shape[0]
-    multiple = _sum([column[:, j, None] * inverse[None, j, :, None] for j in range(size)])
+    multiple = add_up([column[:, j, None] * inverse[None, j, :, None] for j in range(size)])
     first, second = np.tril_indices(columns.shape[1])
     multiple, column = lax.optimization_barrier((multiple, column))
     left, right = lax.optimization_barrier((multiple[:, :, first], column[:, :, second]))
-    change = lax.optimization_barrier(_sum([left[:, j, None] * right[None, :, j] for j in range(size)]))
+    change = lax.optimization_barrier(add_up([left[:, j, None] * right[None, :, j] for j in range(size)]))
     blocks = blocks.at[targets].add(-jnp.transpose(change, (3, 2, 0, 1)), mode="promise_in_bounds")
     return blocks, (inverse, multiple)
 
@@ -93,7 +91,7 @@ def _eliminate(blocks, step):
 def _forward(x, step):
     nodes, later, multiples = step
     own = unchecked_take(x, nodes).T
-    change = _sum([multiples[:, j] * own[None, j, None] for j in range(own.shape[0])])
+    change = add_up([multiples[:, j] * own[None, j, None] for j in range(own.shape[0])])
     return x.at[later].add(-change.T, mode="promise_in_bounds"), None
 
 
@@ -101,7 +99,7 @@ def _backward(x, step):
     nodes, later, own, multiples = step
     ahead = unchecked_take(x, later).T
     size, d = ahead.shape[:2]
-    ahead = _sum([own, *(-multiples[i, :, k] * ahead[None, i, k] for i in range(size) for k in range(d))])
+    ahead = add_up([own, *(-multiples[i, :, k] * ahead[None, i, k] for i in range(size) for k in range(d))])
     return x.at[nodes].set(ahead.T, mode="promise_in_bounds"), None
 
 
@@ -126,7 +124,3 @@ def _inverse(a):
         ]
         rows = [row if i == k else swept(i) for i in range(r)]
     return jnp.stack([jnp.stack(row) for row in rows])
-
-
-def _sum(terms):
-    return functools.reduce(jnp.add, terms)

@@ -7,15 +7,13 @@ each eliminates some nodes at once.
 Source: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIAM Review 34(1), 1992.
 """
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact
 
-from .arrays import unchecked_take
+from .arrays import add_up, unchecked_take
 from .elimination_order import NodeOrder
 
 
@@ -44,7 +42,7 @@ class BlockLU(eqx.Module):
             x = x.at[order.rest].set(rest.reshape(-1, x.shape[1]), mode="promise_in_bounds", unique_indices=True)
         for stage, inverses, right in reversed(list(zip(order.stages, self.inverses, self.right, strict=True))):
             own = jnp.moveaxis(unchecked_take(x, stage.nodes), 2, 1)
-            own = _sum([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
+            own = add_up([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
             x = lax.scan(_backward, x, (stage.nodes, stage.later, own, right), reverse=True)[0]
         return x[:-1]
 
@@ -85,14 +83,14 @@ def _eliminate(blocks, step):
     column = jnp.transpose(unchecked_take(blocks, columns), (2, 3, 4, 1, 0))
     below, right = column
     size, d = inverse.shape[0], columns.shape[1]
-    multiple = _sum([below[:, j, None] * inverse[None, j, :, None] for j in range(size)])
-    transposed = _sum([right[:, j, None] * inverse[None, :, j, None] for j in range(size)])
+    multiple = add_up([below[:, j, None] * inverse[None, j, :, None] for j in range(size)])
+    transposed = add_up([right[:, j, None] * inverse[None, :, j, None] for j in range(size)])
     multiple, below, right, transposed = lax.optimization_barrier((multiple, below, right, transposed))
     first, second = np.tril_indices(d)
     # The change of the block (a, b) is L_a (b's part of U), that of (b, a), transposed, is its mirror image.
     left = lax.optimization_barrier(jnp.stack([multiple[:, :, first], transposed[:, :, first]]))
     other = lax.optimization_barrier(jnp.stack([right[:, :, second], below[:, :, second]]))
-    change = lax.optimization_barrier(_sum([left[:, :, j, None] * other[:, None, :, j] for j in range(size)]))
+    change = lax.optimization_barrier(add_up([left[:, :, j, None] * other[:, None, :, j] for j in range(size)]))
     blocks = blocks.at[targets].add(-jnp.transpose(change, (4, 3, 0, 1, 2)), mode="promise_in_bounds")
     return blocks, (inverse, multiple, transposed)
 
@@ -100,7 +98,7 @@ def _eliminate(blocks, step):
 def _forward(x, step):
     nodes, later, below = step
     own = unchecked_take(x, nodes).T
-    change = _sum([below[:, j] * own[None, j, None] for j in range(own.shape[0])])
+    change = add_up([below[:, j] * own[None, j, None] for j in range(own.shape[0])])
     return x.at[later].add(-jnp.transpose(change, (2, 1, 0)), mode="promise_in_bounds"), None
 
 
@@ -108,7 +106,7 @@ def _backward(x, step):
     nodes, later, own, right = step
     ahead = unchecked_take(x, later).T
     # The pivot's row is its inverse times the transposed blocks.
-    change = _sum([right[i] * ahead[i, None] for i in range(ahead.shape[0])])
+    change = add_up([right[i] * ahead[i, None] for i in range(ahead.shape[0])])
     own = own - jnp.sum(change, axis=1)
     return x.at[nodes].set(own.T, mode="promise_in_bounds"), None
 
@@ -137,7 +135,3 @@ def _inverse(a):
         return jnp.where(in_row, row, swept)
 
     return lax.fori_loop(0, size, sweep, a)
-
-
-def _sum(terms):
-    return functools.reduce(jnp.add, terms)

@@ -4,14 +4,11 @@ XLA fuses a sum of few terms with the surrounding operations. A batched dot of s
 reduction over an axis of a few entries takes three to five times as long.
 """
 
-import functools
-import operator
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arrays import namespace
+from .arrays import add_up, namespace
 from .bilinear import bilinear_primitive
 
 
@@ -38,7 +35,7 @@ def transpose_vector_products(a: Float[Array, "*k i j"], x: Float[Array, "*k i"]
 def _evaluate(a, b):
     if a.shape[-1] == 0:
         return jnp.zeros((*a.shape[:-1], b.shape[-1]), a.dtype)
-    return functools.reduce(operator.add, [a[..., :, j, None] * b[..., None, j, :] for j in range(a.shape[-1])])
+    return add_up([a[..., :, j, None] * b[..., None, j, :] for j in range(a.shape[-1])])
 
 
 _products = bilinear_primitive(

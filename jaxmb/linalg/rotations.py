@@ -8,8 +8,6 @@ Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
 """
 
-import functools
-import operator
 from typing import Any
 
 import jax
@@ -18,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, VectorLike
-from .arrays import as_array, namespace
+from .arrays import add_up, as_array, namespace
 from .bilinear import BilinearMap
 from .blocks import matrix_products
 
@@ -46,14 +44,10 @@ _PULL_BACK = _RATES.transpose(2, 1, 0)
 _ROTATION = BilinearMap.of(_OF_MATRIX.reshape(9, 4, 4))
 
 
-def _sum(terms):
-    return functools.reduce(operator.add, terms)
-
-
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     """Euclidean norm over the last axis, with derivative zero (not NaN) at the zero vector."""
     xp = namespace(x)
-    square = _sum([x[..., k] ** 2 for k in range(x.shape[-1])]) if x.shape[-1] <= 4 else (x * x).sum(axis=-1)
+    square = add_up([x[..., k] ** 2 for k in range(x.shape[-1])]) if x.shape[-1] <= 4 else (x * x).sum(axis=-1)
     positive = square > 0
     return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
 
