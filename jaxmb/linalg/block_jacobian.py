@@ -76,6 +76,11 @@ class JointOrder:
     left_out: tuple[int, ...] = dataclasses.field(compare=False)
     absolute: frozenset[int] = dataclasses.field(compare=False)
 
+    @property
+    def uniform(self) -> bool:
+        """Whether every body has all its velocities, so that those of the bodies are a plain reshape of all."""
+        return self.velocity_place.size == self.velocity_index[:-1].size
+
     def of_first(self, rows: int) -> "JointOrder":
         """The same order with these rows kept at most."""
         return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
@@ -106,8 +111,8 @@ class BlockJacobian(AbstractJacobian):
     def on_velocities(self, multipliers: Float[Array, "j r"]) -> Float[Array, "n"]:
         """`Aᵀ λ` from multipliers joint by joint."""
         wrenches = transpose_vector_products(self.blocks, multipliers[:, None, :])
-        of_bodies = self.order.on_bodies(wrenches.reshape(-1, wrenches.shape[2]))
-        return unchecked_take(of_bodies.reshape(-1), self.order.velocity_place)
+        of_bodies = self.order.on_bodies(wrenches.reshape(-1, wrenches.shape[2])).reshape(-1)
+        return of_bodies if self.order.uniform else unchecked_take(of_bodies, self.order.velocity_place)
 
     def row_norms(self, scale):
         own = unchecked_take(_of_bodies(self.order, scale), self.order.bodies)
@@ -151,9 +156,7 @@ class BlockGram(AbstractPositiveDefinite):
         order, blocks = self.jacobian.order, self.jacobian.blocks
         joints, k, r, v = blocks.shape
         scaled = jnp.where(order.kept[:, None, :, None], blocks, 0.0)
-        unit = np.zeros((order.velocity_place.size + 1, v))
-        unit[order.velocity_index, np.arange(v)] = 1.0
-        root = _of_bodies(order, self.inertia.root().solve(jnp.asarray(unit[:-1], blocks.dtype)))
+        root = _of_bodies(order, self.inertia.root().solve(_units(order, blocks.dtype)))
         scaled = scaled.reshape(joints * k, r, v)
         root = unchecked_take(root, order.bodies.reshape(-1)).swapaxes(1, 2)
         # Barriers keep XLA from computing the factors anew for each entry of a product.
@@ -205,8 +208,21 @@ def block_jacobian(blocks: Float[Array, "entries"], order: JointOrder) -> BlockJ
 
 def _of_bodies(order, values):
     """Values (n, …) body by body, followed by zeros, (bodies + 1, v, …)."""
+    if order.uniform:
+        values = values.reshape(-1, order.velocity_index.shape[1], *values.shape[1:])
+        return jnp.pad(values, ((0, 1), *[(0, 0)] * (values.ndim - 1)))
     zero = jnp.zeros((1, *values.shape[1:]), values.dtype)
     return unchecked_take(jnp.concatenate([values, zero]), order.velocity_index)
+
+
+def _units(order, dtype):
+    """The identity of each body's velocities, (n, v)."""
+    n, v = order.velocity_place.size, order.velocity_index.shape[1]
+    if order.uniform:
+        return jnp.tile(jnp.eye(v, dtype=dtype), (n // v, 1))
+    unit = np.zeros((n + 1, v))
+    unit[order.velocity_index, np.arange(v)] = 1.0
+    return jnp.asarray(unit[:-1], dtype)
 
 
 def _identities(order, size):

@@ -57,7 +57,8 @@ class NodeOrder:
 
     **Fields:**
 
-    - `nodes`: their number; `levels`: how many sets of them are eliminated one after the other, before the rest.
+    - `nodes`: their number; `size` of their blocks; `levels`: how many sets of them are eliminated one after the other,
+        before the rest.
     - `blocks`: the number of stored blocks, original ones and fill, in the lower triangle with respect to the order,
         those on the diagonal first, in the order of the nodes.
     - `row`, `column` (blocks,): the nodes of each, the row the later of the two.
@@ -68,6 +69,7 @@ class NodeOrder:
 
     key: Any
     nodes: int = dataclasses.field(compare=False)
+    size: int = dataclasses.field(compare=False)
     blocks: int = dataclasses.field(compare=False)
     row: np.ndarray = dataclasses.field(compare=False)
     column: np.ndarray = dataclasses.field(compare=False)
@@ -76,6 +78,12 @@ class NodeOrder:
     rest_blocks: np.ndarray = dataclasses.field(compare=False)
     levels: int = dataclasses.field(compare=False)
     cost: float = dataclasses.field(compare=False)
+
+    @property
+    def factor_flops(self) -> float:
+        """Floating point operations of a Cholesky factor."""
+        later = np.bincount(self.column[self.row != self.column], minlength=self.nodes)
+        return float(np.sum(later**2 + later + 1 / 3)) * self.size**3
 
 
 def order_nodes(
@@ -198,10 +206,10 @@ def _laid_out(neighbours, levels, rest, size, cost):
     row, column = np.array(list(pairs), np.int32).reshape(-1, 2).T
     arrays = [row, column, np.array(rest, np.int32), np.array(rest_blocks, np.int32).reshape(len(rest), len(rest))]
     key = digest([*arrays, *(array for stage in stages for array in dataclasses.astuple(stage))])
-    return NodeOrder(key, n, blocks, row, column, stages, arrays[2], arrays[3], len(levels), cost)
+    return NodeOrder(key, n, size, blocks, row, column, stages, arrays[2], arrays[3], len(levels), cost)
 
 
-def _cut(levels, size, most=3):
+def _cut(levels, size, most=2):
     """Levels grouped in at most so many stages, each of one number of lanes and one of later neighbours."""
     count = len(levels)
     if not count:

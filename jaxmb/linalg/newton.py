@@ -51,6 +51,7 @@ def chord(
     most: int,
     rate: Any = 0.0,
     rounding: Any = None,
+    peel: bool = False,
 ) -> tuple[PyTree, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method with one matrix for all corrections.
 
@@ -61,7 +62,9 @@ def chord(
     **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
     first correction is compared with (1: the error of the matrix is as large as the first correction; 0: unknown, and a
     second correction is made); `tol`; `most`: the largest number of corrections; `rate`: a lower bound of the factor by
-    which they shrink; `rounding`: the size below which they may stop shrinking, default some thousand rounding errors.
+    which they shrink; `rounding`: the size below which they may stop shrinking, default some thousand rounding errors;
+    `peel`: whether the first correction precedes the loop, which saves half a microsecond where corrections are small
+    programs, and compiles them twice.
 
     **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
     """
@@ -76,9 +79,10 @@ def chord(
 
     def proceed(carry):
         _, size, ahead, k = carry
-        return (ahead > tol) & (size < 1.0) & (k < most)
+        return (not peel and k == 0) | ((ahead > tol) & (size < 1.0) & (k < most))
 
-    x, _, ahead, k = lax.while_loop(proceed, advance, advance((start, first, first, jnp.array(0))))
+    carry = (start, first, first, jnp.array(0))
+    x, _, ahead, k = lax.while_loop(proceed, advance, advance(carry) if peel else carry)
     return x, k, ~(ahead <= tol)
 
 

@@ -214,7 +214,7 @@ def restore_positions(
     # Where velocities and coordinates share their factor, it is of this time, and wrong by the first correction only;
     # of an older one nothing is known.
     first = jnp.full((), 1.0 if split.coordinate is None else 0.0, q.dtype)
-    return chord(correct, q, first=first, tol=tol, most=_MAX_ITERATIONS)
+    return chord(correct, q, first=first, tol=tol, most=_MAX_ITERATIONS, peel=True)
 
 
 # Derivatives

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
@@ -37,10 +38,9 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     Jacobian is one dense matrix.
     """
     if system.elimination is not None:
-        metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
         t, tol = jnp.asarray(t, y.q.dtype), 64 * jnp.finfo(y.q.dtype).eps
-        linearized_at = binding_velocities(system, t, y.q, y.u).projector(metric)
-        return project_in_metric(system, t, y, lambda y: metric, linearized_at, tol)[0]
+        metric_of = lambda system, t, y: DiagonalInertia(1 / system.velocity_scale() ** 2)
+        return project_in_metric(system, t, y, metric_of, None, tol)[0]
     q = y.q
     if system.coordinate_rank > 0:
         t = jnp.asarray(t, q.dtype)
@@ -88,35 +88,72 @@ def project_in_metric(
     system: AbstractSystem,
     t: Scalar,
     y: State,
-    metric_at: Callable[[State], AbstractInertia],
-    linearized_at: MassProjector,
+    metric_of: Callable[[AbstractSystem, Scalar, State], AbstractInertia],
+    linearized_at: MassProjector | None,
     tol: Scalar,
 ) -> tuple[State, MassProjector, Int[Array, ""], Bool[Array, ""]]:
     """Project a state on constraints that are linear in velocities, by the smallest displacement in a metric.
 
     Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.
 
-    **Arguments:** `metric_at`: the metric at a state; `linearized_at`: the projector at a state close by, whose
-    derivatives do not count; `tol`: size of the last Newton correction, relative to the system's size.
+    **Arguments:** `metric_of(system, t, y)`: the metric at a state; `linearized_at`: the projector at a state close by,
+    whose derivatives do not count, for a chord method; None for Newton's method; `tol`: size of the last correction,
+    relative to the system's size.
 
-    **Returns:** the state, the projector there, the number of Newton iterations, and whether they failed.
+    **Returns:** the state, the projector there, the number of iterations, and whether they failed.
     """
     fixed_system, fixed_t, before, fixed, tol = lax.stop_gradient((system, t, y, linearized_at, tol))
     scale = fixed_system.velocity_scale()
 
-    def correct(q):
-        step = fixed.cancel(position_rows(fixed_system, fixed_t, q))
-        return displaced(fixed_system, fixed_t, q, step), jnp.max(jnp.abs(step) / scale)
+    def projector_at(q):
+        at = State(q, before.u)
+        return binding_velocities(fixed_system, fixed_t, q, at.u).projector(metric_of(fixed_system, fixed_t, at))
 
-    first = jnp.ones((), y.q.dtype)
-    found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
+    def correction(projector, q):
+        step = projector.cancel(position_rows(fixed_system, fixed_t, q))
+        return step, jnp.max(jnp.abs(step) / scale)
+
+    moved = lambda q, step: displaced(fixed_system, fixed_t, q, step)
+    if fixed is None:
+        found, own, iterations, failed = _by_newton(projector_at, correction, moved, before, tol)
+    else:
+
+        def correct(q):
+            step, size = correction(fixed, q)
+            return moved(q, step), size
+
+        first = jnp.ones((), y.q.dtype)
+        found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
+        own = projector_at(found)
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices.
-    own = binding_velocities(fixed_system, fixed_t, found, before.u)
-    own = own.projector(lax.stop_gradient(metric_at(State(found, before.u))))
     q = y.q + (found - before.q)
     q = displaced(system, t, q, own.cancel(position_rows(system, t, q)))
-    at = State(q, y.u)
-    here = binding_velocities(system, t, q, y.u).projector(metric_at(at), own.factor)
+    here = binding_velocities(system, t, q, y.u).projector(metric_of(system, t, State(q, y.u)), own.factor)
     u = y.u + here.cancel(velocity_rows(system, t, q, y.u))
     return dataclasses.replace(y, q=q, u=u), here, iterations, failed
+
+
+def _by_newton(projector_at, correction, moved, start, tol):
+    """Coordinates whose Newton correction is below `tol`, with the projector there, the number of iterations, and
+    whether they failed. The loop starts with no correction, so that its program holds one elimination only.
+    """
+
+    def advance(carry):
+        q, step, _, before, _, k = carry
+        q = moved(q, step)
+        projector = projector_at(q)
+        step, size = correction(projector, q)
+        rounded = (size < 4096 * jnp.finfo(size.dtype).eps) & (size > 0.5 * before)
+        return q, step, projector, size, jnp.where(rounded, 0.0, size), k + 1
+
+    def proceed(carry):
+        _, _, _, size, left, k = carry
+        return (k == 0) | ((left > tol) & (size < 1.0) & (k < _ITERATIONS))
+
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(projector_at, start.q))
+    far = jnp.full((), jnp.inf, start.q.dtype)
+    q, _, projector, _, left, k = lax.while_loop(
+        proceed, advance, (start.q, jnp.zeros_like(start.u), empty, far, far, jnp.array(0))
+    )
+    return q, projector, k, ~(left <= tol)

@@ -104,6 +104,10 @@ class Projection(AbstractManifold):
         return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
 
 
+def _inertia(system, t, y):
+    return system.inertia(t, y.q, y.u)
+
+
 def _returned(system, t, y):
     """An interpolated state, returned to the constraints."""
     return project_normalized(system, t, y) if system.velocity_rows else normalize_state(system, t, y)
@@ -165,9 +169,8 @@ class ProjectionTerm(AbstractManifoldTerm):
         if self.system.velocity_rows == 0:
             return self.evaluate(t, y, linearized_at.chart, args)
         if not self.system.ideal_on_velocities:
-            metric_at = lambda y: self.system.inertia(t, y.q, y.u)
             y, projector, iterations, failed = project_in_metric(
-                self.system, t, y, metric_at, linearized_at.factors, self.newton_tol
+                self.system, t, y, _inertia, linearized_at.factors, self.newton_tol
             )
             out = self._solved(t, y, projector, linearized_at.chart + iterations)
             return out._replace(failed=failed | out.failed)
@@ -192,9 +195,7 @@ class ProjectionTerm(AbstractManifoldTerm):
         if not system.ideal_on_velocities:
             return super().project_cold(t, y, chart, args)
         # The guess may be far from the constraints: accelerations are found with a factor of the state that is found.
-        fixed = lax.stop_gradient(self).evaluate(*lax.stop_gradient((t, y)), chart, args).factors.projector
-        metric_at = lambda y: system.inertia(t, y.q, y.u)
-        y, projector, iterations, failed = project_in_metric(system, t, y, metric_at, fixed, self.newton_tol)
+        y, projector, iterations, failed = project_in_metric(system, t, y, _inertia, None, self.newton_tol)
         out = self._ideal(t, y, projector, chart + iterations)
         return out._replace(failed=failed, factors=None)
 

@@ -12,11 +12,13 @@ import numpy as np
 from .._results import RESULTS
 from .._types import State
 from ..formulations import Multipliers
-from ..manifold import AbstractManifold, Baumgarte, Partition
+from ..manifold import AbstractManifold, Baumgarte, Partition, Projection
+from ..manifold.default import default_manifold
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 from ..solvers import Adams, Hermite
 from ..system import AbstractSystem
+from ..system.motion_graph import motion_order
 from ..trajectory import Trajectory
 from .evaluations import evaluations
 from .reference import reference
@@ -38,8 +40,8 @@ class MethodCost:
 
     **Fields:** `method`; `bound` and `error`, the largest relative error at the end of the quantities that the
     mechanism observes; `rtol`; `evaluations` of the accelerations, or of the residual of implicit equations; `matrices`
-    factored for Newton's method; `flops` of linear algebra, for full matrices; `time` [s] of a warm run. NaN and zeros
-    if no tolerance meets the bound.
+    factored for Newton's method; `flops` of linear algebra; `time` [s] of a warm run; `ratio`, that time over the time
+    of `Adams` as `simulate` chooses it, at the same bound. NaN and zeros if no tolerance meets the bound.
     """
 
     method: str
@@ -50,6 +52,7 @@ class MethodCost:
     matrices: int
     flops: float
     time: float
+    ratio: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,13 +74,14 @@ class MethodCosts:
         return dataclasses.asdict(self)
 
 
-_HEADER = ("method", "bound", "error", "rtol", "evaluations", "matrices", "Mflop", "run [ms]")
+_HEADER = ("method", "bound", "error", "rtol", "evaluations", "matrices", "Mflop", "run [ms]", "ratio")
 
 
 def _cells(cost: MethodCost) -> tuple[str, ...]:
     if not np.isfinite(cost.error):
-        return (cost.method, f"{cost.bound:.0e}", "not met", *["–"] * 5)
-    counts = str(cost.evaluations), str(cost.matrices), f"{cost.flops / 1e6:.1f}", f"{1e3 * cost.time:.2f}"
+        return (cost.method, f"{cost.bound:.0e}", "not met", *["–"] * 6)
+    ratio = f"{cost.ratio:.2f}" if np.isfinite(cost.ratio) else "–"
+    counts = str(cost.evaluations), str(cost.matrices), f"{cost.flops / 1e6:.1f}", f"{1e3 * cost.time:.2f}", ratio
     return (cost.method, f"{cost.bound:.0e}", f"{cost.error:.1e}", f"{cost.rtol:.0e}", *counts)
 
 
@@ -104,12 +108,15 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
     """Compare coordinate partitioning with integrating all coordinates, at equal error.
 
     The methods are partitioning with `Adams` and with `Hermite`; all coordinates with multipliers and Baumgarte's
-    stabilisation, with `Adams` and with `Dopri8` of diffrax; and, if scikit-sundae is installed and the joints are
-    holonomic, planar and not redundant, implicit BDF (SUNDIALS' IDA) on the stabilised equations of index 2. IDA calls
-    Python for every evaluation, which its time includes.
+    stabilisation, with `Adams` and with `Dopri8` of diffrax; all coordinates with projection and sparse elimination,
+    with `Adams` and with `Hermite`, where `simulate` chooses that; and, if scikit-sundae is installed and the joints
+    are holonomic, planar and not redundant, implicit BDF (SUNDIALS' IDA) on the stabilised equations of index 2. IDA
+    calls Python for every evaluation, which its time includes. The first method is the one that `simulate` chooses,
+    and times are also given in units of its time.
 
     Operations of linear algebra are counted for full matrices: elimination of the constraints and the Cholesky factor
-    of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods.
+    of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods. With sparse
+    elimination, those of its blocks are counted.
 
     **Arguments:** `errors`: bounds on the largest relative error at the end of the quantities that the mechanism
     observes; `repeats`: timed runs of each, in turns, of which the shortest counts.
@@ -143,13 +150,17 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
             else:
                 found.append((name, bound, float("nan"), None))
     times = iter(interleaved(runs, repeats))
-    costs = []
+    costs, unit = [], {}
     for name, bound, rtol, run in found:
         if run is None:
-            costs.append(MethodCost(name, bound, float("nan"), rtol, 0, 0, 0.0, float("nan")))
+            costs.append(MethodCost(name, bound, float("nan"), rtol, 0, 0, 0.0, float("nan"), float("nan")))
             continue
         flops = run.evaluations * methods[name].evaluation + run.matrices * methods[name].matrix
-        costs.append(MethodCost(name, bound, run.error, rtol, run.evaluations, run.matrices, flops, min(next(times))))
+        time = min(next(times))
+        if name == found[0][0]:
+            unit[bound] = time
+        ratio = time / unit.get(bound, float("nan"))
+        costs.append(MethodCost(name, bound, run.error, rtol, run.evaluations, run.matrices, flops, time, ratio))
     return MethodCosts(mechanism.name, t1, tuple(costs), tuple(remarks))
 
 
@@ -165,12 +176,33 @@ def _simulations(mechanism: Mechanism, known: References) -> dict[str, _Method]:
     newton = 8 * (2 * free) ** 3
     stabilised = Baumgarte(_RATE)
     methods = {
+        **_sparse_methods(system),
         "partitioning, Adams": (Adams(), Partition(), eliminated / 2 + reduced, 0.0),
         "partitioning, Hermite": (Hermite(), Partition(), eliminated + reduced, newton),
         "multipliers, Baumgarte, Adams": (Adams(), stabilised, multipliers, 0.0),
         "multipliers, Baumgarte, Dopri8": (diffrax.Dopri8(), stabilised, multipliers, 0.0),
     }
     return {name: _simulation(mechanism, known, *method) for name, method in methods.items()}
+
+
+def _sparse_methods(system: AbstractSystem) -> dict[str, tuple[Any, ...]]:
+    """Methods with sparse elimination, where `simulate` chooses them, with the operations of each."""
+    methods = {}
+    for solver in (Adams(), Hermite()):
+        manifold = default_manifold(system, solver, None)
+        if not isinstance(manifold, Projection):
+            continue
+        # `default_manifold` chooses projection for scenes with sparse elimination only.
+        scene: Any = system
+        factor, newton = scene.elimination.nodes.factor_flops, 0.0
+        if solver.solves_implicitly:
+            # An elimination of a complex matrix that is not symmetric.
+            newton = 8 * motion_order(scene).nodes.factor_flops
+        else:
+            # `Adams` eliminates at predicted states only.
+            factor /= 2
+        methods[f"projection, sparse elimination, {type(solver).__name__}"] = (solver, manifold, factor, newton)
+    return methods
 
 
 def _simulation(

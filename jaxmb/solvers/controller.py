@@ -13,7 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import check_real, ravel, unravel_like
+from ._evaluation import check_real, evaluate, first_chart, ravel
 from ._order import StepEstimate
 from ._scales import RunningScales
 from ._tolerances import MultistepNorm, Tolerances, norm_of
@@ -139,11 +139,11 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         func: Callable[..., Y],
         error_order: Any,
     ) -> tuple[Any, ControllerState]:
-        del error_order
+        del func, error_order
         check_real(y0)
         self._check_resolution(y0)
         if dt0 is None:
-            dt0 = self._first_step(terms, t0, t1, y0, args, func)
+            dt0 = self._first_step(terms, t0, t1, y0, args)
         dt0 = self._bound(dt0, t0.dtype)
         none = jnp.asarray(0, np.int32)
         return t0 + dt0, ControllerState(lax.stop_gradient(dt0), none, none, jnp.zeros(2, np.int32))
@@ -218,11 +218,11 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
                 f"{finest:.1e}. For finer ones switch on `jax_enable_x64`."
             )
 
-    def _first_step(self, terms, t0, t1, y0, args, func) -> Any:
+    def _first_step(self, terms, t0, t1, y0, args) -> Any:
         """The step of order one that would just meet the tolerance, from one trial evaluation."""
         frozen = lambda tree: jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
         terms, t0, t1, y0, args = frozen((terms, t0, t1, y0, args))
-        flat = ravel(y0)
+        flat, chart = ravel(y0), first_chart(terms, t0, y0, args)
         scales, tolerances = self.norm.scales, Tolerances(self.rtol, self.atol, self.norm)
         span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
 
@@ -230,7 +230,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             # At the start, then after a step along the first derivative; in a loop, so that the vector field is
             # compiled once.
             t, y, scale = carry
-            f = ravel(func(terms, t, unravel_like(y0, y), args), flat.dtype)
+            f = evaluate(terms, t, y, y0, chart, args).f
             if scales is not None:
                 scale = jnp.where(scale > 0, scale, tolerances.of_step(flat, flat, scales.start(flat, f)))
             size = lambda x: norm_of(self.norm, x / scale, y0)

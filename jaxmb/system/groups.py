@@ -66,7 +66,7 @@ class Group(eqx.Module):
     @property
     def body_index(self) -> np.ndarray:
         """Bodies of each part, shape (parts, k)."""
-        return np.array(self.bodies)
+        return np.array(self.bodies, np.int32)
 
     @property
     def rows(self) -> int:

@@ -42,12 +42,12 @@ class Layout:
     @functools.cached_property
     def velocity_place(self) -> np.ndarray:
         """Index of each velocity among all bodies' velocities, body by body, shape (nu,)."""
-        return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu)
+        return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu).astype(np.int32)
 
     @functools.cached_property
     def coordinate_place(self) -> np.ndarray:
         """Index of each coordinate among all bodies' poses, body by body, shape (nq,)."""
-        return np.flatnonzero(self.pose_index[:-1].ravel() < self.nq)
+        return np.flatnonzero(self.pose_index[:-1].ravel() < self.nq).astype(np.int32)
 
     @functools.cached_property
     def nq(self) -> int:
@@ -63,7 +63,7 @@ class Layout:
             own = size if rotates else self.space.dimension
             index.append([*range(start, start + own), *constant[own:]])
             start += own
-        return np.array([*index, constant])
+        return np.array([*index, constant], np.int32)
 
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
         """Source of each entry of an assembled Jacobian.
