@@ -203,3 +203,55 @@ def test_what_cannot_touch_is_refused(part, message):
     with pytest.raises(ValueError, match=f"'touch': .*{message}"):
         own = part()
         own.resolve(PLANE, jnp.zeros((len(own.bodies), 3)))
+
+
+ROOF = np.array([[-1.0, -0.5], [0.0, 0.0], [1.0, -0.5]])
+
+
+def roof(edge=0.1, **options):
+    """Two sides and a base, a closed chain, each of its own body; the disc comes from above."""
+    corners = {"start": ROOF, "end": np.roll(ROOF, -1, axis=0)}
+    names = ("disc", "left", "right", "base")
+    part = planar.PlateContact("roof", names, radius=0.2, edge=edge, **corners, **options)
+    return part.resolve(PLANE, jnp.zeros((4, 3)))
+
+
+def test_the_corners_of_a_chain_bear():
+    """On the ridge of a roof a disc rests as on a point; no side alone bears it there."""
+    poses = jnp.zeros((4, 3)).at[0, 1].set(0.19)
+    on_disc = lambda part: part.wrenches(PLANE, poses, jnp.zeros((4, 3)), 0.0)[0]
+    np.testing.assert_allclose(on_disc(roof(edge=0.05, chain=True, **SHARP)), [0.0, 4e4 * 0.01, 0.0], atol=1e-6)
+    np.testing.assert_allclose(on_disc(roof(edge=0.05, **SHARP)), 0.0, atol=1e-6)
+    # On a side, away from its ends, the chain makes no difference.
+    poses = poses.at[0, :2].set(jnp.array([0.5, -0.25]) + 0.19 * jnp.array([1.0, 2.0]) / np.sqrt(5.0))
+    np.testing.assert_allclose(on_disc(roof(chain=True, **LAWS)), on_disc(roof(**LAWS)), rtol=1e-12)
+
+
+def test_forces_at_corners_follow_from_the_energy_and_balance():
+    """Also where the plates are not quite joined; and those of friction and damping balance, too, and take energy."""
+    rng, still = np.random.default_rng(3), jnp.zeros((4, 3))
+    places = jnp.asarray([(x, y, 0.3) for x in (-0.08, -0.02, 0.0, 0.03, 0.09) for y in (0.1, 0.13, 0.16)])
+    poses = jnp.zeros((len(places), 4, 3)).at[:, 0].set(places)
+    poses = poses.at[:, 1:].add(0.01 * jnp.asarray(rng.normal(size=(len(places), 3, 3))))
+    velocities = jnp.asarray(rng.normal(size=poses.shape))
+    elastic, losing = roof(chain=True, **SHARP | {"smoothing": 1e-3}), roof(chain=True, **LAWS)
+
+    @jax.jit
+    @jax.vmap
+    def found(poses, velocities):
+        falls = -jax.grad(lambda poses: elastic.energy(PLANE, poses, 0.0))(poses)
+        return elastic.wrenches(PLANE, poses, still, 0.0), falls, losing.wrenches(PLANE, poses, velocities, 0.0)
+
+    pushes, falls, losses = map(np.asarray, found(poses, velocities))
+    assert np.all(np.abs(pushes[:, 0, 1]) > 10.0)
+    np.testing.assert_allclose(pushes, falls, rtol=0, atol=1e-9 * 4e4)
+    for wrenches in (pushes, losses):
+        moment = poses[:, :, 0] * wrenches[:, :, 1] - poses[:, :, 1] * wrenches[:, :, 0] + wrenches[:, :, 2]
+        np.testing.assert_allclose(np.sum(wrenches[:, :, :2], axis=1), 0.0, atol=1e-9 * 4e4)
+        np.testing.assert_allclose(np.sum(moment, axis=1), 0.0, atol=1e-9 * 4e4)
+    assert np.all(np.sum((losses - pushes) * velocities, axis=(1, 2)) < 0.0)
+
+
+def test_what_is_no_chain_is_refused():
+    with pytest.raises(ValueError, match="closed chain has three plates at least, got 1"):
+        collision(plate(chain=True, **LAWS), (0.0, 0.25))

@@ -14,6 +14,7 @@ from jaxmb.mechanisms import ride
 from jaxmb.mechanisms._shoe_track import _laid
 
 SHOE, PITCH, HEIGHT, RADII = 36.0, 0.1524, 0.06, {"sprocket": 0.2, "idler": 0.2, "wheel": 0.305}
+TIMES = jnp.linspace(0.0, 1.0, 101)
 BUMP = {"length": 5.0, "peak": 0.15}
 WHEELS = np.array([[1.351 - 0.667 * k, 0.365] for k in range(5)])
 
@@ -183,3 +184,30 @@ def test_over_a_long_bump_as_with_an_elastic_track():
     # Running needs the tension that turns the shoes' momentum around, m v² / pitch, on top of that at rest.
     tension = np.mean(ride.track_tension(sol)[10:50])
     assert tension == pytest.approx(1.5e4 + SHOE * 5.0**2 / PITCH, rel=0.1)
+
+
+@pytest.mark.long
+def test_several_hundred_short_shoes_run_over_a_bump():
+    """Two carriers on tracks of half the pitch, which turn sharply between wheels: no wheel sinks in at the corners
+    between two shoes, and no track buckles.
+    """
+    pitch, height = 0.5 * PITCH, 0.05
+    short = mechanisms.tracked_vehicle(units=2, track=mechanisms.Shoes(pitch=pitch, mass=0.5 * SHOE, height=height))
+    names = short.system.body_names
+    assert len(names) == 268
+    run = jit_to_run_long(
+        lambda state: mb.simulate(short.system, state, t1=1.0, rtol=1e-4, saveat=TIMES, max_steps=40_000)
+    )
+    sol = run(short.state)
+    assert np.all(sol.constraint_violation.position <= 1e-12)
+    for p in ("", "rear_"):
+        shoes, wheels = (bodies(sol, f"{p}{kind}") for kind in ("shoe", "wheel"))
+        assert len(shoes[0]) == 122 and len(wheels[0]) == 5
+        bend = np.diff(np.concatenate([shoes[..., 2], shoes[:, :1, 2]], axis=1), axis=1)
+        assert np.max(np.abs((bend + np.pi) % (2 * np.pi) - np.pi)) < 0.7
+        between = wheels[:, :, None, :2] - shoes[:, None, :, :2]
+        c, s = np.cos(shoes[:, None, :, 2]), np.sin(shoes[:, None, :, 2])
+        along, across = c * between[..., 0] + s * between[..., 1], c * between[..., 1] - s * between[..., 0]
+        distance = np.hypot(np.maximum(np.abs(along) - pitch / 2, 0.0), across - height / 2)
+        assert np.min(distance) > RADII["wheel"] - 0.03
+    assert np.min(np.diff(sol["hull"].position[:, 0])) > 0.0

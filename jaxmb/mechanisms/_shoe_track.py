@@ -28,12 +28,9 @@ class Shoes:
     """A track of rigid shoes on pins, for `tracked_vehicle(track=Shoes(...))`. One body stands for a left and right
     pair.
 
-    Shoes touch sprocket, idler and wheels on their inner side, and the ground at two points, a quarter of their pitch
-    from their middle.
-
-    Stiffness and damping are those of one shoe, not of a length of track. Discs rest on the flat sides of shoes: one
-    sinks in between shoes that bend towards it. The default track runs without this; one of half the pitch, with the
-    same numbers, buckles under the wheels in half a second.
+    Shoes touch sprocket, idler and wheels on their inner side and at the corners between them, and the ground at two
+    points, a quarter of their pitch from their middle. Stiffness and damping are those of one shoe, not of a length of
+    track.
 
     **Fields:** `number` of shoes, default the one for which the idler stands closest to its design position; `pitch`
     [m], the distance of their pins, and `height` [m]; `mass` [kg] of a shoe; radii [m] and masses [kg] of `sprocket`
@@ -126,6 +123,7 @@ def shoe_track(
                 start=(-half[0], shoes.height / 2),
                 end=(half[0], shoes.height / 2),
                 edge=shoes.pitch / 4,
+                chain=True,
                 normal=contact.Linear(shoes.rim_stiffness),
                 friction=contact.Coulomb(coefficient, transition_speed=speed),
                 damping=damping,

@@ -12,7 +12,7 @@ import numpy as np
 from .._results import RESULTS
 from .._types import State
 from ..formulations import Multipliers
-from ..manifold import AbstractManifold, Baumgarte, Partition, Projection
+from ..manifold import AbstractManifold, Baumgarte, Partition
 from ..manifold.default import default_manifold
 from ..mechanisms import Mechanism, References
 from ..simulate import simulate
@@ -190,9 +190,9 @@ def _sparse_methods(system: AbstractSystem) -> dict[str, tuple[Any, ...]]:
     methods = {}
     for solver in (Adams(), Hermite()):
         manifold = default_manifold(system, solver, None)
-        if not isinstance(manifold, Projection):
+        if manifold == Partition():
             continue
-        # `default_manifold` chooses projection for scenes with sparse elimination only.
+        # Constrained systems are projected by multistep methods only with sparse elimination, which scenes have.
         scene: Any = system
         factor, newton = scene.elimination.nodes.factor_flops, 0.0
         if solver.solves_implicitly:

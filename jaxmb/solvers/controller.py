@@ -13,7 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import check_real, evaluate, first_chart, ravel
+from ._evaluation import check_real, check_term, evaluate, first_chart, ravel
 from ._order import StepEstimate
 from ._scales import RunningScales
 from ._tolerances import MultistepNorm, Tolerances, norm_of
@@ -140,6 +140,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         error_order: Any,
     ) -> tuple[Any, ControllerState]:
         del func, error_order
+        check_term(terms)
         check_real(y0)
         self._check_resolution(y0)
         if dt0 is None:

@@ -6,6 +6,7 @@ body, so contact adds no constraint and no event.
 
 import abc
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -20,6 +21,22 @@ Number = Float[Array, ""]
 Vector = Float[Array, "2"]
 # The numbers that describe a surface.
 Surface = tuple[Array, ...]
+
+
+class _Disc:
+    """A disc whose centre is fixed in a body; `middle` is where that is in the world."""
+
+    def __init__(self, pose, velocity, centre, space):
+        self.pose, self.velocity, self.space = pose, velocity, space
+        self.middle = space.point(pose, centre)
+
+    def velocity_at(self, x):
+        """The velocity of the body's point at a place of the world."""
+        return self.space.point_velocity(self.pose, self.velocity, self.space.body_point(self.pose, x))
+
+    def wrench(self, x, force):
+        """The wrench on the body of a force at a place of the world."""
+        return self.space.point_force(self.pose, self.space.body_point(self.pose, x), force)
 
 
 class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
@@ -53,9 +70,8 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         """Fraction of the force, from 0 to 1, where the disc's centre is at a point of the other body's frame."""
 
     def wrenches(self, space, poses, velocities, t):
-        centre = space.point(poses[0], self.centre)
-        travel = space.point_velocity(poses[0], velocities[0], self.centre)
-        own = lambda *other: self._pair(space, poses[0], velocities[0], centre, travel, *other)
+        disc = _Disc(poses[0], velocities[0], self.centre, space)
+        own = lambda *other: self._pair(space, disc, *other)
         on_disc, on_others = jax.vmap(own)(poses[1:], velocities[1:], self.surfaces())
         return jnp.concatenate([jnp.sum(on_disc, axis=0, keepdims=True), on_others])
 
@@ -71,27 +87,42 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     def _energy(self, place, surface):
         return self.share(place, surface) * self.normal.energy(self._depth(place, surface))
 
-    def _pair(self, space, disc, disc_velocity, centre, travel, pose, velocity, surface):
+    def _pair(self, space, disc, pose, velocity, surface):
         """Wrenches on the disc's body and on another one."""
-        place = space.body_point(pose, centre)
+        place = space.body_point(pose, disc.middle)
         elastic = -space.direction(pose, jax.grad(self._energy)(place, surface))
         normal = space.direction(pose, jax.grad(self.distance)(place, surface))
         share, depth = self.share(place, surface), self._depth(place, surface)
+        on_disc, on_others = self._losses(space, disc, pose[None], velocity[None], normal, share, depth)
+        on_disc = on_disc + space.point_force(disc.pose, self.centre, elastic)
+        return on_disc, on_others[0] + space.point_force(pose, place, -elastic)
+
+    def _losses(self, space, disc, poses, velocities, normal, share, depth):
+        """Wrenches of damping and friction on the disc's body, and on those that touch it with one surface, each of
+        which takes an equal part.
+        """
+        equal = 1.0 / len(poses)
+
+        def surface_velocity(x):
+            at = lambda pose, velocity: space.point_velocity(pose, velocity, space.body_point(pose, x))
+            return equal * jnp.sum(jax.vmap(at)(poses, velocities), axis=0)
+
+        def reactions(x, force):
+            return jax.vmap(lambda pose: space.point_force(pose, space.body_point(pose, x), -equal * force))(poses)
+
         engaged = share * step(depth / self.damping_depth)
-        relative = travel - space.point_velocity(pose, velocity, place)
+        relative = disc.velocity_at(disc.middle) - surface_velocity(disc.middle)
         # Normal forces pass through the centre, so that they have the same wrench there as at the deepest point.
-        push = elastic - self.damping * engaged * jnp.dot(relative, normal) * normal
-        on_disc = space.point_force(disc, self.centre, push)
-        on_other = space.point_force(pose, place, -push)
+        push = -self.damping * engaged * jnp.dot(relative, normal) * normal
+        on_disc, on_others = disc.wrench(disc.middle, push), reactions(disc.middle, push)
         if self.friction is None:
-            return on_disc, on_other
-        touching = centre - self.radius * normal
-        here, there = space.body_point(disc, touching), space.body_point(pose, touching)
+            return on_disc, on_others
+        touching = disc.middle - self.radius * normal
         along = lambda v: v - jnp.dot(v, normal) * normal
-        slip = space.point_velocity(disc, disc_velocity, here) - space.point_velocity(pose, velocity, there)
+        slip = disc.velocity_at(touching) - surface_velocity(touching)
         load = share * self.normal.force(depth)
         rub = self.friction.force(load, engaged, along(slip), along(relative))
-        return on_disc + space.point_force(disc, here, rub), on_other + space.point_force(pose, there, -rub)
+        return on_disc + disc.wrench(touching, rub), on_others + reactions(touching, rub)
 
     def _rows(self, value, shape):
         """A number given once, or once for each of the other bodies, as one for each."""
@@ -118,6 +149,11 @@ class PlateContact(AbstractBodyContact):
     distance `edge` before the end to zero as far behind it. A disc that rolls from a plate to the next one in line is
     thus borne by both as by one, whatever its depth.
 
+    Plates of a chain that bends away from the disc leave a gap at its corners, where neither of two plates bears. With
+    `chain=True` the plates form a closed chain, each beginning where the one before it ends, and their corners bear:
+    the depth is measured from the point between the two ends, the potential is that of `normal` times the share that
+    both plates leave, and each of them takes half of the force.
+
     The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
 
     **Arguments:**
@@ -127,6 +163,7 @@ class PlateContact(AbstractBodyContact):
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the mass centre.
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
     - `edge` [m] > 0, at most half as long as a plate.
+    - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least.
     - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
     - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
@@ -134,9 +171,12 @@ class PlateContact(AbstractBodyContact):
     start: fields.Number = fields.parameter(shape=None, unit="m")
     end: fields.Number = fields.parameter(shape=None, unit="m")
     edge: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    chain: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def validate(self):
         self._check_rows(start=(2,), end=(2,))
+        if self.chain and len(self.bodies) < 4:
+            raise ValueError(f"{self.label}: a closed chain has three plates at least, got {len(self.bodies) - 1}.")
         start, end = self.surfaces()
         shortest = float(jnp.min(norm(end - start)))
         if not 0 < 2 * self.edge <= shortest:
@@ -154,8 +194,61 @@ class PlateContact(AbstractBodyContact):
 
     def share(self, place, surface):
         (past, _), length = _along(place, *surface)
-        fade = lambda inside: step(0.5 * (inside / self.edge + 1.0))
-        return fade(past) * fade(length - past)
+        return self._fade(past) * self._fade(length - past)
+
+    def wrenches(self, space, poses, velocities, t):
+        out = super().wrenches(space, poses, velocities, t)
+        if not self.chain:
+            return out
+        disc = _Disc(poses[0], velocities[0], self.centre, space)
+        corner = lambda *own: self._corner(space, disc, *own)
+        on_disc, on_ends, on_starts = jax.vmap(corner)(*_corners(poses[1:], velocities[1:], *self.surfaces()))
+        return out + jnp.concatenate(
+            [jnp.sum(on_disc, axis=0, keepdims=True), on_ends + jnp.roll(on_starts, 1, axis=0)]
+        )
+
+    def energy(self, space, poses, t):
+        out = super().energy(space, poses, t)
+        if not self.chain:
+            return out
+        middle = space.point(poses[0], self.centre)
+
+        def own(poses, _, starts, ends):
+            first, second = (space.body_point(pose, middle) for pose in poses)
+            return self._corner_energy(first, second, middle - _between(space, poses, starts, ends), starts, ends)
+
+        return out + jnp.sum(jax.vmap(own)(*_corners(poses[1:], poses[1:], *self.surfaces())))
+
+    def _fade(self, inside):
+        return step(0.5 * (inside / self.edge + 1.0))
+
+    def _corner_share(self, first, second, starts, ends):
+        """What both plates leave near the end of the first and the start of the second, without a kink."""
+        (past, _), length = _along(first, starts[0], ends[0])
+        (ahead, _), _ = _along(second, starts[1], ends[1])
+        return step(1.0 - self._fade(length - past) - self._fade(ahead))
+
+    def _corner_depth(self, way):
+        return ramp(self.radius - norm(way), self.smoothing)
+
+    def _corner_energy(self, first, second, way, starts, ends):
+        return self._corner_share(first, second, starts, ends) * self.normal.energy(self._corner_depth(way))
+
+    def _corner(self, space, disc, poses, velocities, starts, ends):
+        """Wrenches on the disc's body, on that of the plate that ends at a corner, and on that of the next one."""
+        first, second = (space.body_point(pose, disc.middle) for pose in poses)
+        way = disc.middle - _between(space, poses, starts, ends)
+        slopes = jax.grad(self._corner_energy, (0, 1, 2))(first, second, way, starts, ends)
+        on_first, on_second = (space.direction(pose, slope) for pose, slope in zip(poses, slopes[:2], strict=True))
+        share, depth = self._corner_share(first, second, starts, ends), self._corner_depth(way)
+        on_disc, losses = self._losses(space, disc, poses, velocities, way / norm(way), share, depth)
+        on_disc = on_disc + disc.wrench(disc.middle, -(on_first + on_second + slopes[2]))
+
+        def on_plate(pose, place, push, tip):
+            return space.point_force(pose, place, push) + space.point_force(pose, tip, 0.5 * slopes[2])
+
+        on_first = losses[0] + on_plate(poses[0], first, on_first, ends[0])
+        return on_disc, on_first, losses[1] + on_plate(poses[1], second, on_second, starts[1])
 
 
 def _along(place, start, end):
@@ -163,6 +256,16 @@ def _along(place, start, end):
     way, d = end - start, place - start
     length = norm(way)
     return (jnp.dot(d, way) / length, (way[0] * d[1] - way[1] * d[0]) / length), length
+
+
+def _corners(poses, velocities, starts, ends):
+    """Pairs of consecutive plates of a closed chain, shapes (plates, 2, …)."""
+    return tuple(jnp.stack([x, jnp.roll(x, -1, axis=0)], axis=1) for x in (poses, velocities, starts, ends))
+
+
+def _between(space, poses, starts, ends):
+    """The point in the middle between the end of a plate and the start of the next."""
+    return 0.5 * (space.point(poses[0], ends[0]) + space.point(poses[1], starts[1]))
 
 
 class DiscContact(AbstractBodyContact):
