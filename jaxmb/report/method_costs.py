@@ -115,8 +115,8 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
     and times are also given in units of its time.
 
     Operations of linear algebra are counted for full matrices: elimination of the constraints and the Cholesky factor
-    of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods. With sparse
-    elimination, those of its blocks are counted.
+    of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods. Where A M⁻¹ Aᵀ
+    is eliminated sparsely, as multipliers and projections do in large scenes, those of its blocks are counted.
 
     **Arguments:** `errors`: bounds on the largest relative error at the end of the quantities that the mechanism
     observes; `repeats`: timed runs of each, in turns, of which the shortest counts.
@@ -171,7 +171,8 @@ def _simulations(mechanism: Mechanism, known: References) -> dict[str, _Method]:
     # Gauss–Jordan on m × n at predicted states only; the reduced mass matrix and its Cholesky factor at all states.
     reduced = 2 * free * free * n + free**3 / 3
     eliminated = 2 * m * m * n
-    multipliers = m * m * n + m**3 / 3
+    sparse = system.elimination
+    multipliers = m * m * n + m**3 / 3 if sparse is None else sparse.nodes.factor_flops
     # One complex matrix of the free coordinates and velocities is inverted.
     newton = 8 * (2 * free) ** 3
     stabilised = Baumgarte(_RATE)
