@@ -106,8 +106,8 @@ def project_in_metric(
     scale = fixed_system.velocity_scale()
 
     def projector_at(q):
-        at = State(q, before.u)
-        return binding_velocities(fixed_system, fixed_t, q, at.u).projector(metric_of(fixed_system, fixed_t, at))
+        metric = metric_of(fixed_system, fixed_t, State(q, before.u))
+        return binding_velocities(fixed_system, fixed_t, q, before.u).projector(metric)
 
     def correction(projector, q):
         step = projector.cancel(position_rows(fixed_system, fixed_t, q))
