@@ -3,9 +3,12 @@
 import math
 import re
 
+import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_quickly
 from oracles import large
 
 import jaxmb as mb
@@ -128,3 +131,29 @@ def test_a_long_row_of_four_bars_is_assembled():
 def test_what_cannot_be_built_is_refused(name, parameters, message):
     with pytest.raises(ValueError, match=message):
         mb.mechanisms.get(name, **parameters)
+
+
+@pytest.mark.long
+def test_derivatives_of_states_between_steps():
+    """Interpolated states are projected on the constraints by sparse elimination: forward mode, reverse mode and
+    differences, under `jit` and `vmap`.
+    """
+    mechanism = mb.mechanisms.get("rod_chain", n=20)
+    system, times = mechanism.system, jnp.array([0.0513, 0.1177])
+    assert system.elimination is not None
+    mass = mb.parameters(system)["link4.mass"]
+
+    def saved(share, rtol, adjoint):
+        own = mb.with_parameters(system, {"link4.mass": mass * (1.0 + share)})
+        y = mb.simulate(own, mechanism.state, t1=0.15, saveat=times, rtol=rtol, adjoint=adjoint).ys
+        return jnp.cos(jnp.arange(float(system.nq))) @ y.q[0] + jnp.sin(jnp.arange(float(system.nu))) @ y.u[1]
+
+    along = lambda s, rtol: jax.jvp(lambda s: saved(s, rtol, diffrax.ForwardMode()), (s,), (1.0,))
+    forward = jit_quickly(jax.vmap(along, (0, None)))
+    reverse = jit_quickly(jax.vmap(jax.grad(lambda s: saved(s, 1e-9, None))))(jnp.zeros(2))
+    h = 2e-3
+    found = forward(jnp.zeros(4), 1e-9)[1][0]
+    value = np.asarray(forward(h * jnp.array([-2.0, -1.0, 1.0, 2.0]), 1e-12)[0])
+    difference = (8 * (value[2] - value[1]) - (value[3] - value[0])) / (12 * h)
+    np.testing.assert_allclose(reverse, found, rtol=1e-9)
+    np.testing.assert_allclose(found, difference, rtol=1e-7)
