@@ -1,5 +1,5 @@
 """A function of named parameters over many cases, in chunks, on several processes and devices, with a store on disk."""
 
 from . import cases as cases
-from .dataset import load_sweep as load_sweep
+from .load import load_sweep as load_sweep
 from .sweep import sweep as sweep

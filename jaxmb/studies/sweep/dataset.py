@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,28 +63,6 @@ def in_memory(described: Mapping[str, Any], attrs: Mapping[str, Any], computed: 
     (xarray,) = packages("xarray")
     made = {name: (dims, computed.get(name, values), attrs) for name, (dims, values, _, attrs) in described.items()}
     return unstacked(xarray.Dataset(made, attrs=dict(attrs)).set_coords(attrs["coordinates"].split()))
-
-
-def load_sweep(store: str | Path) -> Any:
-    """Read the result of a sweep, also while it runs.
-
-    **Arguments:** `store`, the folder that `sweep` was given.
-
-    **Returns:** an `xarray.Dataset` like that of `sweep`. A sweep over a grid has a dimension for each parameter of it
-    and is read as a whole; of a list of members only what is looked at is read. `xarray.open_zarr(store)` gives the
-    same variables along the one dimension `member`. Members that are not computed yet have status 0 and are NaN, or
-    zero where an output is of integers.
-
-    **Raises:** `ValueError` for a folder that holds no sweep; `ImportError` without the packages of `jaxmb[studies]`.
-    """
-    xarray, zarr = packages("xarray", "zarr")
-    try:
-        dataset = xarray.open_zarr(store, chunks=None)
-    except (FileNotFoundError, zarr.errors.GroupNotFoundError):
-        raise ValueError(f"{store} holds no sweep; the folder is not there, or is no zarr store.") from None
-    if "grid" not in dataset.attrs or "status" not in dataset:
-        raise ValueError(f"{store} holds no sweep, but another zarr store.")
-    return unstacked(dataset)
 
 
 def unstacked(dataset: Any) -> Any:

@@ -3,7 +3,7 @@
 import contextlib
 import importlib.metadata
 import os
-import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -15,10 +15,11 @@ import numpy as np
 
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
-from .cases import table
+from .cases import Cases, table
 from .engine import Task, here, on_executor, on_processes
 from .identity import identity_of_cases, identity_of_function, identity_of_outputs
 from .labels import described
+from .load import load_sweep
 from .outputs import RESERVED, check_parameters, declared, step_limit
 from .progress import shown_progress
 
@@ -43,6 +44,7 @@ def sweep(
     devices: int | Sequence[Any] | None = None,
     progress: bool = True,
     overwrite: bool = False,
+    version: str | int | None = None,
 ) -> Any:
     """Compute a function for many cases of its parameters.
 
@@ -63,7 +65,8 @@ def sweep(
     - `function`: gets the parameters of one member by keyword, as JAX arrays, and returns a dictionary of outputs by
         name: arrays of any shape; a dictionary within it gives `outer.inner`. Under the name `result` it may return a
         `Trajectory` (of `simulate(..., throw=False)`), or its `result`, which becomes the member's status and message,
-        and its number of steps. The function is pure and traced by JAX: parameters are not known as numbers in it.
+        and its number of steps. The function is pure and traced by JAX: parameters are not known as numbers in it, so
+        that `if` and `float()` do not work on what depends on them; `jnp.where` and `jax.lax.cond` do.
     - `cases`: from `jaxmb.cases.grid`, `table` or `sobol`; or whatever `table` takes: columns of equal length by
         name, a pandas DataFrame, an xarray Dataset.
     - `store`: a folder to write to, as zarr format 3; it must be seen by all processes. Without it the result is in
@@ -89,9 +92,12 @@ def sweep(
         `jax.distributed.initialize()`, give each call its own part of the cases and its own store, and
         `devices=jax.local_devices()`; a sweep needs no communication.
     - `progress`: whether to show what is done and the time that is left, in one line.
-    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases and outputs, the
-        source of its function, and the numbers and functions of the same module that this one refers to; functions that
-        it imports count by their names.
+    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases, its outputs, its
+        function and all that this one refers to: functions and classes by their code, systems and other objects by all
+        that they hold, names and choices as well as numbers. What an installed package defines counts by its name, and
+        by the file that defines it; what jaxmb itself rests on, such as JAX, by its name alone.
+    - `version`: a text or number of your own, by which the sweep is known besides. It stands for what cannot be told
+        apart otherwise, such as an open file or a function of a compiled language: change it when that changes.
 
     **Returns:** an `xarray.Dataset`, with a dimension for each parameter of a grid, or else with the dimension
     `member`; parameters are coordinates. With the outputs there are `status`: 0 pending, 1 ok, 2 an output is not
@@ -100,9 +106,10 @@ def sweep(
     at.
 
     **Raises:** `ValueError` for names that are unknown, missing, or there twice, for values that do not fit, for a
-    function that returns no dictionary of arrays or is not pure, and for a store of another sweep; `OSError` if the
-    store cannot be written, as on a full disk: what is done is kept, and the same call again goes on; `RuntimeError` if
-    processes die again and again; `ImportError` without the packages of `jaxmb[studies]`. An interruption (Ctrl-C)
+    function that returns no dictionary of arrays or is not pure or needs the number of a parameter, for a store of
+    another sweep, and for a function that holds something that no store can know again, without `version`; `OSError`
+    if the store cannot be written, as on a full disk: what is done is kept, and the same call again goes on;
+    `RuntimeError` if processes die again and again, and if another process writes the store; `ImportError` without the packages of `jaxmb[studies]`. An interruption (Ctrl-C)
     keeps what is done as well.
 
     That a sweep ends with the same bits however often it was interrupted holds for one kind of processor, one version
@@ -122,10 +129,14 @@ def sweep(
     )
     variables = described(cases, outputs, dims or {}, coords or {}, units or {})
     path = None if store is None else Path(store)
+    hashed, unknown = identity_of_function(function)
+    _check_version(version, {} if path is None else unknown)
     known = {
-        "jaxmb_version": _version(),
+        "jaxmb_version": _installed_version(),
+        "python": sys.implementation.cache_tag,
         "x64": str(jnp.result_type(float) == jnp.float64),
-        "function": identity_of_function(function),
+        "version": "" if version is None else str(version),
+        "function": hashed,
         "cases": identity_of_cases(cases),
         "outputs": identity_of_outputs(variables, cases),
     }
@@ -143,25 +154,44 @@ def sweep(
     elif budget is not None:
         batch = batch.limited(_checked_budget(batch, budget))
     attrs = dataset.attributes(cases, {**known, "chunk": batch.chunk, "budget": batch.budget})
-    computed = _empty(variables) if path is None else {}
-    count, done = -(-len(cases) // batch.chunk), {}
-    if path is not None:
-        with _clear_errors(path):
-            if before is None:
-                _replace(path, overwrite)
-                stores.create(path, variables, attrs, batch.chunk)
-            done = {index: values["status"] for index, values in stores.chunks(stores.Store(path, batch.chunk), count)}
-    own = lambda index: slice(index * batch.chunk, (index + 1) * batch.chunk)
-    tasks = (Task(index, cases[own(index)]) for index in range(count) if index not in done)
-    with shown_progress(progress, cases, done) as advance, _clear_errors(path):
-        for index, values in _chunks(batch, path, tasks, processes, executor):
-            for name, value in values.items() if path is None else ():
-                computed[name][own(index)] = value
-            advance(values["status"])
     if path is None:
+        computed = _empty(variables)
+        for members, values in _results(batch, None, cases, {}, progress, processes, executor):
+            for name, value in values.items():
+                computed[name][members] = value
         return dataset.in_memory(variables, attrs, computed)
-    stores.remove_leftovers(path)
-    return dataset.load_sweep(path)
+    with _clear_errors(path):
+        if before is None:
+            if overwrite and stores.study_of(path) is not None:
+                stores.remove(path)
+            stores.create(path, variables, attrs, batch.chunk)
+        with stores.alone(path):
+            stores.mend(path, variables, batch.chunk)
+            count = -(-len(cases) // batch.chunk)
+            done = {index: values["status"] for index, values in stores.chunks(stores.Store(path, batch.chunk), count)}
+            for _ in _results(batch, path, cases, done, progress, processes, executor):
+                pass
+            stores.remove_leftovers(path)
+    return load_sweep(path)
+
+
+def _results(
+    batch: Batch,
+    path: Path | None,
+    cases: Cases,
+    done: Mapping[int, np.ndarray],
+    progress: bool,
+    processes: int,
+    executor: Executor | None,
+) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """The members and outputs of each chunk that is not done, as they are computed."""
+    own = lambda index: slice(index * batch.chunk, (index + 1) * batch.chunk)
+    count = -(-len(cases) // batch.chunk)
+    tasks = (Task(index, cases[own(index)]) for index in range(count) if index not in done)
+    with shown_progress(progress, cases, done) as advance:
+        for index, values in _chunks(batch, path, tasks, processes, executor):
+            yield own(index), values
+            advance(values["status"])
 
 
 def _chunks(batch: Batch, path: Path | None, tasks: Iterator[Task], processes: int, executor: Executor | None):
@@ -227,8 +257,25 @@ def _checked_budget(batch: Batch, budget: Any) -> int:
     return int(budget)
 
 
+# What a sweep is known by, where the name of the attribute does not say it.
+_WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
+
+
+def _check_version(version: Any, unknown: Mapping[str, str]) -> None:
+    """Refuse what a store cannot know again, unless a version stands for it."""
+    if isinstance(version, bool) or not isinstance(version, str | int | None):
+        raise ValueError(f"version must be a text or an integer, got {version!r}.")
+    if unknown and version is None:
+        place, kind = next(iter(unknown.items()))
+        more = f" (and {len(unknown) - 1} more like it)" if len(unknown) > 1 else ""
+        raise ValueError(
+            f"The function of the sweep uses {place}, a {kind}{more}, and a store cannot tell whether that has changed. "
+            "Give version=, a text or number that you change when it changes, or leave out the store."
+        )
+
+
 def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, str], chunk: Any, budget: Any) -> None:
-    differing = [name.replace("jaxmb_version", "version of jaxmb") for name in known if before.get(name) != known[name]]
+    differing = [_WORDS.get(name, name) for name in known if before.get(name) != known[name]]
     if differing:
         raise ValueError(
             f"The store {path} holds another sweep: the {' and '.join(differing)} differ. Give another path, or "
@@ -239,13 +286,7 @@ def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, 
             raise ValueError(f"The store {path} was begun with {name}={kept}, got {given!r}; leave it out to go on.")
 
 
-def _replace(path: Path, overwrite: bool) -> None:
-    """Remove the store of another sweep, and nothing else."""
-    if overwrite and stores.study_of(path) is not None:
-        shutil.rmtree(path)
-
-
-def _version() -> str:
+def _installed_version() -> str:
     try:
         return importlib.metadata.version("jaxmb")
     except importlib.metadata.PackageNotFoundError:
