@@ -87,6 +87,20 @@ def test_wrong_words(words, message, capsys, tmp_path):
     assert message in capsys.readouterr().err
 
 
+def test_a_report_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text("def scene(mass, length=1.0):\n    raise ValueError('called')\n")
+    words = ["report", f"{file}:scene", "--out", str(tmp_path / "out")]
+    for given, message in (
+        ([], "own.py:scene: missing a required argument: 'mass'; --set NAME=VALUE"),
+        (["--set", "mas=2"], "missing a required argument: 'mass'"),
+        (["--set", "mass=1", "--set", "lenth=2"], "got an unexpected keyword argument 'lenth'"),
+        (["--set", "mass=1"], "called"),
+    ):
+        assert main([*words, *given]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_no_traceback_of_wrong_values(capsys, tmp_path):
     """One line, whatever the mechanism did with the value."""
     assert main(["run", "four_bar", "--set", "speed=fast", "--out", str(tmp_path)]) == 2

@@ -108,6 +108,86 @@ def test_a_store_can_be_read_while_it_is_written(undisturbed, tmp_path):
     assert np.all(found["message"][40:50] == "Not computed yet.") and np.all(found["status"][50:] != 0)
 
 
+def test_a_store_that_lost_files_says_so_and_is_mended(undisturbed, tmp_path):
+    """A chunk, a variable with its metadata, a coordinate."""
+    store = tmp_path / "runs.zarr"
+    shutil.copytree(undisturbed[0], store)
+    before = files(store)
+    (store / "wave" / "c" / "7" / "0").unlink()
+    with pytest.raises(ValueError, match=r"has lost 'wave' of the members 70 to 79, which.*computes what is lost"):
+        mb.load_sweep(store)
+    shutil.rmtree(store / "more.square")
+    with pytest.raises(ValueError, match=r"has lost .* and 81 other chunks"):
+        mb.load_sweep(store)
+    shutil.rmtree(store / "a" / "c")
+    with pytest.raises(ValueError, match=r"has lost .* and 82 other chunks"):
+        mb.load_sweep(store)
+    with pytest.warns(UserWarning, match="damaged"):
+        xr.testing.assert_identical(run(store).load(), undisturbed[1].load())
+    assert files(store) == before
+
+
+def test_metadata_that_were_changed_are_an_error_that_names_the_store(undisturbed, tmp_path):
+    def changed(place, change):
+        file = store / place / "zarr.json"
+        data = json.loads(file.read_text())
+        change(data)
+        file.write_text(json.dumps(data))
+
+    def of(name):
+        return lambda data: data["consolidated_metadata"]["metadata"][name]
+
+    for place, change, message in (
+        ("", lambda data: data.pop("attributes"), r"damaged.*zarr.json cannot be used \(KeyError"),
+        ("", lambda data: data["attributes"].update(chunk="ten"), "damaged.*chunk is 'ten'"),
+        ("", lambda data: data["attributes"].update(grid="["), "damaged"),
+        ("", lambda data: of("wave")(data).update(shape=[3, 4]), "damaged"),
+        ("", lambda data: of("wave")(data).update(codecs=[]), "damaged"),
+        ("", lambda data: of("status")(data)["attributes"].pop("messages"), "damaged"),
+        ("", lambda data: data["consolidated_metadata"]["metadata"].pop("status"), "damaged"),
+    ):
+        store = tmp_path / "runs.zarr"
+        shutil.copytree(undisturbed[0], store, dirs_exist_ok=True)
+        changed(place, change)
+        with pytest.raises(ValueError, match=message):
+            mb.load_sweep(store)
+    for change in (lambda data: data.update(shape=[3, 4]), lambda data: data.pop("data_type")):
+        shutil.copytree(undisturbed[0], store, dirs_exist_ok=True)
+        changed("wave", change)
+        with pytest.raises(ValueError, match="damaged: the metadata of 'wave' cannot be used.*overwrite=True"):
+            run(store)
+    (store / "zarr.json").write_text("{")
+    for read in (mb.load_sweep, run):
+        with pytest.raises(ValueError, match="damaged: zarr.json cannot be used"):
+            read(store)
+
+
+def test_a_second_sweep_does_not_write_a_store_at_the_same_time(tmp_path):
+    """Neither one that is there, nor one that another process has made between the look and the rename."""
+    store, cases, refused = tmp_path / "runs.zarr", mb.cases.table(a=[1.0, 2.0]), []
+    function = lambda a: {"x": 2 * a}
+
+    class Both(ThreadPoolExecutor):
+        """Starts the same sweep once more while the first one computes."""
+
+        def submit(self, *args, **kwargs):
+            for overwrite in (False, True):
+                with pytest.raises(RuntimeError, match="Another process is writing the store .*the same call goes on"):
+                    mb.sweep(function, cases, store, overwrite=overwrite, progress=False)
+                refused.append(overwrite)
+            return super().submit(*args, **kwargs)
+
+    with Both(1) as executor:
+        found = mb.sweep(function, cases, store, executor=executor, progress=False)
+    np.testing.assert_array_equal(found["x"], [2.0, 4.0])
+    assert refused == [False, True] and mb.sweep(function, cases, store, progress=False).identical(found)
+    before = files(store)
+    stores = sys.modules["jaxmb.studies.sweep.store"]
+    with pytest.raises(RuntimeError, match="Another process is writing the store"):
+        stores.create(store, {}, {}, 2)
+    assert files(store) == before and [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
+
+
 def test_the_store_of_another_study_is_refused(undisturbed, tmp_path):
     store = tmp_path / "runs.zarr"
     shutil.copytree(undisturbed[0], store)
@@ -164,6 +244,13 @@ def _random():
         (_counting(), {}, "not pure.*names, shapes or types of 'x1', 'x2'"),
         (_random(), {}, "not pure: traced twice, it has other numbers"),
         (lambda a: {"x": a + jnp.zeros((2,)) + jnp.zeros((3,))}, {}, "shapes"),
+        (
+            lambda a: {"x": a if a > 0 else -a},
+            {},
+            r"test_sweep.py:\d+: `.*if a > 0.*` needs a parameter as a number.*jnp",
+        ),
+        (lambda a: {"x": np.sin(a)}, {}, r"`.*np.sin\(a\).*` needs a parameter as a number, and .* is traced by JAX"),
+        (lambda a: {"x": jnp.arange(int(a))}, {}, r"`.*int\(a\).*` needs a parameter as a number"),
         (lambda a: {"x": a}, {"dims": {"y": []}}, "Unknown output in dims 'y'"),
         (lambda a: {"x": a}, {"dims": {"x": ["t"]}}, "must be a list of 0 names"),
         (lambda a: {"x": a * jnp.ones(2)}, {"dims": {"x": ["a"]}}, "'a' of 'x' has the name of something else"),
@@ -282,7 +369,7 @@ def test_the_command_line(capsys, tmp_path):
         ("study.py", 2, "There is no file"),
         (f"{file}:function", 2, "must be file.py or file.py:function:cases"),
         (f"{file}:functon:cases", 2, "did you mean 'function'"),
-        (f"{file}:bad:cases", 1, "ConcretizationTypeError"),
+        (f"{file}:bad:cases", 2, "study.py:7: `return {'x': float(a)}` needs a parameter as a number"),
     ):
         assert main(["sweep", source, *words[2:]]) == code
         assert message in capsys.readouterr().err

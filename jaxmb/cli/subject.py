@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import importlib
 import importlib.util
+import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -52,6 +53,12 @@ def _function(where: str) -> Callable[..., Any]:
 
 def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechanism:
     """The motion of a user's function: a scene, a mechanism, or system, state and perhaps t1."""
+    try:
+        inspect.signature(function).bind(**dict(arguments.set))
+    except TypeError as error:
+        raise ValueError(
+            f"{arguments.mechanism}: {error}; --set NAME=VALUE gives an argument, and the others need defaults."
+        ) from None
     given, *rest = made if isinstance(made := function(**dict(arguments.set)), tuple) else (made,)
     system = given.compile() if hasattr(given, "compile") else given
     if hasattr(system, "references"):

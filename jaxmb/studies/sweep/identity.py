@@ -128,7 +128,9 @@ class _Hash:
             # Functions that are compiled, cached, or have derivatives of their own.
             own = {k: v for k, v in getattr(value, "__dict__", {}).items() if k not in _OF_WRAPPERS}
             return "wrapper", [
-                self.of(type(value), path), self.of(value.__wrapped__, path), *self._attributes(own, path)
+                self.of(type(value), path),
+                self.of(value.__wrapped__, path),
+                *self._attributes(own, path),
             ]
         return "object", self._object(value, path)
 
@@ -171,7 +173,9 @@ class _Hash:
             and (callable(value) or not name.startswith("__"))
         }
         return [
-            kind.__name__.encode(), self.of(type(kind), path), self.of(kind.__bases__, path),
+            kind.__name__.encode(),
+            self.of(type(kind), path),
+            self.of(kind.__bases__, path),
             *self._attributes(own, (*path, f".{kind.__name__}")),
         ]
 

@@ -27,6 +27,8 @@ from .progress import shown_progress
 _CHUNK = 512
 # With fewer members it takes longer to compile a second program than any of them can hold up the others.
 _FEWEST_FOR_BUDGET = 64
+# What a sweep is known by, where the name of the attribute does not say it.
+_WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
 
 
 def sweep(
@@ -255,10 +257,6 @@ def _checked_budget(batch: Batch, budget: Any) -> int:
             "and that returns the trajectory as 'result'."
         )
     return int(budget)
-
-
-# What a sweep is known by, where the name of the attribute does not say it.
-_WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
 
 
 def _check_version(version: Any, unknown: Mapping[str, str]) -> None:
