@@ -154,11 +154,11 @@ def test_metadata_that_were_changed_are_an_error_that_names_the_store(undisturbe
     for change in (lambda data: data.update(shape=[3, 4]), lambda data: data.pop("data_type")):
         shutil.copytree(undisturbed[0], store, dirs_exist_ok=True)
         changed("wave", change)
-        with pytest.raises(ValueError, match="damaged: the metadata of 'wave' cannot be used.*overwrite=True"):
+        with pytest.raises(ValueError, match=r"damaged: the metadata of 'wave' cannot be used.*overwrite=True"):
             run(store)
     (store / "zarr.json").write_text("{")
     for read in (mb.load_sweep, run):
-        with pytest.raises(ValueError, match="damaged: zarr.json cannot be used"):
+        with pytest.raises(ValueError, match=r"damaged: zarr\.json cannot be used"):
             read(store)
 
 
@@ -172,7 +172,7 @@ def test_a_second_sweep_does_not_write_a_store_at_the_same_time(tmp_path):
 
         def submit(self, *args, **kwargs):
             for overwrite in (False, True):
-                with pytest.raises(RuntimeError, match="Another process is writing the store .*the same call goes on"):
+                with pytest.raises(RuntimeError, match=r"Another process is writing the store .*the same call goes on"):
                     mb.sweep(function, cases, store, overwrite=overwrite, progress=False)
                 refused.append(overwrite)
             return super().submit(*args, **kwargs)

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from .cases import Cases
 
@@ -135,9 +137,9 @@ class _Hash:
         return "object", self._object(value, path)
 
     def _array(self, value: Any, path: tuple[str, ...]) -> tuple[str, list[bytes]]:
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             return "traced", self._not_known(value, path)
-        if isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             return "key", [repr(value.dtype).encode(), self.of(jax.random.key_data(value), path)]
         array = np.asarray(value)
         if array.dtype.hasobject:

@@ -37,7 +37,7 @@ def load_sweep(store: str | Path) -> Any:
         name, members = lost[0]
         more = f" and {len(lost) - 1} other chunks" if len(lost) > 1 else ""
         raise ValueError(
-            f"The store {path} has lost {name!r} of the members {members.start} to {members.stop - 1}{more}, which were "
-            "computed. The same call of sweep with this store computes what is lost, and only that."
+            f"The store {path} has lost {name!r} of the members {members.start} to {members.stop - 1}{more}, which "
+            "were computed. The same call of sweep with this store computes what is lost, and only that."
         )
     return read

@@ -79,9 +79,9 @@ def _explained(error: Exception) -> str:
     lines = [f for f in traceback.extract_tb(error.__traceback__) if not is_installed(f.filename)]
     where = f"{lines[-1].filename}:{lines[-1].lineno}: `{lines[-1].line}`" if lines else "The function"
     return (
-        f"{where} needs a parameter as a number, and the function of a sweep is traced by JAX, for all members at once: "
-        "there is no `if`, `while`, `float()`, `int()` or NumPy function of what depends on a parameter. Use jnp.where "
-        "or jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy."
+        f"{where} needs a parameter as a number, and the function of a sweep is traced by JAX, for all members at "
+        "once: there is no `if`, `while`, `float()`, `int()` or NumPy function of what depends on a parameter. Use "
+        "jnp.where or jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy."
     )
 
 

@@ -109,10 +109,10 @@ def sweep(
 
     **Raises:** `ValueError` for names that are unknown, missing, or there twice, for values that do not fit, for a
     function that returns no dictionary of arrays or is not pure or needs the number of a parameter, for a store of
-    another sweep, and for a function that holds something that no store can know again, without `version`; `OSError`
-    if the store cannot be written, as on a full disk: what is done is kept, and the same call again goes on;
-    `RuntimeError` if processes die again and again, and if another process writes the store; `ImportError` without the packages of `jaxmb[studies]`. An interruption (Ctrl-C)
-    keeps what is done as well.
+    another sweep, and for a function that holds something that no store can know again, without `version`;
+    `OSError` if the store cannot be written, as on a full disk: what is done is kept, and the same call again goes
+    on; `RuntimeError` if processes die again and again, and if another process writes the store; `ImportError`
+    without the packages of `jaxmb[studies]`. An interruption (Ctrl-C) keeps what is done as well.
 
     That a sweep ends with the same bits however often it was interrupted holds for one kind of processor, one version
     of the packages and one `chunk`, also between processes and executors.
@@ -267,8 +267,8 @@ def _check_version(version: Any, unknown: Mapping[str, str]) -> None:
         place, kind = next(iter(unknown.items()))
         more = f" (and {len(unknown) - 1} more like it)" if len(unknown) > 1 else ""
         raise ValueError(
-            f"The function of the sweep uses {place}, a {kind}{more}, and a store cannot tell whether that has changed. "
-            "Give version=, a text or number that you change when it changes, or leave out the store."
+            f"The function of the sweep uses {place}, a {kind}{more}, and a store cannot tell whether that has "
+            "changed. Give version=, a text or number that you change when it changes, or leave out the store."
         )
 
 
