@@ -12,7 +12,7 @@ from ..studies.sweep import sweep
 from ..studies.sweep.outputs import OK
 from .subject import module_from
 
-_OPTIONS = ("dims", "coords", "units")
+_OPTIONS = ("dims", "coords", "units", "version")
 
 
 def add_to(commands: Any) -> None:
@@ -25,8 +25,8 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument(
         "source",
-        help="file.py, which defines `function` and `cases` as jaxmb.sweep takes them, and perhaps `dims`, `coords` "
-        "and `units`; or file.py:function:cases with other names",
+        help="file.py, which defines `function` and `cases` as jaxmb.sweep takes them, and perhaps `dims`, `coords`, "
+        "`units` and `version`; or file.py:function:cases with other names",
     )
     command.add_argument("--out", type=Path, required=True, help="folder of the store, such as runs.zarr")
     command.add_argument("--processes", type=int, default=1, help="processes on this machine (default %(default)d)")
