@@ -34,7 +34,4 @@ class FactoredMultipliers(AbstractFormulation):
     takes_blocks: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma):
-        free = inertia.solve(force)
-        projector = jacobian.projector(inertia, self.factor)
-        multipliers = projector.multipliers(gamma - jacobian.product(free))
-        return free + projector.direction(multipliers), multipliers
+        return jacobian.projector(inertia, self.factor).solve(force, gamma)

@@ -114,6 +114,9 @@ class BlockJacobian(AbstractJacobian):
         of_bodies = self.order.on_bodies(wrenches.reshape(-1, wrenches.shape[2])).reshape(-1)
         return of_bodies if self.order.uniform else unchecked_take(of_bodies, self.order.velocity_place)
 
+    def sizes(self, v):
+        return BlockJacobian(jnp.abs(self.blocks), self.order).product(jnp.abs(v))
+
     def row_norms(self, scale):
         own = unchecked_take(_of_bodies(self.order, scale), self.order.bodies)
         return self._all_rows(jnp.sqrt(jnp.sum((self.blocks * own[:, :, None, :]) ** 2, axis=(1, 3))))

@@ -8,12 +8,17 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from .elimination import Factor
 from .inertia import AbstractInertia
 from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor, DensePositiveDefinite
 from .rotations import norm
+
+# A solution is refined until its rows are met to this many rounding errors of what adds up in them, or as often.
+_ROUNDING = 128
+_REFINEMENTS = 4
 
 
 class AbstractJacobian(eqx.Module):
@@ -28,6 +33,10 @@ class AbstractJacobian(eqx.Module):
     @abc.abstractmethod
     def transpose_product(self, multipliers: Float[Array, "m"]) -> Float[Array, "n"]:
         """`Aᵀ λ`."""
+
+    @abc.abstractmethod
+    def sizes(self, v: Float[Array, "n"]) -> Float[Array, "m"]:
+        """The sum of the sizes of what adds up in each row of `A v`."""
 
     @abc.abstractmethod
     def row_norms(self, scale: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -69,6 +78,57 @@ class MassProjector(eqx.Module):
     metric: AbstractInertia
     factor: AbstractPositiveFactor
 
+    def solve(self, force: Float[Array, "n"], rows: Float[Array, "m"]) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
+        """x and λ of `M x = f + Aᵀ λ`, `A x = b`, for a metric without infinite entries; λ is zero for implied rows.
+
+        Where light bodies are between heavy ones, what the heavy ones add to `A M⁻¹ Aᵀ` is lost in rounding errors of
+        what the light ones do. So x is refined, with the residuals of the rows themselves, until it meets them to
+        rounding errors: one refinement restores all digits for ratios of masses up to 1e8. It is differentiated
+        implicitly, by the equations that it solves.
+
+        Source: N. J. Higham, "Accuracy and Stability of Numerical Algorithms", 2nd ed., SIAM, 2002, chapter 12
+        (iterative refinement in fixed precision, tested by the componentwise backward error of Oettli and Prager).
+        """
+        jacobian, n = self.jacobian, force.size
+        target = jacobian.gather_rows(rows)
+        fixed = lax.stop_gradient(self)
+
+        # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+        join = lambda x, multipliers: jnp.concatenate([x, multipliers.ravel()])
+        split = lambda both: (both[:n], both[n:].reshape(target.shape))
+
+        def equations(both):
+            x, multipliers = split(both)
+            wrench = jacobian.transpose_product(jacobian.scatter_rows(multipliers))
+            return join(self.metric.product(x) - wrench, -jacobian.gather_rows(jacobian.product(x)))
+
+        def solution(_, both):
+            force, target = split(both)
+            return join(*fixed._refined(force, -target))
+
+        x, multipliers = split(lax.custom_linear_solve(equations, join(force, -target), solution, symmetric=True))
+        return x, jacobian.scatter_rows(multipliers)
+
+    def _refined(self, force, target):
+        jacobian = self.jacobian
+
+        def refined(x, multipliers, residual, k):
+            change = self.factor.substitute(residual)
+            x = x + self.direction(jacobian.scatter_rows(change))
+            return x, multipliers + change, target - jacobian.gather_rows(jacobian.product(x)), k + 1
+
+        def inexact(carry):
+            x, _, residual, k = carry
+            sizes = jacobian.gather_rows(jacobian.sizes(x)) + jnp.abs(target)
+            tol = _ROUNDING * jnp.finfo(x.dtype).eps
+            return jnp.any(jnp.abs(residual) > tol * sizes) & (k <= _REFINEMENTS)
+
+        free = self.metric.solve(force)
+        residual = target - jacobian.gather_rows(jacobian.product(free))
+        start = refined(free, jnp.zeros_like(target), residual, jnp.array(0))
+        x, multipliers, _, _ = lax.while_loop(inexact, lambda carry: refined(*carry), start)
+        return x, multipliers
+
     def multipliers(self, values: Float[Array, "m"]) -> Float[Array, "m"]:
         """`(A M⁻¹ Aᵀ)⁻¹ x`; zero for implied rows."""
         return self.jacobian.scatter_rows(self.factor.solve(self.jacobian.gather_rows(values)))
@@ -78,7 +138,9 @@ class MassProjector(eqx.Module):
         return self.metric.solve(self.jacobian.transpose_product(multipliers))
 
     def cancel(self, residual: Float[Array, "m"]) -> Float[Array, "n"]:
-        """The smallest displacement that changes the rows by `−residual`."""
+        """The smallest displacement that changes the rows by `−residual`, to the digits that the factor has: for
+        iterations, which evaluate the residual again. A metric with infinite entries holds these velocities.
+        """
         return -self.direction(self.multipliers(residual))
 
 
@@ -109,6 +171,9 @@ class DenseJacobian(AbstractJacobian):
 
     def transpose_product(self, multipliers):
         return self.matrix.T @ multipliers
+
+    def sizes(self, v):
+        return jnp.abs(self.matrix) @ jnp.abs(v)
 
     def row_norms(self, scale):
         return norm(self.matrix * scale[None, :])

@@ -51,13 +51,14 @@ def chord(
     most: int,
     rate: Any = 0.0,
     rounding: Any = None,
+    largest: Any = 1.0,
     peel: bool = False,
 ) -> tuple[PyTree, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method with one matrix for all corrections.
 
     Corrections shrink by a constant factor, so the size of the next one is known and needs no iteration. The iteration
     ends where the next correction is below `tol`, or at the level of rounding errors, where corrections stop shrinking;
-    it fails where a correction exceeds 1.
+    it fails where a correction is too large.
 
     **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
     first correction is compared with (1: the error of the matrix is as large as the first correction; 0: unknown, and a
@@ -79,7 +80,7 @@ def chord(
 
     def proceed(carry):
         _, size, ahead, k = carry
-        return (not peel and k == 0) | ((ahead > tol) & (size < 1.0) & (k < most))
+        return (not peel and k == 0) | ((ahead > tol) & (size < largest) & (k < most))
 
     carry = (start, first, first, jnp.array(0))
     x, _, ahead, k = lax.while_loop(proceed, advance, advance(carry) if peel else carry)

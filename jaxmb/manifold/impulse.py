@@ -30,7 +30,8 @@ def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
     u, inertia = y.u, system.inertia(t, y.q, y.u)
     if system.elimination is not None:
         projector = binding_velocities(system, t, y.q, u).projector(inertia)
-        return dataclasses.replace(y, u=u + projector.cancel(velocity_rows(system, t, y.q, u)))
+        change, _ = projector.solve(jnp.zeros_like(u), -velocity_rows(system, t, y.q, u))
+        return dataclasses.replace(y, u=u + change)
     for _ in range(1 if system.linear else 3):
         jacobian = system.velocity_jacobian(t, y.q, u)
         rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)

@@ -128,9 +128,10 @@ def project_in_metric(
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices.
     q = y.q + (found - before.q)
-    q = displaced(system, t, q, own.cancel(position_rows(system, t, q)))
+    none = jnp.zeros_like(y.u)
+    q = displaced(system, t, q, own.solve(none, -position_rows(system, t, q))[0])
     here = binding_velocities(system, t, q, y.u).projector(metric_of(system, t, State(q, y.u)), own.factor)
-    u = y.u + here.cancel(velocity_rows(system, t, q, y.u))
+    u = y.u + here.solve(none, -velocity_rows(system, t, q, y.u))[0]
     return dataclasses.replace(y, q=q, u=u), here, iterations, failed
 
 

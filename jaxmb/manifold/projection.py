@@ -202,9 +202,8 @@ class ProjectionTerm(AbstractManifoldTerm):
     def _ideal(self, t, y, projector: MassProjector, chart):
         """The evaluation with ideal constraints that bind velocities, at a state whose projector is known."""
         system = self.system
-        free = projector.metric.solve(system.force(t, y.q, y.u))
-        multipliers = -projector.multipliers(system.acceleration_residual(t, y.q, y.u, free))
-        udot = free + projector.direction(multipliers)
+        gamma = -system.acceleration_residual(t, y.q, y.u, jnp.zeros_like(y.u))
+        udot, multipliers = projector.solve(system.force(t, y.q, y.u), gamma)
         f = State(system.rates(t, y.q, y.u), udot)
         return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
 

@@ -207,13 +207,25 @@ def _stiffness(base: _Base) -> Iterator[_Trial]:
 
 
 def _masses(base: _Base) -> Iterator[_Trial]:
-    system = base.mechanism.system
-    body = system.motion_names()[0]
-    masses = [n for n, unit in units(system).items() if n.startswith(f"{body}.") and "kg" in (unit or "").split()]
+    body = base.mechanism.system.motion_names()[0]
+    masses = _inertial(base, [body])
     if not masses:
         raise _NotHereError("left out, there is no body whose mass is a parameter")
     for trial in _scaled(base, masses, 10.0 ** np.array([-8, -4, -2, 2, 4, 8])):
         yield trial._replace(case=f"{body} {trial.case}")
+
+
+def _alternating_masses(base: _Base) -> Iterator[_Trial]:
+    every_other = _inertial(base, base.mechanism.system.motion_names()[1::2])
+    if not every_other:
+        raise _NotHereError("left out, there are no two bodies whose masses are parameters")
+    yield from _scaled(base, every_other, 10.0 ** np.array([-8, -6, -3, 3, 6, 8]))
+
+
+def _inertial(base: _Base, bodies: Collection[str]) -> list[str]:
+    """The parameters of bodies that are masses or moments of inertia."""
+    named = units(base.mechanism.system)
+    return [n for n, unit in named.items() if n.split(".")[0] in bodies and "kg" in (unit or "").split()]
 
 
 def _lengths(base: _Base) -> Iterator[_Trial]:
@@ -263,6 +275,7 @@ KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
     "long horizon": _horizon,
     "stiffness": _stiffness,
     "mass": _masses,
+    "alternating masses": _alternating_masses,
     "lengths": _lengths,
     "initial speed": _speeds,
     "near-singular": _near_singular,
