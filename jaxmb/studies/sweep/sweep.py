@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ...parts.names import names_arguments
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
 from .cases import table
@@ -28,6 +29,7 @@ _CHUNK = 512
 _FEWEST_FOR_BUDGET = 64
 
 
+@names_arguments
 def sweep(
     function: Callable[..., Mapping[str, Any]],
     cases: Any,
