@@ -10,6 +10,8 @@ A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes th
 """
 
 import abc
+import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -21,6 +23,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from . import checks, fields
+from .names import check_arguments
 from .shapes import AbstractShape
 from .space import AbstractSpace
 
@@ -44,6 +47,10 @@ class AbstractPart(eqx.Module):
 
     name: AbstractVar[str]
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        check_arguments(cls.__name__, _signature(cls), len(args), kwargs)
+        return super().__new__(cls)
 
     def __check_init__(self):
         checks.check_kinds(self, self.label)
@@ -85,6 +92,11 @@ class AbstractPart(eqx.Module):
         for field, value in (fields.values_of(self) | values).items():
             object.__setattr__(out, field, value)
         return out
+
+
+@functools.cache
+def _signature(part: type) -> inspect.Signature:
+    return inspect.signature(part)
 
 
 class AbstractPlanarPart(AbstractPart):

@@ -1,16 +1,72 @@
 """Error messages for unknown names, with the nearest known ones."""
 
 import difflib
-from collections.abc import Iterable
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from typing import ParamSpec, TypeVar
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> ValueError:
-    """An error for an unknown name, with the nearest known ones."""
+class UnknownNameError(ValueError, KeyError):
+    """A name that stands for nothing. It is a `KeyError` as well, so that `in` and `get` of a mapping work."""
+
+    __str__ = ValueError.__str__
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """An error for an unknown name, with the nearest known ones; of `"rod.phi"` with all names of `"rod"`."""
+    return UnknownNameError(f"Unknown {what} {name!r}{_hint(name, known)}")
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
     known = list(dict.fromkeys(known))
-    near = difflib.get_close_matches(name, known, n=2, cutoff=0.5)
-    if near:
-        hint = f"; did you mean {' or '.join(map(repr, near))}?"
+    part, dot, field = name.rpartition(".")
+    of_part = {own[len(part) + 1 :]: own for own in known if dot and own.startswith(f"{part}.")}
+    if of_part:
+        near = [of_part[own] for own in difflib.get_close_matches(field, of_part, n=2, cutoff=0.6)]
+        listed = list(of_part.values())
+        lead = f"{part!r} has"
     else:
-        listed = ", ".join(map(repr, known[:12])) + (", …" if len(known) > 12 else "")
-        hint = f"; there are {listed}." if known else "; there are none."
-    return ValueError(f"Unknown {what} {name!r}{hint}")
+        near, listed, lead = difflib.get_close_matches(name, known, n=2, cutoff=0.5), known, "there are"
+    if near:
+        return f"; did you mean {' or '.join(map(repr, near))}?"
+    shown = ", ".join(map(repr, listed[:12])) + (", …" if len(listed) > 12 else "")
+    return f"; {lead} {shown}." if listed else "; there are none."
+
+
+def check_arguments(what: str, signature: inspect.Signature, positional: int, names: Iterable[str]) -> None:
+    """Raise a `TypeError` that lists what a function or class takes, for arguments that it does not take.
+
+    **Arguments:** `what`: its name; its `signature`; the number of `positional` arguments and the `names` of others.
+    """
+    taken = signature.parameters
+    kinds = {own.kind for own in taken.values()}
+    if inspect.Parameter.VAR_KEYWORD not in kinds:
+        for name in names:
+            if name not in taken:
+                near = difflib.get_close_matches(name, taken, n=2, cutoff=0.5)
+                hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(taken)}."
+                raise TypeError(f"{what} has no argument {name!r}; {hint}")
+    by_place = [name for name, own in taken.items() if own.kind is not inspect.Parameter.KEYWORD_ONLY]
+    if positional > len(by_place) and inspect.Parameter.VAR_POSITIONAL not in kinds:
+        others = [name for name in taken if name not in by_place]
+        by_name = f"; give by name: {', '.join(others)}" if others else ""
+        listed = (
+            f"{len(by_place)} arguments by position, {', '.join(by_place)}" if by_place else "no argument by position"
+        )
+        raise TypeError(f"{what} takes {listed}; got {positional}{by_name}.")
+
+
+def names_arguments(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """A function whose error for an unknown argument names the nearest one, or all that it takes."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        check_arguments(function.__name__, signature, len(args), kwargs)
+        return function(*args, **kwargs)
+
+    return checked

@@ -4,6 +4,8 @@ from typing import Any
 
 from . import fields
 from .base import AbstractConstraint, AbstractLink
+from .joint_parts import AbstractCoordinatePart
+from .sources import AbstractOfSources
 
 
 class Servo(AbstractLink):
@@ -27,6 +29,12 @@ class Servo(AbstractLink):
     stiffness: fields.Number = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
 
     def __check_init__(self):
+        if isinstance(self.program, AbstractCoordinatePart | AbstractOfSources):
+            raise ValueError(
+                f"{self.label}: the program must be a constraint between bodies, such as a Driver or a Constraint; a "
+                f"{self.program.kind} acts on coordinates of joints. Prescribe a coordinate of a body with a Driver, "
+                "or write the coordinate's residual as a Constraint."
+            )
         taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
         if taken:
             raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; rename that parameter.")

@@ -13,7 +13,7 @@ import numpy as np
 from .._results import RESULTS
 from .._types import State, VectorLike
 from ..mechanisms import Mechanism
-from ..parts.names import unknown
+from ..parts.names import names_arguments, unknown
 from ..simulate import simulate
 from ..solvers import Adams, Hermite
 from ..states.assembly import assemble
@@ -112,6 +112,7 @@ class _Trial(NamedTuple):
     truth: tuple[Any] | None = None
 
 
+@names_arguments
 def stability(
     system: AbstractSystem | Mechanism,
     state: State | None = None,

@@ -12,6 +12,7 @@ import numpy as np
 from .._results import RESULTS
 from .._types import State
 from ..mechanisms import Mechanism, References
+from ..parts.names import names_arguments
 from ..simulate import simulate
 from ..solvers import Adams
 from ..system import AbstractSystem
@@ -123,6 +124,7 @@ def _cells(run: Run) -> tuple[str, ...]:
     )
 
 
+@names_arguments
 def work_precision(
     system: AbstractSystem | Mechanism,
     state: State | None = None,

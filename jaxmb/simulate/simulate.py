@@ -16,6 +16,7 @@ from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
 from ..manifold import AbstractManifold, default_manifold, with_internal_states
+from ..parts.names import names_arguments
 from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from ..solvers._one_step import OneStepController
 from ..states.consistency import consistent
@@ -44,6 +45,7 @@ _CHECKPOINTS = 4096
 _CHECKPOINT_BYTES = 2**28
 
 
+@names_arguments
 def simulate(
     system: AbstractSystem,
     state: State,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
+from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
@@ -23,8 +24,11 @@ from .held_coordinates import holding, internal_states, split_names
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
+# Singular values, of rows of unit length, that count as zero.
+_DEPENDENT = 1e-8
 
 
+@names_arguments
 def assemble(
     system: AbstractSystem,
     guess: State | None = None,
@@ -138,12 +142,37 @@ def _cannot_assemble(system, t, q, fixed, names):
     held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
     if held:
         text += f" with {', '.join(held)} fixed"
+    dependent = _dependent(system, t, q, held, names)
     listed = violated_joints(system, t, q)
+    remain = f"residuals remain in {listed}"
+    if dependent:
+        return f"{text}: {dependent}{f'; {remain}' if listed else ''}. Fix fewer of them, or give values that agree."
     if listed:
-        return (
-            f"{text}: residuals remain in {listed}. Check lengths and points, or give a better guess of the positions."
-        )
+        return f"{text}: {remain}. Check lengths and points, or give a better guess of the positions."
     return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
+
+
+def _dependent(system, t, q, held, names):
+    """Which fixed coordinates the constraints determine, alone or from each other, in a configuration; empty for none.
+
+    A motion that the constraints admit changes the fixed coordinates by the rows of a basis of such motions. Rows that
+    depend on each other, or vanish, belong to coordinates that cannot be chosen together.
+    """
+    scale = np.asarray(system.coordinate_scale())
+    jacobian = np.asarray(system.coordinate_jacobian(t, q)) * scale
+    _, sizes, right = np.linalg.svd(jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), 1e-300))
+    motions = right[np.sum(sizes > _DEPENDENT) :].T
+    of_held = motions[[names[name][0] for name in held]]
+    left, sizes, _ = np.linalg.svd(of_held)
+    combinations = left[:, np.sum(sizes > _DEPENDENT) :]
+    together = [name for name, row in zip(held, combinations, strict=True) if np.max(np.abs(row), initial=0) > 1e-6]
+    if not together:
+        return ""
+    if len(together) == 1:
+        return f"the constraints determine {together[0]} already"
+    free = len(together) - combinations.shape[1]
+    chosen = f"of these {len(together)} coordinates only {free} can be chosen" if free else "none of them can be chosen"
+    return f"{', '.join(together[:-1])} and {together[-1]} depend on each other: {chosen}"
 
 
 def _cannot_move(system, t, q, u, fixed, names):

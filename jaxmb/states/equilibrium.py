@@ -21,6 +21,7 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
 from ..linalg.newton import root
 from ..linalg.rotations import norm
+from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
@@ -36,6 +37,7 @@ _FIRST, _LONGEST = 0.025, 0.5
 _NEGLIGIBLE = 1e-12
 
 
+@names_arguments
 def equilibrium(
     system: AbstractSystem,
     guess: State | None = None,

@@ -90,6 +90,8 @@ def stack(
     groups: dict[Any, list] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
+        if not all(eqx.is_array_like(leaf) for leaf in leaves):
+            raise ValueError(_not_numbers(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
         if key not in groups and check is not None:
             check(part, layout.space, len(bodies))
@@ -103,6 +105,18 @@ def stack(
         inner = tuple((keys, tuple(m[3][k][1].name for m in members)) for k, (keys, _) in enumerate(members[0][3]))
         out.append(Group(jtu.tree_unflatten(key[0], leaves), names, bodies, layout, inner=inner))
     return tuple(out)
+
+
+def _not_numbers(part: AbstractPart) -> str:
+    """What is wrong with a part that holds other things than numbers in fields that are not static."""
+    found = [(path, leaf) for path, leaf in jtu.tree_flatten_with_path(part)[0] if not eqx.is_array_like(leaf)]
+    path, leaf = found[0]
+    field = jtu.keystr(path).removeprefix(".")
+    return (
+        f"{part.label}: {field} is {leaf!r}, which is not a number. Declare a function with fields.function(). Split a "
+        "module that holds functions, such as a neural network, by arrays, rest = eqx.partition(module, eqx.is_array), "
+        "with a field for the arrays and one that is fields.function() for the rest."
+    )
 
 
 class BodyGroup(eqx.Module):

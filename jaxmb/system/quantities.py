@@ -39,6 +39,12 @@ class BodyMotion(NamedTuple):
     orientation: Array | None
     angular_velocity: Array | None
 
+    def __dir__(self) -> list[str]:
+        return list(self._fields)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"The motion of a body has {', '.join(self._fields)}; got {name!r}.")
+
 
 class Reaction(NamedTuple):
     """The force that a joint exerts on the last of its bodies that is not the ground.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..parts.names import names_arguments
 from ..parts.shapes import AbstractShape
 from ..trajectory import Trajectory
 from . import scenery
@@ -46,6 +47,7 @@ class MovingPicture:
         return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}"></iframe>'
 
 
+@names_arguments
 def show(
     trajectory: Motions,
     *,

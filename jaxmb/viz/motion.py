@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..parts.names import unknown
+from ..parts.names import names_arguments, unknown
 from ..trajectory import Trajectory
 from .figure import new_figure
 
@@ -19,6 +19,7 @@ _LEGEND = 8
 _ROUNDING = 1e-17
 
 
+@names_arguments
 def plot_motion(trajectory: Trajectory, names: Sequence[str] | None = None) -> "Figure":
     """Plot positions or angles, velocities, energy and constraint residuals against time.
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
+from ...parts.names import names_arguments
 from ...states.arguments import check_no_states
 from ...system import AbstractSystem
 from ...trajectory import Trajectory
@@ -28,6 +29,7 @@ _NO_EFFECT = 1e-10
 _ITERATIONS = {"lm": 100, "optax": 1000}
 
 
+@names_arguments
 def identify(
     system: AbstractSystem,
     measured: Mapping[str, VectorLike] | Experiment | Sequence[Experiment] | None = None,

@@ -14,7 +14,7 @@ from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
 from ...linalg.eigen import eigen
 from ...linalg.failure import not_a_number_where
-from ...parts.names import unknown
+from ...parts.names import names_arguments, unknown
 from ...simulate import simulate
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.consistency import consistent
@@ -67,6 +67,7 @@ class Floquet(eqx.Module):
         return "\n".join(lines)
 
 
+@names_arguments
 def floquet(
     system: AbstractSystem,
     state: State,

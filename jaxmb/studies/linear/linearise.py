@@ -9,6 +9,7 @@ import numpy as np
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
 from ...linalg.failure import not_a_number_where
+from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem, parameters
@@ -24,6 +25,7 @@ from .perturbations import (
 from .quantities import component_names, components
 
 
+@names_arguments
 def linearise(
     system: AbstractSystem,
     state: State,

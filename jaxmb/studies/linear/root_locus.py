@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from ..._types import Scalar, State
-from ...parts.names import unknown
+from ...parts.names import names_arguments, unknown
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.arguments import real_array
 from .linearise import linearise
@@ -35,6 +35,7 @@ class RootLocus(eqx.Module):
         return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
 
 
+@names_arguments
 def root_locus(
     system: AbstractSystem | Callable[[Scalar], tuple[AbstractSystem, State]],
     name: str,

@@ -17,7 +17,7 @@ from ...linalg.failure import not_a_number_where
 from ...linalg.newton import newton, root
 from ...linalg.rotations import unrotate
 from ...linalg.shortest import pseudoinverse
-from ...parts.names import unknown
+from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...system import AbstractSystem
 from ...system.arguments import real_array
@@ -32,6 +32,7 @@ _ITERATIONS = 60
 _LONGEST, _SOLVED = 0.5, 1e-9
 
 
+@names_arguments
 def steady_motion(
     system: AbstractSystem,
     guess: State | None = None,

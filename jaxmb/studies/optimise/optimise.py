@@ -10,6 +10,7 @@ import optax
 from jaxtyping import ArrayLike
 
 from ..._types import VectorLike
+from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
 from .constrained import multipliers, slsqp, trust_constr
@@ -134,6 +135,7 @@ class Optimum:
         return "\n".join([*(line.rstrip() for line in lines), "", self.message])
 
 
+@names_arguments
 def optimise(
     function: Callable[..., Any],
     start: Mapping[str, VectorLike] | Sequence[str],

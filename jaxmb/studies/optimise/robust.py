@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._types import VectorLike
-from ...parts.names import unknown
+from ...parts.names import names_arguments, unknown
 from ...system.arguments import real_array
 
 
+@names_arguments
 def robust(
     function: Callable[..., Any], samples: Mapping[str, VectorLike], *, weight: float | None = None
 ) -> Callable[..., dict[str, Array]]:

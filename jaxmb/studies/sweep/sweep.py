@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ...parts.names import names_arguments
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
 from .cases import Cases, table
@@ -31,6 +32,7 @@ _FEWEST_FOR_BUDGET = 64
 _WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
 
 
+@names_arguments
 def sweep(
     function: Callable[..., Mapping[str, Any]],
     cases: Any,

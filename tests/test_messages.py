@@ -1,0 +1,104 @@
+"""What a user reads after a slip: the nearest names, what an object has, and which values depend on each other."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.parts import AbstractForce, fields
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0), angle=0.0)
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    return mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+@pytest.fixture(scope="module")
+def motion(pendulum):
+    return mb.simulate(pendulum, mb.assemble(pendulum), t1=0.01)
+
+
+def test_an_unknown_coordinate_lists_those_of_the_body(pendulum):
+    with pytest.raises(ValueError, match=r"'rod' has 'rod\.x', 'rod\.y', 'rod\.angle'"):
+        mb.assemble(pendulum, fix={"rod.phi": 0.3})
+    with pytest.raises(ValueError, match=r"did you mean 'rod\.angle'\?"):
+        mb.assemble(pendulum, fix={"rod.angel": 0.3})
+
+
+def test_views_list_what_they_have(motion):
+    with pytest.raises(AttributeError, match="angular_velocity; got 'omega'"):
+        getattr(motion["rod"], "omega")  # noqa: B009
+    assert dir(motion["rod"]) == sorted(["position", "velocity", "angle", "orientation", "angular_velocity"])
+
+
+def test_views_by_name_are_mappings(motion):
+    assert "pin" in motion.reactions and "knee" not in motion.reactions
+    assert motion.reactions.get("knee") is None
+    for error in (KeyError, ValueError):
+        with pytest.raises(error, match="Unknown joint 'knee'; there are 'pin'"):
+            motion.reactions["knee"]
+
+
+def test_unknown_arguments_of_parts():
+    with pytest.raises(TypeError, match=r"SpringDamper has no argument 'k'; it takes .*stiffness, damping"):
+        planar.SpringDamper("spring", "ground", "rod", k=3.0)  # pyright: ignore
+    with pytest.raises(TypeError, match="did you mean 'stiffness'"):
+        planar.SpringDamper("spring", "ground", "rod", stifness=3.0)  # pyright: ignore
+    with pytest.raises(TypeError, match=r"Revolute takes 3 arguments by position.*give by name: point_a, point_b"):
+        planar.Revolute("pin", "ground", "rod", (0.0, 0.0), (1.0, 0.0))  # pyright: ignore
+
+
+def test_unknown_arguments_of_functions(pendulum):
+    with pytest.raises(TypeError, match="simulate has no argument 'tol'; did you mean 'rtol'"):
+        mb.simulate(pendulum, mb.assemble(pendulum), t1=1.0, tol=1e-3)  # pyright: ignore
+    with pytest.raises(TypeError, match="assemble has no argument 'fixed'; did you mean 'fix'"):
+        mb.assemble(pendulum, fixed={"rod.angle": 0.3})  # pyright: ignore
+
+
+def test_fixed_coordinates_that_depend_on_each_other(pendulum):
+    with pytest.raises(ValueError, match=r"rod\.x and rod\.angle depend on each other: of these 2 .* only 1 can be"):
+        mb.assemble(pendulum, fix={"rod.x": 0.3, "rod.angle": 1.0})
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        mb.JointDriver("drive", "pin.angle", rate=1.0),
+        mb.JointCoupling("drive", "pin.angle", "hip.angle", coefficients=(0.0, 1.0)),
+    ],
+)
+def test_servos_of_parts_on_coordinates(program):
+    with pytest.raises(ValueError, match="Servo 'drive': the program must be a constraint between bodies"):
+        mb.Servo(program)
+
+
+class Learned(AbstractForce):
+    """A moment [N m] from a neural network of the body's velocity."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    arrays: Any
+    rest: Any = fields.function(default=None)
+
+    def wrenches(self, space, poses, velocities, t):
+        network = self.arrays if self.rest is None else eqx.combine(self.arrays, self.rest)
+        return jax.numpy.zeros((1, 3)).at[0, 2].add(network(velocities[0])[0])
+
+
+def test_modules_as_fields():
+    """A module that holds functions is refused with what to do, which works."""
+    rod = planar.Body("rod", mass=1.0, inertia=0.1)
+    network = eqx.nn.MLP(3, 1, 4, 1, key=jax.random.key(0))
+    with pytest.raises(ValueError, match=r"Learned 'net': arrays\.activation is .*eqx\.partition"):
+        mb.Scene([rod], forces=[Learned("net", "rod", network)]).compile()
+    arrays, rest = eqx.partition(network, eqx.is_array)
+    system = mb.Scene([rod], forces=[Learned("net", "rod", arrays, rest)]).compile()
+    state = mb.assemble(system)
+    expected = float(network(np.zeros(3))[0])
+    np.testing.assert_allclose(system.force(0.0, state.q, state.u)[2], expected, rtol=1e-12)
