@@ -11,7 +11,8 @@ class Multipliers(AbstractFormulation):
 
     Needs a mass matrix that is cheap to solve with; cheapest where constraints are few and degrees of freedom many. The
     elimination follows the graph of joints: for chains, trees and local loops time and memory are proportional to the
-    number of joints.
+    number of joints. Solutions are refined until they meet the constraint rows to rounding errors, so that all digits
+    are right also where light bodies are between or at the ends of heavy ones, for ratios of masses up to 1e8 and more.
     """
 
     partitions: ClassVar[bool] = False

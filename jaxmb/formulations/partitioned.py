@@ -10,9 +10,9 @@ class Partitioned(AbstractFormulation):
     """Reduced equations in the independent accelerations, `(EᵀME) u̇_i = Eᵀ(F − M c)`, `u̇ = E u̇_i + c`.
 
     E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
-    Cheapest where a chart is made anyway and the degrees of freedom are few; the default with `Partition`. (A
-    Bricard linkage, 30 velocities and 29 independent rows, one evaluation with its factor: 15 µs, and 24 with a
-    derivative; the others take from 15 to 83, and 25 to 124.)
+    Cheapest where a chart is made anyway and the degrees of freedom are few; the default with `Partition`. Where a
+    light body moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has;
+    `Multipliers` keeps them.
 
     ??? cite "Reference"
         ```bibtex
