@@ -17,6 +17,10 @@ else:
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
+# An estimate is at an end of its range where it has come closer to it than this, relative to where it started, and its
+# distance from a bound is less than `_INDISTINCT` standard deviations.
+_NEAR, _INDISTINCT = 1e-3, 0.1
+
 
 class AbstractRange(eqx.Module):
     """The values that one parameter may take, as the image of a vector `z`."""
@@ -36,6 +40,15 @@ class AbstractRange(eqx.Module):
     def locate(self, value: Array) -> Float[Array, "n"]:
         """The vector `z` of a value."""
 
+    @abc.abstractmethod
+    def at_end(self, z: Float[Array, "n"], deviations: np.ndarray) -> np.ndarray:
+        """Which components of the value are at an end of the range, a bound or infinity, as far as can be told.
+
+        They have come a thousand times closer to it than they started (closer than a thousandth of the width to one of
+        two bounds), and what is left is small compared with their standard `deviations`: a component that is close to a
+        bound but determined well enough to tell it from the bound is not at it.
+        """
+
     @property
     def componentwise(self) -> bool:
         """Whether every component of the value belongs to one component of `z`."""
@@ -50,6 +63,18 @@ class AbstractRange(eqx.Module):
         return jnp.asarray(random.standard_normal(self.size), self.start.dtype)
 
 
+def _indistinct(distance: np.ndarray, before: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Whether what is left of a distance from a bound says nothing."""
+    distance = np.abs(distance)
+    return (distance < _NEAR * before) & ~(distance > _INDISTINCT * deviations)
+
+
+def _lost(distance: np.ndarray, before: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Whether a value has run so far away that nothing tells how far."""
+    distance = np.abs(distance)
+    return (distance > np.abs(before) / _NEAR) & ~(distance > deviations)
+
+
 class Line(AbstractRange):
     """Any value: `start + scale z`."""
 
@@ -61,6 +86,9 @@ class Line(AbstractRange):
 
     def locate(self, value):
         return ((value - self.start) / self.scale).reshape(-1)
+
+    def at_end(self, z, deviations):
+        return _lost(np.asarray(self(z) - self.start), np.asarray(self.scale), deviations)
 
 
 class HalfLine(AbstractRange):
@@ -75,6 +103,10 @@ class HalfLine(AbstractRange):
     def locate(self, value):
         return jnp.log((value - self.bound) / (self.start - self.bound)).reshape(-1)
 
+    def at_end(self, z, deviations):
+        distance, before = (np.asarray(x - self.bound) for x in (self(z), self.start))
+        return _indistinct(distance, np.abs(before), deviations) | _lost(distance, before, deviations)
+
 
 class Interval(AbstractRange):
     """Values between two bounds: a logistic curve of `z`."""
@@ -88,6 +120,11 @@ class Interval(AbstractRange):
 
     def locate(self, value):
         return (self._logit(value) - self._logit(self.start)).reshape(-1)
+
+    def at_end(self, z, deviations):
+        value, width = self(z), np.asarray(self.high - self.low)
+        distance = np.asarray(jnp.minimum(value - self.low, self.high - value))
+        return _indistinct(distance, width, deviations)
 
     def draw(self, random):
         # Between two bounds every value is as likely as any other.
@@ -109,15 +146,24 @@ class PositiveDefinite(AbstractRange):
         return n * (n + 1) // 2
 
     def __call__(self, z):
+        factor = jnp.linalg.cholesky(self.start) @ self._factor(z)
+        return factor @ factor.T
+
+    def _factor(self, z):
         lower = jnp.zeros_like(self.start).at[self._below].set(z)
         diagonal = jnp.diag(lower)
-        factor = jnp.linalg.cholesky(self.start) @ (lower + jnp.diag(jnp.exp(diagonal) - diagonal))
-        return factor @ factor.T
+        return lower + jnp.diag(jnp.exp(diagonal) - diagonal)
 
     def locate(self, value):
         lower = jnp.linalg.solve(jnp.linalg.cholesky(self.start), jnp.linalg.cholesky(value))
         diagonal = jnp.diag(lower)
         return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
+
+    def at_end(self, z, deviations):
+        # The singular values of T are roots of how much of the start is left in a direction.
+        there = np.linalg.svd(np.asarray(self._factor(z)), compute_uv=False)
+        near = there[-1] < _NEAR or there[0] > 1 / _NEAR
+        return np.full(self.start.shape, near)
 
     def free_components(self, value):
         return value[self._below]
@@ -149,6 +195,9 @@ class Inertia(AbstractRange):
 
     def locate(self, value):
         return self._moments.locate(second_moments(value))
+
+    def at_end(self, z, deviations):
+        return self._moments.at_end(z, deviations)
 
     def free_components(self, value):
         return self._moments.free_components(value)
@@ -186,6 +235,18 @@ class FreeParameters(eqx.Module):
     def flat(self, z: Float[Array, "n"]) -> Float[Array, "values"]:
         """All values, raveled one after the other."""
         return jnp.concatenate([value.reshape(-1) for value in self(z).values()])
+
+    @property
+    def start(self) -> dict[str, Array]:
+        """The values at zero, by name."""
+        return {name: r.start for name, r in zip(self.names, self.ranges, strict=True)}
+
+    def at_end(self, z: Float[Array, "n"], deviations: Float[np.ndarray, "values"]) -> np.ndarray:
+        """Which of all values, raveled one after the other, are at an end of their ranges."""
+        out, ends = [], np.cumsum([r.start.size for r in self.ranges])
+        for name, r, own in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
+            out.append(np.ravel(r.at_end(z[self.place(name)], own.reshape(r.start.shape))))
+        return np.concatenate(out)
 
     def locate(self, values: Mapping[str, Array]) -> Float[Array, "n"]:
         """The vector of values by name."""

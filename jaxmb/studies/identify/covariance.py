@@ -33,21 +33,29 @@ def covariance(
     ahead: Float[np.ndarray, "components n"],
     squares: float | None,
     count: int,
+    slope: float = 1.0,
 ) -> Covariance:
     """The covariance of a fit.
 
-    **Arguments:** `jacobian` of the weighted residuals along n directions; `ahead`: changes of the components along
-    them; `squares`: sum of the `count` squared residuals of data, which estimates the noise if it is not known.
+    **Arguments:** `jacobian` of the residuals along n directions, first of the `count` of data; `ahead`: changes of the
+    components along them; `squares`: sum of the squared residuals of data, which estimates the noise if it is not
+    known. For a robust loss these are the squares of `ψ = r ρ'(r²)`, and `slope` is the mean of `ψ'`: the covariance is
+    that of Huber's M-estimate, as from samples with noise of the variance `mean ψ² / (mean ψ')²`.
     """
+    noise = 1.0
+    if squares is not None:
+        # The rank of what is determined does not depend on how the rows are weighted.
+        plain = np.linalg.svd(jacobian, compute_uv=False)
+        surplus = count - int(np.sum(plain > _UNDETERMINED * plain[0]))
+        noise = np.sqrt(squares / surplus) / slope if surplus > 0 and slope > 0 else np.nan
+        if np.isfinite(noise):
+            # What is known beside the data has the size that it is known with.
+            jacobian = np.vstack([jacobian[:count], noise * jacobian[count:]])
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
     sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
     weak = sizes <= _UNDETERMINED * sizes[0]
     root = ahead @ (directions[~weak] / sizes[~weak][:, None]).T
     lost = ahead @ directions[weak].T
-    surplus = count - int(np.sum(~weak))
-    noise = 1.0
-    if squares is not None:
-        noise = np.sqrt(squares / surplus) if surplus > 0 else np.nan
     root = root * noise
     matrix = root @ root.T
     undetermined = np.max(np.abs(lost), axis=1, initial=0.0) > _SHARE * np.max(np.abs(ahead), axis=1)

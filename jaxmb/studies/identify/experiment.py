@@ -18,7 +18,12 @@ from ...simulate import simulate
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory
+from .loss import Loss
+from .measurements import Measurements
 from .sensors import Channel, Rows, Sensor, readings_of
+
+# The name of a residual function's result among the readings.
+RESIDUAL = "residual"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +32,8 @@ class Experiment:
 
     **Arguments:**
 
-    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
+    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`. The
+        `Measurements` that `read_measurements` returns have their own `ts`.
     - `inputs`: as of `simulate`.
     - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
@@ -35,9 +41,9 @@ class Experiment:
     - `held_out`: whether the data are only predicted, for `Identification.held_out`, and not fitted.
     """
 
-    measured: Mapping[str, VectorLike] | None = None
+    measured: Mapping[str, VectorLike] | Measurements | None = None
     _: dataclasses.KW_ONLY
-    ts: ArrayLike
+    ts: ArrayLike | Mapping[str, ArrayLike] | None = None
     state: State | None = None
     fix: Mapping[str, VectorLike] | None = None
     rates: Mapping[str, VectorLike] | None = None
@@ -61,7 +67,8 @@ class Initial(NamedTuple):
 
 class Seen(NamedTuple):
     """What a simulation with some parameters shows: the misfit, the predicted readings by sensor, the state at the last
-    time, and how the simulation ended. Where it failed the misfit is infinite.
+    time, and how the simulation ended. Where it failed the misfit is infinite. What a residual function returns is a
+    reading of the name `"residual"`.
     """
 
     rows: Rows
@@ -82,6 +89,7 @@ class Trial(eqx.Module):
     initial: tuple[tuple[str, Initial], ...] = eqx.field(static=True)
     channels: tuple[Channel, ...]
     residual: Callable[[Trajectory], Array] | None
+    loss: Loss = eqx.field(static=True)
     known: dict[str, Array]
     state: State
     fix: dict[str, Array]
@@ -147,9 +155,10 @@ class Trial(eqx.Module):
             own = places[1 + late.index(channel) if channel.delayed else 0]
             quantity = trajectory.quantity(channel.quantity)
             readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
-            rows.append(channel.rows(readings[channel.name], theta))
+            rows.append(channel.rows(readings[channel.name], theta, self.loss))
         if self.residual is not None:
-            rows.append(_of_user(self.residual(trajectory)))
+            readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
+            rows.append(_of_user(readings[RESIDUAL], self.loss))
         joined = Rows(
             jnp.concatenate([own.residuals for own in rows]),
             jnp.concatenate([own.present for own in rows]),
@@ -163,28 +172,61 @@ class Trial(eqx.Module):
         return Seen(joined, readings, end, trajectory.result)
 
 
-def _of_user(residuals) -> Rows:
-    residuals = jnp.asarray(residuals).reshape(-1)
+def _of_user(residuals: Array, loss: Loss) -> Rows:
+    residuals = residuals.reshape(-1)
     present = jnp.ones(residuals.shape, bool)
-    return Rows(residuals, present, jnp.zeros((0,), residuals.dtype), 0.5 * jnp.sum(residuals**2))
+    return Rows(residuals, present, jnp.zeros((0,), residuals.dtype), 0.5 * jnp.sum(loss.rho(residuals**2)))
 
 
-def checked_times(ts: ArrayLike, t0: Scalar) -> Float[Array, "times"]:
-    """Measured times, or a `ValueError` that says what is wrong with them."""
+def with_times(experiment: Experiment, where: str = "") -> Experiment:
+    """An experiment with what was measured by name, and with times, whatever they were read from."""
+    if isinstance(experiment.measured, Measurements):
+        if experiment.ts is not None:
+            raise ValueError(f"Measurements{where} have their own times; leave out ts.")
+        experiment = dataclasses.replace(experiment, measured=experiment.measured.values, ts=experiment.measured.ts)
+    if experiment.ts is None:
+        raise ValueError(f"ts{where} is missing: the times of what was measured.")
+    return experiment
+
+
+def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
+    """All times of an experiment in order, and for each measured name which of them are its own."""
+    names = tuple(experiment.measured or ())
+    if not isinstance(experiment.ts, Mapping):
+        ts = checked_times(experiment.ts, experiment.t0)
+        return ts, dict.fromkeys(names, np.arange(ts.size))
+    if not names:
+        raise ValueError("Times by name belong to measured quantities; a residual function needs one vector ts.")
+    for name in experiment.ts:
+        if name not in names:
+            raise unknown("measured name with times", name, names)
+    missing = [name for name in names if name not in experiment.ts]
+    if missing:
+        raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all that was measured.")
+    each = {name: np.asarray(checked_times(experiment.ts[name], experiment.t0, name)) for name in names}
+    ts = np.unique(np.concatenate(list(each.values())))
+    return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
+
+
+def checked_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
+    """Measured times, of all or of one name, or a `ValueError` that says what is wrong with them."""
+    label = f"ts[{name!r}]" if name else "ts"
     times = np.asarray(ts, dtype=float)
     if times.ndim != 1 or times.size == 0:
-        raise ValueError(f"ts must be a vector of increasing times, got shape {times.shape}.")
+        raise ValueError(f"{label} must be a vector of increasing times, got shape {times.shape}.")
     if not np.all(np.isfinite(times)):
         place = int(np.flatnonzero(~np.isfinite(times))[0])
-        raise ValueError(f"ts must be a vector of increasing times, but ts[{place}] is {times[place]}; leave it out.")
+        raise ValueError(
+            f"{label} must be a vector of increasing times, but {label}[{place}] is {times[place]}; leave it out."
+        )
     if np.any(np.diff(times) <= 0):
         place = int(np.flatnonzero(np.diff(times) <= 0)[0])
         raise ValueError(
-            f"ts must be a vector of increasing times, but ts[{place + 1}] = {times[place + 1]:g} follows "
+            f"{label} must be a vector of increasing times, but {label}[{place + 1}] = {times[place + 1]:g} follows "
             f"{times[place]:g}; sort the samples, one at each time."
         )
     if times[0] < t0 or times[-1] <= t0:
-        raise ValueError(f"ts must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
+        raise ValueError(f"{label} must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
     return jnp.asarray(times, dtype=jnp.result_type(float))
 
 
@@ -195,10 +237,11 @@ def channels_of(
     sigma: Mapping[str, VectorLike] | None,
     free: frozenset[str],
     ts: Float[Array, "times"],
+    places: Mapping[str, np.ndarray],
 ) -> tuple[Channel, ...]:
     """The readings of an experiment, checked.
 
-    **Arguments:** `free`: names of unknowns, without the experiment's.
+    **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
     """
     measured, residual = experiment.measured, experiment.residual
     if (measured is None) == (residual is None):
@@ -225,7 +268,7 @@ def channels_of(
         levels[name] = deviation is not None or f"{name}.sigma" in free
         shape = shapes[sensor.quantity]
         late = f"{name}.delay" in free
-        out.append(readings_of(sensor, data, deviation, shape, ts.shape[0], ts.dtype, late))
+        out.append(readings_of(sensor, data, deviation, shape, places[name], ts.shape[0], ts.dtype, late))
     if any(levels.values()) and not all(levels.values()):
         missing = next(name for name, there in levels.items() if not there)
         raise ValueError(f"sigma is given for other quantities but not for {missing!r}; give all or none.")

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from .covariance import Covariance
 from .problem import Problem
+from .residuals import Series
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,9 +16,11 @@ class Fit:
     """The problem, the point where the iteration ended, and what is known of it there.
 
     **Fields:** `z`: the vector of the unknowns, and `values` by name; `components`: the names of all scalar components
-    of these; `objective`: minus the logarithm of likelihood and prior; `residuals` of the data, weighted; `jacobian` of
-    all rows, and `readings`: the predicted ones by experiment and sensor; `known_noise`: whether the noise level of
-    every reading is known, or an unknown of its own; `segments`: of multiple shooting.
+    of these; `objective`: minus the logarithm of likelihood and prior; `residuals` of the data, in units of the noise;
+    `series`: the same in order of time, by sensor; `jacobian` of all rows, and `readings`: the predicted ones by
+    experiment and sensor; `known_noise`: whether the noise level of every reading is known, or an unknown of its own;
+    `success`: whether the iteration converged; `doubts`: what speaks against the estimates as a whole; `dispersion`:
+    the factor of twice a difference of the objective over a χ² variable; `segments`: of multiple shooting.
     """
 
     problem: Problem
@@ -26,11 +29,14 @@ class Fit:
     components: tuple[str, ...]
     objective: float
     residuals: np.ndarray
+    series: tuple[Series, ...]
     jacobian: np.ndarray
     covariance: Covariance
     readings: dict[str, dict[str, Any]]
     known_noise: bool
     success: bool
+    doubts: tuple[str, ...]
+    dispersion: float
     segments: int
     tol: float
     max_iterations: int

@@ -16,8 +16,10 @@ from ...system import AbstractSystem
 from ...trajectory import Trajectory
 from ..minimise import Minimum, descend, minimise_together
 from ..ranges import Bounds
-from .experiment import Experiment
+from .experiment import Experiment, with_times
 from .identification import Identification, identification
+from .loss import loss_named
+from .measurements import Measurements
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
 from .sensors import Sensor
 from .shooting import shoot
@@ -32,9 +34,9 @@ _ITERATIONS = {"lm": 100, "optax": 1000}
 @names_arguments
 def identify(
     system: AbstractSystem,
-    measured: Mapping[str, VectorLike] | Experiment | Sequence[Experiment] | None = None,
+    measured: Mapping[str, VectorLike] | Measurements | Experiment | Sequence[Experiment] | None = None,
     *,
-    ts: ArrayLike | None = None,
+    ts: ArrayLike | Mapping[str, ArrayLike] | None = None,
     free: Mapping[str, VectorLike | None] | Sequence[str] = (),
     state: State | None = None,
     fix: Mapping[str, VectorLike] | None = None,
@@ -46,6 +48,7 @@ def identify(
     bounds: Mapping[str, Bounds] | None = None,
     prior: Mapping[str, Prior] | None = None,
     residual: Callable[[Trajectory], Array] | None = None,
+    loss: str = "linear",
     starts: int | Sequence[Mapping[str, VectorLike]] = 1,
     seed: int = 0,
     segments: int = 1,
@@ -64,8 +67,10 @@ def identify(
         `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
         coordinates and their rates q̇, `"theta"` and `"theta.rate"`, shape (times,), and generalized forces of its
         constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
-        wrapping. Instead, an `Experiment` or a list of them, each with its own data, times and initial state.
-    - `ts`: times [s], shape (times,), increasing, from `t0` on.
+        wrapping. Instead, the `Measurements` that `read_measurements` returns, with their times; or an `Experiment` or
+        a list of them, each with its own data, times and initial state.
+    - `ts`: times [s], shape (times,), increasing, from `t0` on. Where sensors have times of their own, by name of what
+        was measured: `ts={"encoder": (times1,), "gyro": (times2,)}`; each measured array has the length of its own.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
         system's values. Every experiment has the same value, unless the name is among its `own`: that unknown is
         called `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
@@ -87,7 +92,13 @@ def identify(
         parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
     - `prior`: `(mean, deviation)` by name, of a normal distribution that is known before the measurement. Needs the
         noise levels, known or free.
-    - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of weighted residuals.
+    - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of residuals in units of
+        their noise, with time as axis 0.
+    - `loss`: how residuals r, in units of σ, weigh: the fit minimises `½ Σ ρ(r²)`, with ρ of "linear", least squares,
+        or, for data with outliers, of "soft_l1", `2 (√(1 + r²) − 1)`, or "huber", `r²` up to one σ and `2 |r| − 1`
+        beyond. The latter two need `sigma` in numbers, or a residual function. They are those of
+        `scipy.optimize.least_squares`; a residual beyond about one σ pulls as one of σ. Deviations are then estimated
+        from the residuals, as those of Huber's M-estimate.
     - `starts`: how many points to start from, the first one that of `free`, the others drawn with `seed` between the
         bounds or, where there are none, from a normal distribution of the size of the start; or further starting
         values, one mapping for each start. They are simulated in one batch, and the best minimum is returned.
@@ -103,13 +114,19 @@ def identify(
 
     A trial at which the mechanism cannot be assembled or the simulation fails is rejected, and a smaller step is tried.
 
-    **Returns:** an `Identification`.
+    **Returns:** an `Identification`. It is `converged` only if the iteration converged and nothing speaks against its
+    end: residuals far beyond `sigma`, or without it no closer to the data than a constant; residuals that are no noise,
+    by their signs, their autocorrelation or their correlation with what is predicted; an estimate at an end of its
+    range, or one that the data do not determine; another of the `starts` that fits as well elsewhere. `warnings` say
+    what it is, and what helps.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, fewer data than unknowns,
     and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.
     """
     own = {"ts": ts, "state": state, "fix": fix, "rates": rates, "residual": residual, "free_initial": free_initial}
-    problem, known_noise = _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, options)
+    problem, known_noise = _problem(
+        system, measured, own, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options
+    )
     if method != "lm" and not isinstance(method, optax.GradientTransformation):
         raise ValueError(f"method must be 'lm' or an optax optimiser, got {method!r}.")
     limit = _ITERATIONS["lm" if method == "lm" else "optax"] if max_iterations is None else max_iterations
@@ -131,7 +148,7 @@ def identify(
             known_noise=known_noise,
             iterations=shot.iterations,
             success=shot.success,
-            objectives=(shot.objective,),
+            ends=[(shot.objective, shot.z)],
             tol=tol,
             max_iterations=limit,
             segments=segments,
@@ -150,25 +167,23 @@ def identify(
     return identification(
         problem,
         best.z,
-        data=model.linearised.residuals[: model.data],
-        jacobian=model.linearised.jacobian,
+        data=model.plain.residuals[: model.data],
+        jacobian=model.plain.jacobian,
         objective=model.linearised.value,
         readings=model.readings,
         known_noise=known_noise,
         iterations=best.iterations,
         success=best.success,
-        objectives=tuple(solution.value for solution in solutions),
+        ends=[(solution.value, solution.z) for solution in solutions],
         tol=tol,
         max_iterations=limit,
     )
 
 
-def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, options) -> tuple[Problem, bool]:
+def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> tuple[Problem, bool]:
     """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
-    if isinstance(measured, Mapping) or measured is None:
-        if own["ts"] is None:
-            raise ValueError("ts is missing: the times of what was measured.")
-        experiments = {"": Experiment(measured, **own, t0=t0)}
+    if isinstance(measured, Mapping | Measurements) or measured is None:
+        experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]
         given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
@@ -176,7 +191,7 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, opt
             raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {given[0]}=…).")
         experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
     named = sensors_by_name(system, sensors)
-    free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma)
+    free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma, loss)
     problem = Problem(
         system=system,
         free=free,
@@ -188,6 +203,8 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, opt
         options=_checked(options),
     )
     known_noise = _known_noise(experiments, named, sigma, trials)
+    if loss.robust and not (known_noise and np.all(~level_mask(problem))):
+        raise ValueError(f"loss={loss.name!r} needs to know from where on a residual is large: give sigma, as numbers.")
     if priors.names and not known_noise:
         raise ValueError(
             f"The prior of {priors.names[0]!r} is weighed against noise of a known size: give sigma, or free the noise "
@@ -258,7 +275,7 @@ def _check_start(problem: Problem, model: Model) -> None:
             text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
             where = f" of experiment {name!r}" if name else ""
             raise ValueError(f"The simulation{where} fails with the starting values: {text}")
-    residuals, jacobian, _ = model.linearised
+    residuals, jacobian, _ = model.plain
     if not np.all(np.isfinite(residuals)):
         raise ValueError("The residuals are not finite with the starting values.")
     size = max(trial.size for trial in problem.trials)

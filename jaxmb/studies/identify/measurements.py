@@ -13,8 +13,8 @@ _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
 class Measurements(NamedTuple):
-    """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, as `identify` takes them:
-    `identify(system, data.values, ts=data.ts, …)`.
+    """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, as `identify` and
+    `Experiment` take them: `identify(system, data, …)`.
     """
 
     ts: np.ndarray

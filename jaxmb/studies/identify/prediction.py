@@ -23,7 +23,8 @@ class Prediction:
 
     **Fields:** `ts` [s]; by name of the quantity `values`, their standard `deviations`, and the ends of the band that
     holds the true value with probability `level`, `low` and `high`; times are axis 0. A deviation is infinite where the
-    quantity depends on what the data do not determine.
+    quantity depends on what the data do not determine, and not a number where the fit did not converge, or does not
+    explain its data.
     """
 
     ts: np.ndarray
@@ -68,7 +69,7 @@ def predict(
             along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
             size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
             deviation = np.where(along > 1e-6 * size, np.inf, deviation)
-        deviations[name] = deviation
+        deviations[name] = np.full_like(deviation, np.nan) if fit.doubts else deviation
     low = {name: out[name] - width * deviations[name] for name in names}
     high = {name: out[name] + width * deviations[name] for name in names}
     return Prediction(np.asarray(ts), out, deviations, low, high, level)
@@ -94,7 +95,7 @@ class HeldOut:
     """How well data that were not fitted are predicted.
 
     **Fields:** `residuals` of the samples, predicted minus measured, weighted by the noise level (by the range of the
-    readings where it is not known); `rms`: their root mean square; `readings`: predicted, by sensor.
+    readings where it is not known); `rms`: their root mean square; `readings`: predicted, by sensor, at its times.
     """
 
     residuals: np.ndarray
@@ -111,7 +112,8 @@ def held_out(fit: Fit) -> dict[str, HeldOut]:
             continue
         seen = _seen(problem.system, problem.trials[number], problem.options, problem.own(number, values))
         residuals = np.asarray(seen.rows.residuals)[np.asarray(seen.rows.present)]
-        readings = {sensor: np.asarray(reading) for sensor, reading in seen.readings.items()}
+        own = {channel.name: np.asarray(channel.places) for channel in problem.trials[number].channels}
+        readings = {sensor: np.asarray(reading)[own.get(sensor, ...)] for sensor, reading in seen.readings.items()}
         out[name] = HeldOut(residuals, float(np.sqrt(np.mean(residuals**2))), readings)
     return out
 

@@ -17,6 +17,7 @@ from ...system import AbstractSystem
 from ..minimise import Linearised
 from ..ranges import FreeParameters
 from .experiment import Seen, Trial
+from .loss import Loss
 from .unknowns import Priors
 
 
@@ -35,6 +36,11 @@ class Problem(eqx.Module):
     fitted: tuple[bool, ...] = eqx.field(static=True)
     trials: tuple[Trial, ...]
     options: dict[str, Any]
+
+    @property
+    def loss(self) -> Loss:
+        """The loss, which all experiments have in common."""
+        return self.trials[0].loss
 
     def own(self, number: int, values: Mapping[str, Array]) -> dict[str, Array]:
         """The unknowns of one experiment, by their names in it."""
@@ -68,11 +74,13 @@ class Problem(eqx.Module):
 class Model(NamedTuple):
     """A `Linearised` with its parts.
 
-    **Fields:** `data`: the number of residuals that are of data, the first ones; those of priors and noise levels
-    follow; `results`: how each simulation ended; `readings`: predictions by experiment and sensor.
+    **Fields:** `linearised`, with residuals weighted by the loss, and `plain`, as they are; `data`: the number of
+    residuals that are of data, the first ones; those of priors and noise levels follow; `results`: how each simulation
+    ended; `readings`: predictions by experiment and sensor.
     """
 
     linearised: Linearised
+    plain: Linearised
     data: int
     results: tuple[RESULTS, ...]
     readings: dict[str, dict[str, np.ndarray]]
@@ -156,14 +164,25 @@ def _joined(problem, chart, found) -> Model:
         scores.append(rows.scores)
         score_jacobians.append(of_scores @ inward)
         objective = objective + rows.objective
-    data = sum(own.size for own in residuals)
-    model = Linearised(
+    plain = Linearised(
         np.concatenate([*residuals, prior_rows, *scores]),
         np.vstack([*jacobians, prior_jacobian, *score_jacobians]),
         objective,
     )
+    data = sum(own.size for own in residuals)
     results = tuple(seen.result for seen, _ in found.values())
-    return Model(model, data, results, {problem.names[n]: seen.readings for n, (seen, _) in found.items()})
+    readings = {problem.names[n]: seen.readings for n, (seen, _) in found.items()}
+    return Model(weighted(problem, plain, data), plain, data, results, readings)
+
+
+def weighted(problem: Problem, plain: Linearised, data: int) -> Linearised:
+    """The linearised objective, whose first rows, those of data, weigh by the loss."""
+    residuals, jacobian = problem.loss.weighted(plain.residuals[:data], plain.jacobian[:data])
+    return Linearised(
+        np.concatenate([residuals, plain.residuals[data:]]),
+        np.vstack([jacobian, plain.jacobian[data:]]),
+        plain.objective,
+    )
 
 
 def with_likely_levels(

@@ -114,7 +114,7 @@ class _Walk:
             minimum = Minimum(start, 1, bool(np.isfinite(model.value)), model.value)
         else:
             minimum = levenberg_marquardt(linearised, start, fit.tol, fit.max_iterations, self.held)
-        ratio = 2 * (minimum.value - fit.objective)
+        ratio = 2 * (minimum.value - fit.objective) / fit.dispersion
         if not fit.known_noise:
             ratio = self.fit.residuals.size * np.log(2 * minimum.value / self.squares)
         return value, float(ratio), minimum

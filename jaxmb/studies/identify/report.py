@@ -12,6 +12,10 @@ import numpy as np
 from .fit import Fit
 from .prediction import held_out
 from .profile import Profile, profile
+from .residuals import Outlier
+
+# Outliers that are listed.
+_MOST = 50
 
 _STYLE = (
     "body{font-family:sans-serif;max-width:60em;margin:2em auto}table{border-collapse:collapse}"
@@ -23,10 +27,11 @@ def write_report(
     fit: Fit,
     path: str | Path,
     *,
-    message: str,
+    verdict: Sequence[str],
     start: np.ndarray,
-    deviations: np.ndarray,
+    deviations: Sequence[str],
     combinations: Sequence[dict[str, float]],
+    outliers: Sequence[Outlier],
     profiles: Sequence[str],
 ) -> Path:
     """As `Identification.report`."""
@@ -35,14 +40,16 @@ def write_report(
     path.parent.mkdir(parents=True, exist_ok=True)
     values = np.concatenate([np.ravel(value) for value in fit.values.values()])
     rows = zip(fit.components, start, values, deviations, strict=True)
-    parts = [
-        "<h1>Identification</h1>",
+    headline, *reasons = map(html.escape, verdict)
+    parts = ["<h1>Identification</h1>", f"<p><strong>{headline}</strong></p>"]
+    if reasons:
+        parts.append("<ul>" + "".join(f"<li>{reason}</li>" for reason in reasons) + "</ul>")
+    parts += [
         _table(
             ("parameter", "start", "estimate", "standard deviation"),
-            [(name, f"{a:.6g}", f"{b:.6g}", f"{c:.2g}") for name, a, b, c in rows],
+            [(name, f"{a:.6g}", f"{b:.6g}", c) for name, a, b, c in rows],
         ),
-        f"<p>{html.escape(message)}</p><p>{fit.residuals.size} residuals, rms "
-        f"{np.sqrt(np.mean(fit.residuals**2)):.3g}</p>",
+        f"<p>{fit.residuals.size} residuals, rms {np.sqrt(np.mean(fit.residuals**2)):.3g}</p>",
     ]
     for direction in combinations:
         text = ", ".join(f"{name} {100 * share:+.3g} %" for name, share in direction.items())
@@ -51,7 +58,11 @@ def write_report(
         readings = fit.readings[name] if fitted else held_out(fit)[name].readings
         for channel in trial.channels:
             label = " ".join(filter(None, (name, channel.name, "" if fitted else "(held out)")))
-            parts += [f"<h2>{html.escape(label)}</h2>", _fit_figure(trial, channel, np.asarray(readings[channel.name]))]
+            far = [own for own in outliers if (own.experiment, own.sensor) == (name, channel.name)]
+            predicted = np.asarray(readings[channel.name])
+            parts += [f"<h2>{html.escape(label)}</h2>", _fit_figure(trial, channel, predicted, fitted, far)]
+    if outliers:
+        parts += ["<h2>Residuals beyond 5 σ</h2>", _outliers(outliers)]
     if len(fit.components) > 1:
         parts += ["<h2>Correlations</h2>", _correlations(fit)]
     for component in profiles:
@@ -81,12 +92,35 @@ def _image(figure: Any) -> str:
     return f"<img src='data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}'>"
 
 
-def _fit_figure(trial, channel, predicted) -> str:
-    """Measured samples and the fit above, what is between them below."""
+def _outliers(outliers: Sequence[Outlier]) -> str:
+    """The outliers in a table, the largest first."""
+    shown = sorted(outliers, key=lambda own: -abs(own.residual))[:_MOST]
+    rows = [
+        (
+            " ".join(filter(None, (own.experiment, own.sensor))),
+            ", ".join(map(str, own.sample)),
+            f"{own.t:.6g}",
+            f"{own.residual:.3g} σ",
+        )
+        for own in shown
+    ]
+    more = "" if len(shown) == len(outliers) else f"<p>and {len(outliers) - len(shown)} smaller ones</p>"
+    return _table(("sensor", "sample", "time [s]", "fitted − measured"), rows) + more
+
+
+def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> str:
+    """Measured samples and the fit above, what is between them below; residuals beyond 5 σ have a ring."""
     figure, (above, below) = _axes(2, 5.0)
-    ts = np.asarray(trial.ts)
-    measured = np.where(channel.present, channel.values, np.nan).reshape(ts.size, -1)
-    predicted = predicted.reshape(ts.size, -1)
+    own = np.asarray(channel.places)
+    ts = np.asarray(trial.ts)[own]
+    measured = np.where(channel.present, channel.values, np.nan)[own].reshape(ts.size, -1)
+    predicted = (predicted[own] if fitted else predicted).reshape(ts.size, -1)
+    shape = np.shape(channel.values)[1:]
+    for outlier in far:
+        sample, component = outlier.sample[0], int(np.ravel_multi_index(outlier.sample[1:], shape)) if shape else 0
+        ring = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "color": "red", "linestyle": "none"}
+        above.plot(ts[sample], measured[sample, component], **ring)
+        below.plot(ts[sample], measured[sample, component] - predicted[sample, component], **ring)
     for k in range(measured.shape[1]):
         above.plot(ts, measured[:, k], ".", color=f"C{k}", markersize=3)
         above.plot(ts, predicted[:, k], "-", color=f"C{k}", linewidth=1)

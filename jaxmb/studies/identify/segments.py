@@ -13,8 +13,9 @@ from jaxtyping import Array
 from ..._types import State
 from ...states.assembly import assemble
 from ...system import AbstractSystem
+from ..minimise import Linearised
 from .experiment import Trial
-from .problem import Problem, numbers, values_and_derivatives
+from .problem import Problem, numbers, values_and_derivatives, weighted
 
 
 class Lanes(NamedTuple):
@@ -27,7 +28,10 @@ class Lanes(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The unknowns, and the linearised problem there; infinite where a simulation failed."""
+    """The unknowns, and the linearised problem there; infinite where a simulation failed.
+
+    `residuals` and `jacobian` are weighted by the loss, those of `plain` are as they are.
+    """
 
     z: Array
     states: tuple[State, ...]
@@ -36,6 +40,7 @@ class Point(NamedTuple):
     data: int
     residuals: np.ndarray
     jacobian: np.ndarray
+    plain: Linearised
     gaps: np.ndarray
     continuity: np.ndarray
     readings: dict[str, dict[str, np.ndarray]]
@@ -135,14 +140,17 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], z, states) -> Point:
     whole = np.concatenate([*residuals, prior_rows, *scores]), np.vstack([*jacobian, prior_whole, *score_rows])
     finite = np.isfinite(objective) and all(np.all(np.isfinite(x)) for x in (*whole, *gaps, *continuity))
     objective = float(objective) if finite else np.inf
+    plain = Linearised(*whole, objective)
+    model = weighted(problem, plain, data)
     return Point(
         z=z,
         states=tuple(states),
         charts=tuple(all_charts),
         objective=objective,
         data=data,
-        residuals=whole[0],
-        jacobian=whole[1],
+        residuals=model.residuals,
+        jacobian=model.jacobian,
+        plain=plain,
         gaps=np.concatenate(gaps),
         continuity=np.vstack(continuity),
         readings=readings,

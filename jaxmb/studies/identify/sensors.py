@@ -8,9 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Scalar, VectorLike
+from .loss import Loss
 
 # What can be unknown of a sensor.
 SENSOR_FIELDS = ("bias", "gain", "delay", "sigma")
@@ -60,8 +61,9 @@ class Rows(eqx.Module):
 class Channel(eqx.Module):
     """The readings of one sensor in one experiment, with its known numbers.
 
-    **Fields:** `values` and `present`, shape (times, …); `sigma` broadcasts to them; `delayed`: whether the sensor has
-    its own times.
+    **Fields:** `values` and `present`, shape (times, …), at the times of all sensors of the experiment together, where
+    one that has times of its own lacks the others' samples; `sigma` broadcasts to them; `places`: which of the times
+    are the sensor's own; `delayed`: whether it sees the motion at other times.
     """
 
     name: str = eqx.field(static=True)
@@ -69,6 +71,7 @@ class Channel(eqx.Module):
     delayed: bool = eqx.field(static=True)
     values: Float[Array, "times *shape"]
     present: Bool[Array, "times *shape"]
+    places: Int[Array, "own"]
     bias: Array
     gain: Array
     delay: Array
@@ -83,14 +86,15 @@ class Channel(eqx.Module):
         gain, bias = (self._each(theta.get(f"{self.name}.{key}", getattr(self, key))) for key in ("gain", "bias"))
         return gain * quantity + bias
 
-    def rows(self, predicted: Float[Array, "times *shape"], theta: Mapping[str, Array]) -> Rows:
-        """How far predicted readings are from the measured ones."""
+    def rows(self, predicted: Float[Array, "times *shape"], theta: Mapping[str, Array], loss: Loss) -> Rows:
+        """How far predicted readings are from the measured ones; a loss but the linear one needs a known `sigma`."""
         difference = jnp.where(self.present, predicted - self.values, jnp.zeros_like(predicted))
         level = theta.get(f"{self.name}.sigma")
         if level is None:
             residuals = difference / self.sigma
             none = jnp.zeros((0,), residuals.dtype)
-            return Rows(residuals.reshape(-1), self.present.reshape(-1), none, 0.5 * jnp.sum(residuals**2))
+            objective = 0.5 * jnp.sum(loss.rho(residuals**2))
+            return Rows(residuals.reshape(-1), self.present.reshape(-1), none, objective)
         # The expected second derivatives do not couple noise levels with what the residuals depend on.
         residuals = difference / self._each(lax.stop_gradient(level))
         spread = tuple(range(difference.ndim - level.ndim)) if level.ndim else None
@@ -131,6 +135,7 @@ def readings_of(
     data: Any,
     sigma: Any,
     shape: tuple[int, ...],
+    places: Int[np.ndarray, "own"],
     times: int,
     dtype: Any,
     unknown_delay: bool,
@@ -138,15 +143,16 @@ def readings_of(
     """The readings of a sensor, checked.
 
     **Arguments:** `sigma`: standard deviation of the noise, None if it is not known: readings are weighted by their
-    range then; `shape` of the quantity at one time; `times`: their number.
+    range then; `shape` of the quantity at one time; `places` of the sensor's times among all; `times`: their number.
     """
     name = sensor.label
     try:
         data = np.asarray(data, dtype=dtype)
     except (TypeError, ValueError):
         raise ValueError(f"Measured {name!r} must be an array of numbers, NaN where a sample is missing.") from None
-    if data.shape != (times, *shape):
-        raise ValueError(f"Measured {name!r} must have shape {(times, *shape)} for {times} times, got {data.shape}.")
+    own = places.size
+    if data.shape != (own, *shape):
+        raise ValueError(f"Measured {name!r} must have shape {(own, *shape)} for {own} times, got {data.shape}.")
     if np.any(np.isinf(data)):
         raise ValueError(f"Measured {name!r} is infinite at sample {np.argwhere(np.isinf(data))[0][0]}.")
     present = ~np.isnan(data)
@@ -162,11 +168,19 @@ def readings_of(
         name=name,
         quantity=sensor.quantity,
         delayed=unknown_delay or float(numbers["delay"]) != 0.0,
-        values=jnp.asarray(np.where(present, data, 0.0)),
-        present=jnp.asarray(present),
-        sigma=jnp.asarray(_deviations(name, data, sigma)),
+        values=jnp.asarray(_among_all(np.where(present, data, 0.0), places, times, 0.0)),
+        present=jnp.asarray(_among_all(present, places, times, False)),
+        places=jnp.asarray(places),
+        sigma=jnp.asarray(_among_all(_deviations(name, data, sigma), places, times, 1.0)),
         **numbers,
     )
+
+
+def _among_all(own: np.ndarray, places: np.ndarray, times: int, otherwise: Any) -> np.ndarray:
+    """What a sensor has at its own times, at the times of all sensors."""
+    out = np.full((times, *own.shape[1:]), otherwise, own.dtype)
+    out[places] = own
+    return out
 
 
 def _deviations(name: str, data: np.ndarray, sigma: Any) -> np.ndarray:

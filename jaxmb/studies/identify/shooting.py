@@ -35,8 +35,8 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING, _HALVINGS = 1e-6, 1e-12, 1e8, 6
 class Shot(NamedTuple):
     """Where multiple shooting ended.
 
-    **Fields:** `z`; `data`: weighted residuals of data; `jacobian` of all rows along the directions that keep the
-    motion continuous, and `along`: how z changes along them; `objective`; `readings` by experiment and sensor;
+    **Fields:** `z`; `data`: residuals of data in units of the noise; `jacobian` of all rows along the directions that
+    keep the motion continuous, and `along`: how z changes along them; `objective`; `readings` by experiment and sensor;
     `continuity`: the largest gap; `iterations`; `success`.
     """
 
@@ -78,8 +78,8 @@ def shoot(problem: Problem, z: Float[Array, "n"], segments: int, tol: float, lim
     basis = _null_basis(point.continuity)[2]
     return Shot(
         point.z,
-        point.residuals[: point.data],
-        point.jacobian @ basis,
+        point.plain.residuals[: point.data],
+        point.plain.jacobian @ basis,
         basis[: z.size],
         point.objective,
         point.readings,
@@ -143,7 +143,10 @@ def _step(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _each_to_its_data(lanes, evaluate, point: Point) -> Point:
-    """The states from which each segment alone fits its data, with the parameters as they are, by damped steps."""
+    """The states from which each segment alone fits its data, with the parameters as they are, by damped steps.
+
+    They are only where the joint iteration starts, and weigh all residuals by their squares.
+    """
     dampings = [np.full(len(own.samples), 1e-3) for own in lanes]
     for _ in range(_ALONE):
         moves = []

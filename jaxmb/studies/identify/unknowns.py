@@ -16,7 +16,8 @@ from ...system import AbstractSystem, parameters, with_parameters
 from ...system.arguments import check_kind
 from ...system.design import design_bounds
 from ..ranges import Bounds, FreeParameters, range_of
-from .experiment import Experiment, Trial, arrays, channels_of, checked_times, initial_unknown, known_parameters
+from .experiment import Experiment, Trial, arrays, channels_of, initial_unknown, known_parameters, times_of, with_times
+from .loss import Loss
 from .sensors import SENSOR_FIELDS, Channel, Sensor
 
 Prior = tuple[VectorLike, VectorLike]
@@ -63,7 +64,7 @@ def experiments_by_name(experiments: Sequence[Experiment]) -> dict[str, Experime
         name = f"exp{number}" if experiment.name is None else experiment.name
         if name in out or not name or "/" in name:
             raise ValueError(f"The name {name!r} of an experiment must be its own, not empty and without '/'.")
-        out[name] = experiment
+        out[name] = with_times(experiment, f" of experiment {name!r}")
     if not any(not experiment.held_out for experiment in out.values()):
         raise ValueError("There is no experiment to fit: give one or more that are not held_out.")
     return out
@@ -90,6 +91,7 @@ def unknowns(
     bounds: Mapping[str, Bounds] | None,
     prior: Mapping[str, Prior] | None,
     sigma: Mapping[str, VectorLike] | None,
+    loss: Loss,
 ) -> Unknowns:
     """Unknowns with their starts, ranges and priors, and the experiments that depend on them.
 
@@ -105,7 +107,7 @@ def unknowns(
     found: dict[str, _Unknown] = {}
     trials, sources = [], []
     for name, experiment in experiments.items():
-        trial, own = _trial(system, name, experiment, sensors, given, sigma, found)
+        trial, own = _trial(system, name, experiment, sensors, given, sigma, loss, found)
         trials.append(trial)
         sources.append(own)
     _check_sigma(system, experiments, sensors, sigma)
@@ -173,15 +175,15 @@ def _check_sigma(system, experiments, sensors, sigma) -> None:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
 
 
-def _trial(system, prefix, experiment, sensors, given, sigma, found) -> tuple[Trial, tuple[str, ...]]:
+def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[Trial, tuple[str, ...]]:
     """One experiment, whose unknowns are added to those that are found."""
-    ts = checked_times(experiment.ts, experiment.t0)
+    ts, places = times_of(experiment)
     label = lambda name: f"{prefix}/{name}" if prefix else name
     known = known_parameters(system, experiment)
     own = {*experiment.own}
     shared = [name for name in given if "/" not in name and not name.startswith("initial.")]
     local = list(dict.fromkeys((*shared, *experiment.own)))
-    channels = channels_of(system, experiment, sensors, sigma, frozenset(local), ts)
+    channels = channels_of(system, experiment, sensors, sigma, frozenset(local), ts, places)
     values, positive = parameters(system) | known, system.positive_parameters()
     by_name = {f"{channel.name}.{key}": (channel, key) for channel in channels for key in SENSOR_FIELDS}
 
@@ -227,6 +229,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, found) -> tuple[Tr
         initial=initial,
         channels=channels,
         residual=experiment.residual,
+        loss=loss,
         known=known,
         state=guess,
         fix=fix,

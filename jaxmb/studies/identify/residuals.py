@@ -1,0 +1,147 @@
+"""The residuals of each sensor in order of time, in units of its noise."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .experiment import RESIDUAL, Trial
+from .problem import Problem
+from .sensors import Channel
+
+# What is left of a fit does not matter below half a standard deviation of the noise that is known, or, where the noise
+# is not known, below a thousandth of the range of what was measured: about the errors of simulations and instruments.
+_SMALL, _SMALL_OF_RANGE = 0.5, 1e-3
+# Residuals beyond so many standard deviations are outliers: one in two million of normal noise.
+_FAR = 5.0
+# From so many samples on, the noise is known from their median, which outliers do not change.
+_MANY = 20
+
+
+class Series(NamedTuple):
+    """The residuals of one component of a sensor in order of time, predicted minus measured.
+
+    **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma` (one each),
+    or of the range where the noise is not known; `known`: whether it is, from before the fit; `small`: the size of
+    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: the indices in what was measured.
+    Where a residual function was given, `predicted` and `ts` are empty.
+    """
+
+    label: str
+    experiment: str
+    sensor: str
+    component: tuple[int, ...]
+    residuals: np.ndarray
+    sigma: np.ndarray
+    known: bool
+    small: float
+    predicted: np.ndarray
+    ts: np.ndarray
+    samples: np.ndarray
+
+    @property
+    def square(self) -> float:
+        """The mean square of the residuals."""
+        return float(np.mean(self.residuals**2))
+
+
+class Outlier(NamedTuple):
+    """A residual beyond five standard deviations of the noise.
+
+    **Fields:** `experiment`, `sensor`; `sample`: the index in what was measured; `t` [s], not a number for what a
+    residual function returns; `residual`: predicted minus measured, in standard deviations.
+    """
+
+    experiment: str
+    sensor: str
+    sample: tuple[int, ...]
+    t: float
+    residual: float
+
+
+def series(
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    readings: Mapping[str, Mapping[str, Any]],
+    known_noise: bool,
+) -> tuple[Series, ...]:
+    """The residuals of everything that was fitted, from the unknowns by name and the readings at them."""
+    out = []
+    for number, (name, trial, fitted) in enumerate(zip(problem.names, problem.trials, problem.fitted, strict=True)):
+        if fitted and trial.residual is not None:
+            out += _of_user(name, trial, np.asarray(readings[name][RESIDUAL]))
+        elif fitted:
+            theta = problem.own(number, values)
+            for channel in trial.channels:
+                level = theta.get(f"{channel.name}.sigma")
+                out += _of_channel(name, trial, channel, np.asarray(readings[name][channel.name]), level, known_noise)
+    return tuple(out)
+
+
+def _of_channel(experiment: str, trial: Trial, channel: Channel, predicted, level, known_noise) -> Iterator[Series]:
+    ts, measured, present = (np.asarray(x) for x in (trial.ts, channel.values, channel.present))
+    sigma = np.broadcast_to(np.asarray(channel.sigma if level is None else level), measured.shape)
+    own = np.full(ts.size, -1)
+    own[np.asarray(channel.places)] = np.arange(channel.places.size)
+    known = known_noise and level is None
+    for component in np.ndindex(measured.shape[1:]):
+        there = present[(slice(None), *component)]
+        at = (there, *component)
+        if not there.any():
+            continue
+        label = " ".join(filter(None, (experiment, channel.name + _indices(component))))
+        unit = sigma[at]
+        small = _SMALL if known else _SMALL_OF_RANGE * float(channel.range) / float(np.max(unit))
+        yield Series(
+            label=label,
+            experiment=experiment,
+            sensor=channel.name,
+            component=component,
+            residuals=(predicted[at] - measured[at]) / unit,
+            sigma=unit,
+            known=known,
+            small=small,
+            predicted=predicted[at],
+            ts=ts[there],
+            samples=own[there],
+        )
+
+
+def _of_user(experiment: str, trial: Trial, residuals: np.ndarray) -> Iterator[Series]:
+    """Columns of one row for each time, or else one series."""
+    rows = trial.ts.size if residuals.ndim and residuals.shape[0] == trial.ts.size else residuals.size
+    label = " ".join(filter(None, (experiment, "what residual returns")))
+    for k, column in enumerate(residuals.reshape(rows, -1).T):
+        yield Series(
+            label=label,
+            experiment=experiment,
+            sensor=RESIDUAL,
+            component=np.unravel_index(k, residuals.shape[1:]) if residuals.ndim > 1 and rows == len(residuals) else (),
+            residuals=column,
+            sigma=np.ones_like(column),
+            known=True,
+            small=_SMALL,
+            predicted=np.zeros(0),
+            ts=np.zeros(0),
+            samples=np.arange(column.size),
+        )
+
+
+def outliers(found: tuple[Series, ...]) -> tuple[Outlier, ...]:
+    """The residuals beyond five standard deviations, in order of experiments, sensors and times."""
+    out = []
+    for own in found:
+        sizes = np.abs(own.residuals)
+        level = 1.0
+        if not own.known:
+            middle = np.median(sizes) / 0.6745 if sizes.size >= _MANY else np.sqrt(own.square)
+            level = max(float(middle), own.small)
+        for k in np.flatnonzero(sizes > _FAR * level):
+            t = float(own.ts[k]) if own.ts.size else np.nan
+            sample = (int(own.samples[k]), *map(int, own.component))
+            out.append(Outlier(own.experiment, own.sensor, sample, t, float(own.residuals[k] / level)))
+    return tuple(out)
+
+
+def _indices(component: tuple[int, ...]) -> str:
+    return f"[{', '.join(map(str, component))}]" if component else ""

@@ -1,0 +1,224 @@
+"""Whether a fit explains its data: tests of the residuals, of the estimates, and of the ends of several starts.
+
+Every test of residuals accuses a right fit with normal noise with a probability of less than one in a million, by
+Chernoff's bounds of the distributions' tails, which hold for few samples as well. It accuses only where the misfit is
+not small compared with the noise either: a significant difference may not matter.
+
+Source: L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall 1999, chapter 16; J. D. Gibbons
+and S. Chakraborti, "Nonparametric Statistical Inference", 5th ed., CRC Press 2011, chapter 3 (runs); R. Leipnik,
+"Distribution of the serial correlation coefficient in a circularly correlated universe", Annals of Mathematical
+Statistics 18, 1947.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .residuals import Outlier, Series
+
+# The probability at which a test accuses a right fit.
+_LEVEL = 1e-6
+# Residuals whose root mean square is larger than this are beyond σ; whose median is larger, relative to that of normal
+# noise, where large residuals are expected.
+_BEYOND, _BEYOND_MEDIAN = 1.25, 2.0
+# The median of the absolute value of a standard normal variable.
+_MEDIAN = 0.6745
+# Residuals are no noise if this share of their mean square, or more, follows from others.
+_SHARE = 0.2
+# Two minima that differ by less than this, in twice the logarithm of the likelihood ratio, fit as well as each other;
+# their estimates contradict each other where they differ by more than so many standard deviations.
+_AS_WELL, _APART = 10.0, 5.0
+
+_CURES = (
+    "try other starts (starts=), a range of plausible values (bounds=) and, for a fast, unstable or chaotic motion, "
+    "shorter pieces (segments=)"
+)
+
+
+def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, robust: bool) -> Iterator[str]:
+    """What the residuals of a fit say against it.
+
+    **Arguments:** `directions`: how many combinations of unknowns were fitted; `robust`: whether the loss expects
+    residuals that are large.
+    """
+    known = [own for own in found if own.known]
+    if known:
+        yield from _beyond(known, len(far), directions, robust)
+    if len(known) < len(found):
+        yield from _explains_nothing([own for own in found if not own.known])
+    yield from _no_noise(found, directions)
+
+
+def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
+    """The sum of squares against its χ² distribution, of all residuals and of each series; or the sign test that the
+    median is that of normal noise.
+    """
+    whole = np.concatenate([own.residuals for own in found])
+    groups = {"": (whole, directions)}
+    if len(found) > 1:
+        groups |= {f"those of {own.label}": (own.residuals, 0) for own in found}
+    worst = None
+    for label, (residuals, fitted) in groups.items():
+        count, squares = residuals.size - fitted, float(np.sum(residuals**2))
+        if robust:
+            size = float(np.median(np.abs(residuals))) / _MEDIAN
+            above = int(np.sum(np.abs(residuals) > _MEDIAN))
+            chance, beyond = _fair_trials(residuals.size - above, residuals.size), size > _BEYOND_MEDIAN
+        elif count > 0:
+            size = float(np.sqrt(squares / count))
+            chance, beyond = _chi_squared(squares, count), size > _BEYOND
+        else:
+            continue
+        if beyond and chance * len(groups) < _LEVEL and (worst is None or size > worst[0]):
+            worst = size, label
+    if worst is None:
+        return
+    size, label = worst
+    what = "median" if robust else "root mean square"
+    text = f"the residuals are far beyond sigma, {label or 'all together'} by a factor of {size:.3g} ({what}): "
+    text += "the iteration ended in a local minimum, or the model, the data (a zero, a sign, a unit) or sigma is wrong"
+    if far and not robust and far < 0.1 * whole.size:
+        text += f". {far} of {whole.size} are beyond 5 σ: if these are outliers, take loss='soft_l1' or 'huber'"
+    yield f"{text}; {_CURES}"
+
+
+def _explains_nothing(found: list[Series]) -> Iterator[str]:
+    """Whether constants, one for each series, are closer to the data: an F test."""
+    left = right = 0.0
+    for own in found:
+        measured = own.residuals - own.predicted / own.sigma
+        left += float(np.sum(own.residuals**2))
+        right += float(np.sum((measured - np.mean(measured)) ** 2))
+    small = sum(own.residuals.size * own.small**2 for own in found)
+    constants, rest = len(found), sum(own.residuals.size for own in found) - len(found)
+    # Both sums of squares are χ² distributed if nothing but noise is left, and if the truth is constant; if it is not,
+    # the test accuses less often.
+    if rest > 0 and left - right > small and _beta(right / left, rest / 2, constants / 2) < _LEVEL:
+        explained = 1 - left / right if right > 0 else -np.inf
+        yield (
+            f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g}); the iteration "
+            f"ended in a local minimum, or the model or the data (a zero, a sign, a unit) are wrong; {_CURES}"
+        )
+
+
+def _no_noise(found: Sequence[Series], directions: int) -> Iterator[str]:
+    """Whether residuals follow from others: from their signs, from earlier ones, or from what is predicted."""
+    told, hidden = [], 0
+    for own in found:
+        if own.square <= own.small**2 or own.residuals.size < 3:
+            continue
+        for reason, share, chance in _dependences(own, directions):
+            # `share` of the mean square is no noise.
+            matters = share > _SHARE and share * own.square > own.small**2
+            if matters and chance * len(found) < _LEVEL:
+                told.append(f"those of {own.label} {reason}{_offset(own)}")
+                break
+    hidden = len(told) - 3
+    if told:
+        more = f", and of {hidden} other series as well" if hidden > 0 else ""
+        yield (
+            f"the residuals are no noise: {', '.join(told[:3])}{more}; the iteration ended in a local minimum, or the "
+            f"model or the data are wrong; {_CURES}"
+        )
+
+
+def _dependences(own: Series, directions: int) -> Iterator[tuple[str, float, float]]:
+    """How residuals depend on others, the share of their mean square that does, and the probability for noise."""
+    r, n = own.residuals, own.residuals.size
+    changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
+    # Of normal noise, which the fitted directions may have made a little smoother.
+    yield (
+        f"change their sign {changes} times in {n} samples",
+        float(np.cos(np.pi * changes / (n - 1))),
+        _fair_trials(changes + directions / np.pi, n - 1),
+    )
+    lags = np.arange(1, max(n // 4, 1) + 1)
+    total = float(np.sum(r**2))
+    correlations = np.array([np.sum(r[lag:] * r[:-lag]) for lag in lags]) / total
+    # Residuals of a fit are correlated by as much as the share of directions that were fitted.
+    sizes = np.maximum(np.abs(correlations) - directions / n, 0.0)
+    lag = int(np.argmax(sizes))
+    yield (
+        f"are correlated over {lags[lag]} samples, by {correlations[lag]:.2g}",
+        float(sizes[lag]),
+        lags.size * _correlation(float(sizes[lag]), n),
+    )
+    if own.predicted.size:
+        follows = (own.predicted - np.mean(own.predicted)) / own.sigma
+        norm = float(np.sum(follows**2))
+        if norm > 0:
+            correlation = float(np.sum(follows * r)) / np.sqrt(norm * total)
+            yield (
+                f"follow what is predicted (correlation {correlation:.2g})",
+                correlation**2,
+                _correlation(abs(correlation), n),
+            )
+
+
+def _offset(own: Series) -> str:
+    """A hint where most of the residuals is an offset."""
+    differences = own.residuals * own.sigma
+    mean = float(np.mean(differences))
+    if not own.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
+        return ""
+    return (
+        f" and are {mean:.3g} on average (does the sensor count from another zero? Its offset, "
+        f"'{own.sensor}.bias', can be free)"
+    )
+
+
+def _chi_squared(value: float, freedoms: int) -> float:
+    """At least the probability that a sum of squares of normal variables is larger."""
+    ratio = value / freedoms
+    return float(np.exp(-0.5 * freedoms * (ratio - 1 - np.log(ratio)))) if ratio > 1 else 1.0
+
+
+def _beta(value: float, a: float, b: float) -> float:
+    """At least the probability that a variable with a beta distribution is smaller."""
+    mean = a / (a + b)
+    return (value / mean) ** a * ((1 - value) / (1 - mean)) ** b if value < mean else 1.0
+
+
+def _fair_trials(successes: float, trials: int) -> float:
+    """At least the probability of so many successes, or fewer, of trials that are as likely to fail."""
+    share = successes / trials
+    if share >= 0.5:
+        return 1.0
+    entropy = -sum(x * np.log(x) for x in (share, 1 - share) if x > 0)
+    return float(np.exp(trials * (entropy - np.log(2))))
+
+
+def _correlation(size: float, count: int) -> float:
+    """At least the probability that the correlation of noise with something else is of this size or larger."""
+    return max(1 - size**2, 0.0) ** ((count - 1) / 2)
+
+
+def of_starts(
+    ends: Sequence[tuple[float, np.ndarray]],
+    components: Sequence[str],
+    deviations: np.ndarray,
+    count: int | None,
+    dispersion: float,
+) -> Iterator[str]:
+    """Whether another start ends as well, at other estimates.
+
+    **Arguments:** `ends`: objective and components of every start, the best first; `deviations` of the components;
+    `count` of residuals, where the noise is not known; `dispersion`: the factor of twice the differences of the
+    objective over a χ² variable.
+    """
+    best, estimates = ends[0]
+    for objective, others in ends[1:]:
+        ratio = 2 * (objective - best) / dispersion
+        if count is not None:
+            # Misfits that do not matter do not distinguish one minimum from another.
+            small = 0.5 * count * 1e-6
+            ratio = count * np.log((objective + small) / (best + small))
+        apart = np.abs(others - estimates) / deviations
+        apart[~np.isfinite(apart)] = 0.0
+        k = int(np.argmax(apart))
+        if ratio < _AS_WELL and apart[k] > _APART:
+            yield (
+                f"another start fits as well with {components[k]} = {others[k]:.6g} instead of {estimates[k]:.6g}: the "
+                "data do not tell which is right; bounds= can exclude one, and other or longer measurements tell"
+            )
+            return
