@@ -33,3 +33,20 @@ def swing():
         coordinates=("theta",),
         parameters={"length": 0.8, "damping": 0.3},
     )
+
+
+def slider_crank():
+    """A crank that turns freely and drives a piston against a spring."""
+    bodies = [
+        planar.Body("crank", mass=1.0, inertia=planar.rod(1.0, 0.2), position=(0.05, 0.0)),
+        planar.Body("rod", mass=0.5, inertia=planar.rod(0.5, 0.3), position=(0.25, 0.0)),
+        planar.Body("piston", mass=0.8, inertia=1e-3, position=(0.4, 0.0)),
+    ]
+    joints = [
+        planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.05, 0.0)),
+        planar.Revolute("B", "crank", "rod", point_a=(0.05, 0.0), point_b=(-0.15, 0.0)),
+        planar.Revolute("C", "rod", "piston", point_a=(0.15, 0.0), point_b=(0.0, 0.0)),
+        planar.Prismatic("cylinder", "ground", "piston", point=(0.4, 0.0), axis=(1.0, 0.0)),
+    ]
+    spring = planar.SpringDamper("spring", "ground", "piston", stiffness=200.0, point_a=(0.7, 0.0), free_length=0.35)
+    return mb.Scene(bodies, joints=joints, forces=[spring]).compile()

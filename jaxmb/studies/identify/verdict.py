@@ -21,6 +21,8 @@ _LEVEL = 1e-6
 # Residuals whose root mean square is larger than this are beyond σ; whose median is larger, relative to that of normal
 # noise, where large residuals are expected.
 _BEYOND, _BEYOND_MEDIAN = 1.25, 2.0
+# A smaller share of residuals beyond five standard deviations may be outliers.
+_FEW = 0.1
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
 # Residuals are no noise if this share of their mean square, or more, follows from others.
@@ -30,23 +32,25 @@ _SHARE = 0.2
 _AS_WELL, _APART = 10.0, 5.0
 
 _CURES = (
-    "try other starts (starts=), a range of plausible values (bounds=) and, for a fast, unstable or chaotic motion, "
-    "shorter pieces (segments=)"
+    "The iteration ended in a local minimum: try other starts (starts=), a range of plausible values (bounds=) and, "
+    "for a fast, unstable or chaotic motion, shorter pieces (segments=); or the model, the data (a zero, a sign, a "
+    "unit) or sigma is wrong"
 )
 
 
-def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, robust: bool) -> Iterator[str]:
-    """What the residuals of a fit say against it.
+def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, robust: bool) -> list[str]:
+    """What the residuals of a fit say against it, and what helps.
 
     **Arguments:** `directions`: how many combinations of unknowns were fitted; `robust`: whether the loss expects
     residuals that are large.
     """
-    known = [own for own in found if own.known]
-    if known:
-        yield from _beyond(known, len(far), directions, robust)
-    if len(known) < len(found):
-        yield from _explains_nothing([own for own in found if not own.known])
-    yield from _no_noise(found, directions)
+    known, unknown = ([own for own in found if own.known is there] for there in (True, False))
+    out = [
+        *(_beyond(known, len(far), directions, robust) if known else ()),
+        *(_explains_nothing(unknown) if unknown else ()),
+        *_no_noise(found, directions),
+    ]
+    return [*out[:-1], f"{out[-1]}. {_CURES}"] if out else []
 
 
 def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
@@ -75,11 +79,10 @@ def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Ite
         return
     size, label = worst
     what = "median" if robust else "root mean square"
-    text = f"the residuals are far beyond sigma, {label or 'all together'} by a factor of {size:.3g} ({what}): "
-    text += "the iteration ended in a local minimum, or the model, the data (a zero, a sign, a unit) or sigma is wrong"
-    if far and not robust and far < 0.1 * whole.size:
-        text += f". {far} of {whole.size} are beyond 5 σ: if these are outliers, take loss='soft_l1' or 'huber'"
-    yield f"{text}; {_CURES}"
+    text = f"the residuals are far beyond sigma, {label or 'all together'} by a factor of {size:.3g} ({what})"
+    if far and not robust and far < _FEW * whole.size:
+        text += f"; {far} of {whole.size} are beyond 5 σ: if these are outliers, take loss='soft_l1' or 'huber'"
+    yield text
 
 
 def _explains_nothing(found: list[Series]) -> Iterator[str]:
@@ -95,15 +98,12 @@ def _explains_nothing(found: list[Series]) -> Iterator[str]:
     # the test accuses less often.
     if rest > 0 and left - right > small and _beta(right / left, rest / 2, constants / 2) < _LEVEL:
         explained = 1 - left / right if right > 0 else -np.inf
-        yield (
-            f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g}); the iteration "
-            f"ended in a local minimum, or the model or the data (a zero, a sign, a unit) are wrong; {_CURES}"
-        )
+        yield (f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})")
 
 
 def _no_noise(found: Sequence[Series], directions: int) -> Iterator[str]:
     """Whether residuals follow from others: from their signs, from earlier ones, or from what is predicted."""
-    told, hidden = [], 0
+    told = []
     for own in found:
         if own.square <= own.small**2 or own.residuals.size < 3:
             continue
@@ -116,10 +116,7 @@ def _no_noise(found: Sequence[Series], directions: int) -> Iterator[str]:
     hidden = len(told) - 3
     if told:
         more = f", and of {hidden} other series as well" if hidden > 0 else ""
-        yield (
-            f"the residuals are no noise: {', '.join(told[:3])}{more}; the iteration ended in a local minimum, or the "
-            f"model or the data are wrong; {_CURES}"
-        )
+        yield f"the residuals are no noise: {', '.join(told[:3])}{more}"
 
 
 def _dependences(own: Series, directions: int) -> Iterator[tuple[str, float, float]]:
@@ -134,7 +131,8 @@ def _dependences(own: Series, directions: int) -> Iterator[tuple[str, float, flo
     )
     lags = np.arange(1, max(n // 4, 1) + 1)
     total = float(np.sum(r**2))
-    correlations = np.array([np.sum(r[lag:] * r[:-lag]) for lag in lags]) / total
+    # Of all lags at once, with as many zeros as samples so that none meets one from the other end.
+    correlations = np.fft.irfft(np.abs(np.fft.rfft(r, 2 * n)) ** 2)[lags] / total
     # Residuals of a fit are correlated by as much as the share of directions that were fitted.
     sizes = np.maximum(np.abs(correlations) - directions / n, 0.0)
     lag = int(np.argmax(sizes))
