@@ -77,22 +77,24 @@ def test_right_fits_of_a_swing_are_not_accused(system, exact, count, noise, sigm
 
 
 WRONG = {
-    "another sign": (lambda x: -x, {"max_iterations": 30}),
-    "another unit": (np.rad2deg, {"max_iterations": 30}),
     "another zero": (lambda x: x + 0.1, {}),
     "a delay": (lambda x: np.roll(x, 60), {}),
     "a gain": (lambda x: 1.2 * x, {}),
-    "another motion": (lambda x: np.sin(40 * TS), {"max_iterations": 30}),
     "a drift": (lambda x: x + 0.02 * TS, {}),
     "bounds without the truth": (lambda x: x, {"bounds": {"length": (0.85, 1.0)}}),
     "no damping": (lambda x: x, {"free": {"length": 0.9, "damping": 0.0}, "bounds": {"damping": (-1e-3, 1e-3)}}),
     "another start of the motion": (lambda x: x, {"fix": {"theta": 0.65}}),
     "too few iterations": (lambda x: x, {"max_iterations": 3}),
+    # These end in motions that are fast, and take long to simulate.
+    "another sign": (lambda x: -x, {}),
+    "another unit": (np.rad2deg, {}),
+    "another motion": (lambda x: np.sin(40 * TS), {}),
 }
+SLOW = ("another sign", "another unit", "another motion")
 
 
 @pytest.mark.parametrize("sigma", [NOISE, None], ids=["with sigma", "without"])
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", [pytest.param(own, marks=[pytest.mark.long] * (own in SLOW)) for own in WRONG])
 def test_a_wrong_fit_says_so(system, exact, name, sigma):
     change, arguments = WRONG[name]
     fit = fitted(system, samples(change(exact), 200, NOISE, 5), sigma, **arguments)
@@ -114,7 +116,7 @@ def test_a_wrong_fit_says_so(system, exact, name, sigma):
 
 # The speed is such that the phase of the crank depends much on the spring.
 FAST = {"fix": {"crank.angle": 0.8}, "rates": {"crank.angle": 25.0}}
-CRANK_TS = np.linspace(0.0, 12.0, 102)[1:]
+CRANK_TS = np.linspace(0.0, 6.0, 102)[1:]
 STROKE = "cylinder.displacement"
 
 
@@ -203,7 +205,7 @@ def said(own, robust=False):
 
 def test_what_does_not_matter_is_not_accused():
     """Systematic differences of a third of the noise, of a ten-thousandth of the range, and a slightly wrong sigma."""
-    noise, wave = np.random.default_rng(0).standard_normal(100_000), np.sin(np.arange(100_000) / 50)
+    noise, wave = np.random.default_rng(0).standard_normal(20_000), np.sin(np.arange(20_000) / 50)
     assert not said([series(noise + 0.3 * wave)])
     assert not said([series(0.3 * wave)])
     assert not said([series(1.2 * noise)])
@@ -244,11 +246,11 @@ def test_a_robust_loss_expects_outliers():
     assert "10 of 500 are beyond 5 σ: if these are outliers, take loss='soft_l1'" in said([series(few)])
 
 
-@pytest.mark.parametrize("count, directions", [(10, 1), (30, 2), (30, 10), (100, 20), (1000, 8)])
+@pytest.mark.parametrize("count, directions", [(10, 1), (30, 2), (30, 10), (100, 20)])
 @pytest.mark.parametrize("rough", [False, True])
 def test_bounds_of_probabilities_hold(count, directions, rough):
     """Chances below one in a hundred are rarer than that, for noise that any directions were fitted to."""
-    random, draws, t = np.random.default_rng(0), 1500, (np.arange(count) + 0.5) / count
+    random, draws, t = np.random.default_rng(0), 1000, (np.arange(count) + 0.5) / count
     frequencies = (count - 1 - np.arange(directions)) if rough else np.arange(directions)
     basis = np.linalg.qr(np.cos(np.pi * frequencies * t[:, None]))[0]
     accused = np.zeros(4)
@@ -289,7 +291,7 @@ def test_starts_that_contradict_each_other():
 
 
 def test_outliers_are_marked(system, exact):
-    """With their places in the data; in a right fit they are mentioned, and do not spoil the verdict if they are few."""
+    """With their places in the data. Where the noise is estimated, it contains them, and they are only mentioned."""
     measured = samples(exact, 200, NOISE, 9)
     there = np.flatnonzero(np.isfinite(measured["theta"]))[[20, 77]]
     measured["theta"][there] += [0.09, -0.08]
@@ -298,9 +300,11 @@ def test_outliers_are_marked(system, exact):
         assert [own.sample for own in fit.outliers] == [(int(k),) for k in there]
         assert [own.t for own in fit.outliers] == list(TS[there])
         assert fit.outliers[0].residual < -5 < 5 < fit.outliers[1].residual
-        assert fit.converged and "beyond 5 σ" in fit.message and "loss='soft_l1'" in fit.message
+        assert fit.converged is (sigma is None)
+        assert "beyond 5 σ" in fit.message and "loss='soft_l1'" in fit.message
 
 
+@pytest.mark.long
 def test_no_bands_where_the_fit_explains_nothing(system, exact, tmp_path):
     fit = fitted(system, samples(exact + 0.1, 200, NOISE, 5), NOISE)
     page = fit.report(tmp_path / "page.html").read_text()
