@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from identifying import free_parameters, pendulum, swing
 from jax.scipy.special import ndtri
@@ -11,6 +12,7 @@ from jax.scipy.special import ndtri
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.studies.identify.covariance import combinations, covariance
+from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
 from jaxmb.studies.ranges import second_moments
 
@@ -344,6 +346,111 @@ def test_four_bar_with_biased_accelerometers():
     for name, value in true.items():
         assert np.all(np.abs(fit.parameters[name] - value) < 4 * fit.deviations[name]), name
         assert np.all(4 * fit.deviations[name] < np.abs(value)), name
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("loss", ["soft_l1", "huber"])
+def test_robust_losses_withstand_outliers(motion, loss):
+    """Every tenth sample is far off; the gradient of the objective three ways, of a batch with a failure as well."""
+    own, random = swing(), np.random.default_rng(4)
+    data = motion + 1e-3 * random.standard_normal(TS.size)
+    data[::10] += 0.2
+    common = {"ts": TS, "fix": {"theta": 0.5}, "sigma": {"theta": 1e-3}, "solver": TSIT5, "rtol": 1e-9, "atol": 1e-11}
+    free = {"length": 0.9, "damping": 0.2}
+    squares = mb.identify(own, {"theta": data}, free=free, **common)
+    assert not squares.converged
+    fit = mb.identify(own, {"theta": data}, free=free, loss=loss, **common)
+    assert fit.converged and [outlier.sample for outlier in fit.outliers] == [(0,), (10,), (20,)]
+    for name, true in {"length": 0.8, "damping": 0.3}.items():
+        assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name] < 0.05 * true, name
+        assert abs(squares.parameters[name] - true) > 4 * fit.deviations[name], name
+    function = LOSSES[loss]
+    np.testing.assert_allclose(fit.objectives[0], 0.5 * float(jnp.sum(function.rho(fit.residuals**2))), rtol=1e-9)
+    # The interval of a profile is that of the deviations.
+    low, high = fit.profile("length").interval
+    np.testing.assert_allclose((high - low) / (2 * 1.96 * fit.deviations["length"]), 1.0, atol=0.25)
+
+    forward, reverse = fit.logdensity(), fit.logdensity("reverse")
+    z = fit.fit.z + jnp.array([0.01, -0.02])
+    gradient = jax.grad(forward)(z)
+    np.testing.assert_allclose(jax.grad(reverse)(z), gradient, rtol=1e-8)
+    h = 1e-5
+    for k, e in enumerate(np.eye(2)):
+        central = (forward(z + h * e) - forward(z - h * e)) / (2 * h)
+        np.testing.assert_allclose(central, gradient[k], rtol=1e-5)
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(forward)))(jnp.stack([z, z.at[0].set(jnp.nan)]))
+    np.testing.assert_allclose(gradients[0], gradient, rtol=1e-6)
+    assert values[1] == -jnp.inf and not np.any(gradients[1])
+
+
+@pytest.mark.long
+def test_a_robust_loss_with_segments_and_optax(motion):
+    """All three ways to minimise have the same minimum."""
+    own, random = swing(), np.random.default_rng(4)
+    data = motion + 1e-3 * random.standard_normal(TS.size)
+    data[::10] += 0.2
+    common = {"ts": TS, "fix": {"theta": 0.5}, "sigma": {"theta": 1e-3}, "solver": TSIT5, "loss": "soft_l1"}
+    free = {"length": 0.82, "damping": 0.28}
+    fit = mb.identify(own, {"theta": data}, free=free, **common)
+    pieces = mb.identify(own, {"theta": data}, free=free, segments=3, **common)
+    assert pieces.converged
+    descended = mb.identify(own, {"theta": data}, free=free, method=optax.adam(3e-3), max_iterations=600, **common)
+    for name, value in fit.parameters.items():
+        np.testing.assert_allclose(pieces.parameters[name], value, atol=1e-2 * fit.deviations[name])
+        np.testing.assert_allclose(pieces.deviations[name], fit.deviations[name], rtol=1e-2)
+        np.testing.assert_allclose(descended.parameters[name], value, atol=0.3 * fit.deviations[name])
+
+
+@pytest.mark.long
+def test_sensors_with_times_of_their_own(motion):
+    """As the same samples among all times, with the others missing; with a delay, held out, and in segments."""
+    own, random = swing(), np.random.default_rng(6)
+    start = mb.assemble(own, fix={"theta": 0.5})
+    encoder, gyro = TS[::2], np.linspace(0.1, 0.95, 18)
+    late = mb.simulate(own, start, t1=1.0, saveat=encoder - DELAY, solver=TSIT5)["theta"]
+    rate = mb.simulate(own, start, t1=1.0, saveat=gyro, solver=TSIT5).ys.u[:, 0]
+    data = {"encoder": late + 1e-3 * random.standard_normal(encoder.size)}
+    data["theta.rate"] = rate + 1e-2 * random.standard_normal(gyro.size)
+    sensors = [mb.Sensor("theta", name="encoder", sigma=1e-3), mb.Sensor("theta.rate", sigma=1e-2)]
+    common = {"free": {"length": 0.9, "damping": 0.2}, "sensors": sensors, "solver": TSIT5}
+    ts = {"encoder": encoder, "theta.rate": gyro}
+    fitted, unseen = (mb.Experiment(data, ts=ts, fix={"theta": 0.5}, held_out=out) for out in (False, True))
+    fit = mb.identify(own, [fitted, unseen], **(common | {"free": common["free"] | {"encoder.delay": 0.01}}))
+    assert fit.converged
+    for name, true in {"length": 0.8, "damping": 0.3, "encoder.delay": DELAY}.items():
+        assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name], name
+    readings = fit.held_out["exp2"].readings
+    assert readings["encoder"].shape == encoder.shape and readings["theta.rate"].shape == gyro.shape
+    np.testing.assert_allclose((readings["theta.rate"] - data["theta.rate"]) / 1e-2, fit.residuals[15:], atol=1e-6)
+
+    whole = np.unique(np.concatenate([encoder, gyro]))
+    among = {name: np.full(whole.size, np.nan) for name in ts}
+    for name, times in ts.items():
+        among[name][np.searchsorted(whole, times)] = data[name]
+    for segments in (1, 3):
+        several = {"fix": {"theta": 0.5}, "segments": segments}
+        alone = mb.identify(own, data, ts=ts, **several, **common)
+        same = mb.identify(own, among, ts=whole, **several, **common)
+        assert alone.parameters == same.parameters
+
+
+@pytest.mark.long
+def test_a_second_start_that_fits_as_well():
+    """The sign of an angle of which only the square is seen."""
+    own = swing()
+    start = mb.assemble(own, fix={"theta": 0.5})
+    seen = np.asarray(mb.simulate(own, start, t1=TS[-1], saveat=TS, solver=TSIT5)["theta"]) ** 2
+    fit = mb.identify(
+        own,
+        ts=TS,
+        residual=lambda motion: (motion["theta"] ** 2 - seen) / 1e-3,
+        free={"initial.theta": 0.4},
+        starts=[{"initial.theta": -0.4}],
+        solver=TSIT5,
+    )
+    (words,) = fit.warnings
+    assert not fit.converged and "another start fits as well with initial.theta = " in words
+    np.testing.assert_allclose(abs(fit.parameters["initial.theta"]), 0.5, rtol=1e-6)
 
 
 def test_a_prior_is_one_more_measurement():

@@ -14,7 +14,9 @@ from scipy.optimize import least_squares
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
-from jaxmb.studies.minimise import levenberg_marquardt
+from jaxmb.studies.identify.covariance import covariance
+from jaxmb.studies.identify.loss import LOSSES
+from jaxmb.studies.minimise import Linearised, levenberg_marquardt
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
@@ -106,12 +108,15 @@ def swing():
 
 
 def test_lagrangian_system(swing):
-    """A coordinate and its rate, measured from an angle and a rate that are given."""
+    """A coordinate and its rate, at times of their own, from an angle and a rate that are given."""
     held = {"fix": {"theta": 0.5}, "rates": {"theta": 1.0}}
     motion = mb.simulate(swing, mb.assemble(swing, **held), t1=TS[-1], saveat=TS)
-    measured = {"theta": motion["theta"], "theta.rate": motion.ys.u[:, 0]}
-    fit = mb.identify(swing, measured, ts=TS, free={"length": 1.1, "damping": 0.1}, **held, solver=TSIT5)
+    own = {"theta": slice(None, None, 2), "theta.rate": slice(1, None, 3)}
+    measured = {"theta": motion["theta"][own["theta"]], "theta.rate": motion.ys.u[own["theta.rate"], 0]}
+    ts = {name: TS[where] for name, where in own.items()}
+    fit = mb.identify(swing, measured, ts=ts, free={"length": 1.1, "damping": 0.1}, **held, solver=TSIT5)
     assert fit.converged and fit.components == ("length", "damping")
+    assert fit.residuals.size == 25 and fit.fit.problem.trials[0].ts.size == 20
     np.testing.assert_allclose(fit.parameters["length"], 0.8, rtol=1e-6)
     np.testing.assert_allclose(fit.parameters["damping"], 0.3, rtol=1e-5)
     np.testing.assert_allclose([fit.state.q[0], fit.state.u[0]], [0.5, 1.0])
@@ -195,6 +200,15 @@ def test_no_effect(system):
         ({"sigma": {"rod.position": 1.0}}, "'rod.position', which is not measured"),
         ({"sigma": {"rod.angle": 0.0}}, "must be positive"),
         ({"ts": TS[::-1]}, "increasing"),
+        ({"ts": {"rod.angle": TS[::-1]}}, r"ts\['rod.angle'\] must be a vector of increasing times"),
+        ({"ts": {"rod.angl": TS}}, "did you mean 'rod.angle'"),
+        ({"ts": {}}, "not for 'rod.angle'"),
+        ({"ts": {"rod.angle": TS[1:]}}, r"must have shape \(29,\) for 29 times"),
+        ({"measured": mb.Measurements(np.asarray(TS), {"rod.angle": np.zeros(30)})}, "have their own times"),
+        ({"measured": None, "ts": {"a": TS}, "residual": lambda motion: motion.ts}, "needs one vector ts"),
+        ({"loss": "cauchy"}, "must be one of 'linear', 'soft_l1', 'huber'"),
+        ({"loss": "huber"}, "give sigma, as numbers"),
+        ({"loss": "huber", "free": ["rod.mass", "rod.angle.sigma"]}, "give sigma, as numbers"),
         ({"t0": 0.5}, "after t0"),
         ({"method": "newton"}, "method must be"),
         ({"saveat": TS}, "identify sets 'saveat'"),
@@ -267,6 +281,51 @@ def test_least_squares_agree_with_scipy(residuals, start):
     known = least_squares(residuals, start, jax.jacfwd(residuals), xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
     assert found.success and found.iterations < 50
     np.testing.assert_allclose(0.5 * np.sum(residuals(found.z) ** 2), known.cost, rtol=1e-8, atol=1e-10)
+
+
+DECAY = np.linspace(0.02, 1.0, 50)
+
+
+def decays(z):
+    """Two numbers of an exponential, and its derivatives."""
+    z, shape = np.asarray(z), np.exp(-z[1] * DECAY)
+    return z[0] * shape, np.stack([shape, -DECAY * z[0] * shape], axis=1)
+
+
+@pytest.mark.parametrize("name", ["soft_l1", "huber"])
+def test_robust_losses_agree_with_scipy(name):
+    """On estimates and objective; errors divided by their standard deviations have unit size, with outliers as well."""
+    loss, random, scores = LOSSES[name], np.random.default_rng(0), []
+    for _ in range(40):
+        noise = 0.05 * random.standard_normal(DECAY.size)
+        noise[random.integers(DECAY.size, size=5)] *= 30
+        measured = decays([3.0, 2.0])[0] + noise
+        residuals = lambda z, y=measured: (decays(z)[0] - y) / 0.05
+        jacobian = lambda z: decays(z)[1] / 0.05
+
+        def linearised(z, residuals=residuals, jacobian=jacobian):
+            r = residuals(z)
+            return Linearised(*loss.weighted(r, jacobian(z)), 0.5 * float(np.sum(loss.rho(r**2))))
+
+        found = levenberg_marquardt(linearised, jnp.array([1.0, 0.5]), tol=1e-10, limit=100)
+        known = least_squares(residuals, [1.0, 0.5], jacobian, loss=name, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert found.success
+        np.testing.assert_allclose(found.value, known.cost, rtol=1e-10)
+        np.testing.assert_allclose(found.z, known.x, rtol=1e-6)
+        pull, slope = loss.influence(residuals(found.z))
+        own = covariance(jacobian(found.z), np.eye(2), float(np.sum(pull**2)), DECAY.size, float(np.mean(slope)))
+        scores.append((found.z - np.array([3.0, 2.0])) / np.sqrt(np.diag(own.matrix)))
+    assert np.all(np.abs(np.std(scores, axis=0) - 1) < 0.25)
+
+
+@pytest.mark.parametrize("name", ["soft_l1", "huber"])
+def test_derivatives_of_losses(name):
+    loss, squares, h = LOSSES[name], np.array([0.0, 1e-12, 0.5, 1.5, 40.0]), 1e-6
+    gradient = jax.vmap(jax.grad(loss.rho))(jnp.asarray(squares))
+    np.testing.assert_allclose(gradient, loss.slope(squares), rtol=1e-12)
+    np.testing.assert_allclose(jax.vmap(jax.jacfwd(loss.rho))(jnp.asarray(squares)), gradient, rtol=1e-12)
+    differences = (loss.slope(squares + h) - loss.slope(np.abs(squares - h))) / (2 * h)
+    np.testing.assert_allclose(differences[2:], loss.curvature(squares)[2:], rtol=1e-6)
 
 
 def test_iterations_are_limited(system, motion):

@@ -76,6 +76,15 @@ def test_right_fits_of_a_swing_are_not_accused(system, exact, count, noise, sigm
     assert fit.converged and not fit.warnings, fit
 
 
+def test_measurements_have_their_own_times(system, exact):
+    data = samples(exact, 100, NOISE, 3)
+    arguments = {"free": {"length": 0.9, "damping": 0.2}, "sigma": {"theta": NOISE}, "solver": TSIT5}
+    direct = fitted(system, data, NOISE)
+    read = mb.identify(system, mb.Measurements(TS, data), **START, **arguments)
+    listed = mb.identify(system, [mb.Experiment(mb.Measurements(TS, data), **START)], **arguments)
+    assert read.parameters == direct.parameters == listed.parameters
+
+
 WRONG = {
     "another zero": (lambda x: x + 0.1, {}),
     "a delay": (lambda x: np.roll(x, 60), {}),
