@@ -273,7 +273,7 @@ def _judged(problem, z, components, ends, found, own, far, known_noise, success,
     directions = found.root.shape[1]
     doubts = [] if success else ["the iteration did not converge; try another start, or more iterations"]
     if finite:
-        doubts += verdict.of_residuals(own, far, directions, problem.loss.robust)
+        doubts += verdict.of_residuals(own, far, directions, problem.loss)
     reasons, warnings = {}, list(doubts)
     deviations = np.sqrt(np.diag(found.matrix))
     if np.any(np.isnan(deviations)):

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from .loss import Loss
 from .residuals import Outlier, Series
 
 # The probability at which a test accuses a right fit.
@@ -38,17 +39,17 @@ _CURES = (
 )
 
 
-def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, robust: bool) -> list[str]:
+def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss) -> list[str]:
     """What the residuals of a fit say against it, and what helps.
 
-    **Arguments:** `directions`: how many combinations of unknowns were fitted; `robust`: whether the loss expects
+    **Arguments:** `directions`: how many combinations of unknowns were fitted; `loss`: a robust one expects some
     residuals that are large.
     """
     known, unknown = ([own for own in found if own.known is there] for there in (True, False))
     out = [
-        *(_beyond(known, len(far), directions, robust) if known else ()),
+        *(_beyond(known, len(far), directions, loss.robust) if known else ()),
         *(_explains_nothing(unknown) if unknown else ()),
-        *_no_noise(found, directions),
+        *_no_noise(found, directions, loss),
     ]
     return [*out[:-1], f"{out[-1]}. {_CURES}"] if out else []
 
@@ -98,18 +99,21 @@ def _explains_nothing(found: list[Series]) -> Iterator[str]:
     # the test accuses less often.
     if rest > 0 and left - right > small and _beta(right / left, rest / 2, constants / 2) < _LEVEL:
         explained = 1 - left / right if right > 0 else -np.inf
-        yield (f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})")
+        yield f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})"
 
 
-def _no_noise(found: Sequence[Series], directions: int) -> Iterator[str]:
+def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
     """Whether residuals follow from others: from their signs, from earlier ones, or from what is predicted."""
     told = []
     for own in found:
-        if own.square <= own.small**2 or own.residuals.size < 3:
+        # What outliers have to do with each other is no matter: each counts by its influence on the estimates.
+        residuals = loss.influence(own.residuals)[0]
+        square = float(np.mean(residuals**2))
+        if square <= own.small**2 or residuals.size < 3:
             continue
-        for reason, share, chance in _dependences(own, directions):
+        for reason, share, chance in _dependences(own, residuals, directions):
             # `share` of the mean square is no noise.
-            matters = share > _SHARE and share * own.square > own.small**2
+            matters = share > _SHARE and share * square > own.small**2
             if matters and chance * len(found) < _LEVEL:
                 told.append(f"those of {own.label} {reason}{_offset(own)}")
                 break
@@ -119,9 +123,9 @@ def _no_noise(found: Sequence[Series], directions: int) -> Iterator[str]:
         yield f"the residuals are no noise: {', '.join(told[:3])}{more}"
 
 
-def _dependences(own: Series, directions: int) -> Iterator[tuple[str, float, float]]:
+def _dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
     """How residuals depend on others, the share of their mean square that does, and the probability for noise."""
-    r, n = own.residuals, own.residuals.size
+    n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
     # Of normal noise, which the fitted directions may have made a little smoother.
     yield (
