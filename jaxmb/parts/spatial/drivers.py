@@ -11,15 +11,15 @@ from ..._types import Scalar
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractConstraint, AbstractPair, AbstractSpatialPart
-from .axes import angle, cosine_sine, measured_from_given_poses, offset_in_a
+from .axes import angle, cosine_sine, half_sine, measured_from_given_poses, offset_in_a
 
 
 class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
-    An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, which holds for
-    any number of turns. The joint should let B turn about the axis only; otherwise the angle is that of the projections
-    perpendicular to the axis.
+    An angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], written with products of direction
+    components, which holds for any number of turns. The joint should let B turn about the axis only; otherwise the
+    angle is that of the projections perpendicular to the axis.
 
     **Arguments:**
 
@@ -74,7 +74,6 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         motion = self.motion(t, self.parameters)
         if self.quantity == "angle":
             c, s = cosine_sine(space, self, poses)
-            row = s * jnp.cos(motion) - c * jnp.sin(motion)
-        else:
-            row = self.value(space, poses) - motion
-        return jnp.reshape(row, (1,))
+            sine, cosine = s * jnp.cos(motion) - c * jnp.sin(motion), c * jnp.cos(motion) + s * jnp.sin(motion)
+            return half_sine(jnp.reshape(sine, (1,)), jnp.reshape(cosine, ()))
+        return jnp.reshape(self.value(space, poses) - motion, (1,))
