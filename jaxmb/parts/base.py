@@ -163,8 +163,13 @@ class AbstractLink(AbstractPart):
     bodies = _Bodies()
     path_kind: ClassVar[PathKind] = "rod"
 
-    # Names of the coordinates that are angles known up to full turns.
-    periodic: ClassVar[frozenset[str]] = frozenset()
+    # Names of the coordinates that are angles.
+    angles: ClassVar[frozenset[str]] = frozenset()
+
+    @property
+    def periodic(self) -> frozenset[str]:
+        """Names of the coordinates that are angles known up to full turns; in the plane full turns are counted."""
+        return frozenset() if 2 in self.dimensions else self.angles
 
     def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
         """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""

@@ -120,8 +120,8 @@ class ConstraintOnFrames(AbstractOnFrames, AbstractConstraint):
         return self.part.rheonomic
 
     @property
-    def periodic(self):
-        return self.part.periodic
+    def angles(self):
+        return self.part.angles
 
     def residual(self, space, poses, t):
         return self.part.residual(space, self._poses(space, poses), t)

@@ -41,7 +41,7 @@ from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
 from .picture import picture
 from .quantities import Quantity
-from .reactions import applied_wrenches, reaction
+from .reactions import applied_wrenches, nonideal_wrenches, reaction
 
 
 class Implied(NamedTuple):
@@ -282,15 +282,22 @@ class AbstractBodySystem(AbstractBodies):
         return jax.vmap(single)(ts, ys, multipliers)
 
     def force_names(self):
-        return tuple(dict.fromkeys(name for g in self.forces for name in g.group.names))
+        return tuple(dict.fromkeys(name for g in (*self.forces, *self.nonideal) for name in g.group.names))
 
     @eqx.filter_jit
-    def applied_wrenches(self, name, ts, ys):
-        def single(t, y):
-            own = self.at(y)
-            return applied_wrenches(own.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
+    def applied_wrenches(self, name, ts, ys, multipliers):
+        forces = [k for k, g in enumerate(self.forces) if name in g.group.names]
+        laws = [g for g in self.nonideal if name in g.group.names]
 
-        return jax.vmap(single)(ts, ys)
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            if laws:
+                wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, own)
+                return applied_wrenches(laws, name, wrenches)
+            groups = [self.at(y).forces[k] for k in forces]
+            return applied_wrenches(groups, name, [g.wrenches(t, poses, velocities) for g in groups])
+
+        return jax.vmap(single)(ts, ys, multipliers)
 
     def outline(self, ys):
         groups = (*self.constraints, *self.velocity_constraints, *self.forces)

@@ -122,7 +122,7 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def force_names(self):
         raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
-    def applied_wrenches(self, name, ts, ys):
+    def applied_wrenches(self, name, ts, ys, multipliers):
         raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
     def linear_momentum(self, q, u):

@@ -86,7 +86,7 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 5
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -119,7 +119,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
 
     def validate(self):
         if self.axis_a_W is not None and self.axis_b_W is not None:
@@ -171,7 +171,7 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
     orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
 
     def complete(self, space, poses):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
@@ -209,7 +209,7 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -249,7 +249,7 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     x_b: fields.Number = fields.axis(body=1, optional=True)
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -321,7 +321,7 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 3
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
