@@ -112,7 +112,11 @@ class AbstractSpatialPart(AbstractPart):
 
 
 class AbstractBody(AbstractPart):
-    """A body with mass. The origin of its frame is the mass centre.
+    """A body with mass. The origin of its frame is the mass centre, unless it has a field `centre` that is not None:
+    the mass centre [m] in the frame.
+
+    Points that parts have on a body, and poses, velocities and wrenches in the kernels of parts, are those of its frame.
+    The coordinates of the body and its motion are those of the mass centre.
 
     Fields declared with `fields.guess` hold its initial guess; all other numbers are parameters. `mass` and `inertia`
     are fields, or properties computed from other fields, such as a radius and a density.
@@ -133,11 +137,13 @@ class AbstractBody(AbstractPart):
 
     @abc.abstractmethod
     def pose(self) -> Any:
-        """The initial guess of the pose, a vector; only the position for a body that does not rotate."""
+        """The initial guess of the pose at the mass centre, a vector; only the position for a body that does not
+        rotate.
+        """
 
     @abc.abstractmethod
     def velocities(self) -> Any:
-        """The initial guess of the velocity, likewise."""
+        """The initial guess of the velocity at the mass centre, likewise."""
 
 
 class _Bodies:
@@ -365,7 +371,7 @@ def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
     declared, given, values = fields.declarations(type(part)), fields.values_of(part), {}
     for name, own in declared.items():
         value = given[name]
-        if own.centred and value is None:
+        if own.at_origin and value is None:
             values[name] = fields.as_parameter(np.zeros(space.dimension))
         elif own.gives:
             _check_given(part, name, own)

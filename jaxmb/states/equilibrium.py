@@ -114,7 +114,9 @@ def equilibrium(
     ok = ok & still & assembled & jnp.all(jnp.asarray(steady))
     if throw:
         q = eqx.error_if(
-            q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see which coordinates are at fault."
+            q,
+            ~ok,
+            "No static equilibrium was found; call equilibrium outside jit to see which coordinates are at fault.",
         )
     state = State(q, u, z)
     return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, time))

@@ -328,6 +328,12 @@ class AbstractSystem(eqx.Module):
         space.
         """
 
+    @abc.abstractmethod
+    def with_frames_of(self, before: Self) -> Self:
+        """The system with the guess of its bodies' frames from before its parameters changed: where the mass centre of
+        a body was moved in its frame, the guess of the mass centre follows.
+        """
+
     def at(self, y: State) -> Self:
         """The same system with the internal states of a state, if there are any."""
         return self if y.z is None else self.with_states(y.z)

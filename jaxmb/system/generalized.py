@@ -113,6 +113,10 @@ class AbstractGeneralizedSystem(AbstractSystem):
 
     # There are no bodies to act on.
 
+    def with_frames_of(self, before):
+        del before
+        return self
+
     def joint_names(self):
         raise ValueError("reactions are defined for joints between bodies; this system has constraint_forces.")
 

@@ -28,7 +28,8 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         B relative to point A in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
-    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres: for a coordinate or distance only.
+    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the origins of the frames: for a coordinate or distance
+        only.
     - `axis_a`, unit, shape (3,), fixed in `body_a`, or `axis` in the world: for an angle only.
     - `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis: an angle is measured between them; by
         default it is zero at the given poses.
