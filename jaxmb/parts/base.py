@@ -115,8 +115,8 @@ class AbstractBody(AbstractPart):
     """A body with mass. The origin of its frame is the mass centre, unless it has a field `centre` that is not None:
     the mass centre [m] in the frame.
 
-    Points that parts have on a body, and poses, velocities and wrenches in the kernels of parts, are those of its frame.
-    The coordinates of the body and its motion are those of the mass centre.
+    Points that parts have on a body, and poses, velocities and wrenches in the kernels of parts, are those of its
+    frame. The coordinates of the body and its motion are those of the mass centre.
 
     Fields declared with `fields.guess` hold its initial guess; all other numbers are parameters. `mass` and `inertia`
     are fields, or properties computed from other fields, such as a radius and a density.

@@ -241,8 +241,8 @@ def point(
     origin of a body's frame is its mass centre, unless the body was given `centre=`.
 
     **Arguments:** `body`: index among the part's bodies; `default`: `"origin"`, of that frame, or coordinates;
-    `optional`: default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a world point
-    determines at the given poses.
+    `optional`: default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a
+    world point determines at the given poses.
     """
     at_origin = isinstance(default, str)
     if at_origin and default != "origin":

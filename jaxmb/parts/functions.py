@@ -52,8 +52,8 @@ class VelocityConstraint(AbstractVelocityConstraint):
     """A nonholonomic constraint from a function, `function(poses, velocities, t, parameters) = 0`.
 
     **Arguments:** as `Constraint`; `velocities` has a row per body, of its frame (plane: ẋ, ẏ, angular rate; space: ṙ
-    in the world, ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term (cheaper);
-    `homogeneous`: it also vanishes at rest.
+    in the world, ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term
+    (cheaper); `homogeneous`: it also vanishes at rest.
     """
 
     name: str = fields.name()

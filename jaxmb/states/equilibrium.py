@@ -3,8 +3,8 @@
 At rest the applied forces and the constraint forces balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search follows
 the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and bounded
 steps, so that a conservative system reaches a minimum of its potential. Where it ends at an equilibrium from which
-forces lead away, because there are none at the guess, it starts again beside that. Derivatives are those of the balance,
-by the implicit function theorem.
+forces lead away, because there are none at the guess, it starts again beside that. Derivatives are those of the
+balance, by the implicit function theorem.
 """
 
 from collections.abc import Mapping
@@ -116,7 +116,7 @@ def equilibrium(
         q = eqx.error_if(
             q,
             ~ok,
-            "No static equilibrium was found; call equilibrium outside jit to see which coordinates are at fault.",
+            "No static equilibrium was found; call equilibrium outside jit to see the coordinates at fault.",
         )
     state = State(q, u, z)
     return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, time))
@@ -322,7 +322,7 @@ def _settled(balance: _Balance, start: Float[Array, "nq"]):
 
 
 def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Array, "n"]]:
-    """Whether no eigenvalue has a negative real part, and the direction of the least one, its largest entry about one."""
+    """Whether no eigenvalue has a negative real part, and the direction of the least, its largest entry about one."""
     values, vectors = jnp.linalg.eig(stiffness)
     direction = vectors[:, jnp.argmin(values.real)].real
     size = jnp.abs(direction)
