@@ -174,12 +174,19 @@ def test_a_changed_centre_is_that_of_a_new_scene(dimension):
     expected = mb.assemble(mb.Scene([free(dimension, new)]).compile())
     np.testing.assert_allclose(changed.q, expected.q, rtol=0, atol=1e-15)
     np.testing.assert_allclose(changed.u, expected.u, rtol=0, atol=1e-15)
-    # The guess depends on the centre as the pose of a body does that turns about the origin of its frame.
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_derivatives_of_the_guess_with_respect_to_the_centre(dimension):
+    system, new = mb.Scene([free(dimension, np.zeros(dimension))]).compile(), CENTRE[dimension]
     guess = lambda centre: jnp.concatenate(jax.tree.leaves(mb.with_parameters(system, {"b.centre": centre}).guess))
     forward, reverse = (np.asarray(jax.jit(d(guess))(jnp.asarray(new))) for d in (jax.jacfwd, jax.jacrev))
-    np.testing.assert_array_equal(forward, reverse)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-15)
+    # The guess is linear in the centre.
     central = np.stack([guess(jnp.asarray(new + e)) - guess(jnp.asarray(new - e)) for e in np.eye(dimension)], 1) / 2
     np.testing.assert_allclose(forward, central, rtol=0, atol=1e-14)
+    assert np.max(np.abs(forward)) > 0.1
 
 
 @pytest.mark.long
