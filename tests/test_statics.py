@@ -112,6 +112,27 @@ def test_a_guess_without_forces_on_top_is_left():
     assert tilt > 0.5
 
 
+@pytest.mark.long
+def test_derivatives_where_the_guess_was_left():
+    system = mb.with_parameters(cart(), {"spring.free_angle": 0.5 * np.pi})
+    upright = mb.State(jnp.array([-0.7, 0.0, 0.0, -0.7, 1.0, 0.5 * np.pi]), jnp.zeros(6))
+
+    def lean(k, stable=True):
+        own = mb.with_parameters(system, {"spring.stiffness": k})
+        return mb.equilibrium(own, upright, fix={"cart.x": -0.7}, stable=stable, throw=False).q[5] - 0.5 * np.pi
+
+    stiffness = jnp.array([8.0, 15.0, 30.0])
+    tilt = np.asarray(jax.jit(jax.vmap(lean))(stiffness))
+    np.testing.assert_allclose(stiffness * tilt, 2.0 * G * np.sin(tilt), rtol=0, atol=1e-10)
+    assert np.all(np.abs(tilt[:2]) > 0.5) and abs(tilt[2]) < 1e-12
+    expected = -tilt / (stiffness - 2.0 * G * np.cos(tilt))
+    for derivative in (jax.jacfwd(lean), jax.jacrev(lean)):
+        np.testing.assert_allclose(jax.jit(jax.vmap(derivative))(stiffness), expected, rtol=1e-9, atol=1e-12)
+    # Upright, where the mass and the spring do not turn the bob whatever they are.
+    asked = jax.jit(jax.value_and_grad(lambda k: lean(k, stable=False)))(15.0)
+    np.testing.assert_allclose(asked, 0.0, rtol=0, atol=1e-12)
+
+
 def test_an_equilibrium_that_only_falls_is_said():
     """A spring of a coordinate that pushes away from its middle."""
     push = lambda x, v, t, p: jnp.stack([p["k"] * x[0, 0], *[jnp.zeros_like(x[0, 0])] * 2])
