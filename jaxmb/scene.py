@@ -28,7 +28,7 @@ from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
 from .parts.names import unknown
-from .parts.on_frames import framed, on_frames
+from .parts.on_frames import framed, law_on_frames, on_frames
 from .parts.planar.kinematics import PLANE
 from .parts.servo import Servo
 from .parts.sources import AbstractOfSources
@@ -143,9 +143,7 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
     for part in sorted((*scene.joints, *scene.forces), key=level):
         if isinstance(part, AbstractNonIdeal):
             joint, own, on = joints[part.joint]
-            if any(on) and getattr(part, "point", None) is not None:
-                raise ValueError(f"{part.label}: leave point out; {joint.label} is on frames, and has its own.")
-            laws.append((part.resolve(space, on_frames(joint, on), given[list(own)]), own))
+            laws.append((law_on_frames(part.resolve(space, joint, framed(space, on, given[list(own)])), on), own))
         elif isinstance(part, AbstractCoordinatePart):
             joint, own, on = joints[part.joint_name]
             resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))

@@ -218,12 +218,16 @@ class Trajectory(eqx.Module):
     def forces(self) -> Mapping[str, Array]:
         """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
         (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
+
+        Friction in a joint is among them under its own name, on the bodies of the joint: the reaction of the joint is
+        without it.
         """
         return _ByName("force", self.system.force_names(), self._wrenches)
 
     @_of_each_member
     def _wrenches(self, name):
-        return self.system.applied_wrenches(name, self.ts, self.ys)
+        multipliers = None if self.system.ideal else self.multipliers
+        return self.system.applied_wrenches(name, self.ts, self.ys, multipliers)
 
     @property
     @eqx.filter_jit

@@ -90,7 +90,7 @@ class Marked(parts.AbstractForce):
     cart: str = parts.body_name()
     gain: parts.Number = parts.parameter(sign="nonzero", default=1.0)
     radius: parts.Number = parts.length(sign="positive", default=1.0)
-    at: parts.Number = parts.point(body=0, default="mass centre")
+    at: parts.Number = parts.point(body=0, default="origin")
     along: parts.Number = parts.axis(body=0, default=(1.0, 0.0))
     mode: str = parts.choice("soft", "hard", default="soft")
     numbers: parts.Numbers = parts.numbers()

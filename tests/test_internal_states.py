@@ -256,6 +256,8 @@ def test_modes_of_an_actuator():
         ({"mode": "force", "command": 2.0}, 2.0),
         ({"mode": "speed", "command": 2.0, "gain": 3.0}, 3.0 * (2.0 - 0.5)),
         ({"mode": "position", "command": 0.4, "gain": 3.0, "damping": 0.2}, 3.0 * 0.4 - 0.2 * 0.5),
+        ({"mode": "position", "command": 5.0, "gain": 3.0}, 3.0 * (5.0 - 2 * np.pi)),
+        ({"mode": "position", "command": -8.0, "gain": 3.0}, 3.0 * (-8.0 + 2 * np.pi)),
         ({"mode": "force", "command": 2.0, "limit": 1.5}, 1.5 * np.tanh(2.0 / 1.5)),
     ):
         system = mb.Scene([rod], joints=[pin], forces=[mb.Actuator("m", "pin.angle", lag=0.1, **options)]).compile()

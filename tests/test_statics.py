@@ -93,6 +93,64 @@ def test_search_goes_down():
     np.testing.assert_allclose(np.sin(state.q[5]), -1.0, rtol=0, atol=1e-12)
 
 
+def test_a_guess_without_forces_on_top_is_left():
+    """A pendulum upright hangs, and with a soft spring it leans; with a stiff one it stays."""
+    system = mb.with_parameters(cart(), {"spring.stiffness": 0.0})
+    upright = mb.State(jnp.array([-0.7, 0.0, 0.0, -0.7, 1.0, 0.5 * np.pi]), jnp.zeros(6))
+    hanging = lambda own: mb.equilibrium(own, upright, fix={"cart.x": -0.7})
+    np.testing.assert_allclose(np.sin(hanging(system).q[5]), -1.0, rtol=0, atol=1e-12)
+    # What is asked for is found, also from a guess beside it, and with derivatives.
+    near = mb.assemble(system, fix={"cart.x": -0.7, "bob.angle": 0.45 * np.pi})
+    asked = mb.equilibrium(system, near, fix={"cart.x": -0.7}, stable=False)
+    np.testing.assert_allclose(asked.q[5], 0.5 * np.pi, rtol=0, atol=1e-12)
+    # A spring that holds the bob upright, at an angle with k (angle − free) = −m g l cos(angle).
+    held = mb.with_parameters(system, {"spring.stiffness": 30.0, "spring.free_angle": 0.5 * np.pi})
+    np.testing.assert_allclose(hanging(held).q[5], 0.5 * np.pi, rtol=0, atol=1e-12)
+    soft = mb.with_parameters(system, {"spring.stiffness": 15.0, "spring.free_angle": 0.5 * np.pi})
+    tilt = abs(float(hanging(soft).q[5]) - 0.5 * np.pi)
+    np.testing.assert_allclose(15.0 * tilt, 2.0 * G * np.sin(tilt), rtol=1e-11)
+    assert tilt > 0.5
+
+
+@pytest.mark.long
+def test_derivatives_where_the_guess_was_left():
+    system = mb.with_parameters(cart(), {"spring.free_angle": 0.5 * np.pi})
+    upright = mb.State(jnp.array([-0.7, 0.0, 0.0, -0.7, 1.0, 0.5 * np.pi]), jnp.zeros(6))
+
+    def lean(k, stable=True):
+        own = mb.with_parameters(system, {"spring.stiffness": k})
+        return mb.equilibrium(own, upright, fix={"cart.x": -0.7}, stable=stable, throw=False).q[5] - 0.5 * np.pi
+
+    stiffness = jnp.array([8.0, 15.0, 30.0])
+    tilt = np.asarray(jax.jit(jax.vmap(lean))(stiffness))
+    np.testing.assert_allclose(stiffness * tilt, 2.0 * G * np.sin(tilt), rtol=0, atol=1e-10)
+    assert np.all(np.abs(tilt[:2]) > 0.5) and abs(tilt[2]) < 1e-12
+    expected = -tilt / (stiffness - 2.0 * G * np.cos(tilt))
+    for derivative in (jax.jacfwd(lean), jax.jacrev(lean)):
+        np.testing.assert_allclose(jax.jit(jax.vmap(derivative))(stiffness), expected, rtol=1e-9, atol=1e-12)
+    # Upright, where the mass and the spring do not turn the bob whatever they are.
+    asked = jax.jit(jax.value_and_grad(lambda k: lean(k, stable=False)))(15.0)
+    np.testing.assert_allclose(asked, 0.0, rtol=0, atol=1e-12)
+
+
+def test_an_equilibrium_that_only_falls_is_said():
+    """A spring of a coordinate that pushes away from its middle."""
+    push = lambda x, v, t, p: jnp.stack([p["k"] * x[0, 0], *[jnp.zeros_like(x[0, 0])] * 2])
+    body = planar.Body("body", mass=1.0, inertia=1.0)
+    system = mb.Scene([body], forces=[mb.Force("push", "body", push, parameters={"k": 3.0})]).compile()
+    with pytest.raises(ValueError, match=r"not stable, which falls along body\.x .*stable=False"):
+        mb.equilibrium(system)
+    np.testing.assert_allclose(mb.equilibrium(system, stable=False).q, 0.0, rtol=0, atol=1e-12)
+
+
+def test_forces_without_potential_that_lead_back_are_stable():
+    """Of the stiffness ((1, 10), (0, 1)) the symmetric part is negative, but displacements die out."""
+    turn = lambda x, v, t, p: jnp.stack([-x[0, 0] - 10.0 * x[0, 1], -x[0, 1], -x[0, 2]])
+    body = planar.Body("body", mass=1.0, inertia=1.0)
+    system = mb.Scene([body], forces=[mb.Force("turn", "body", turn)]).compile()
+    np.testing.assert_allclose(mb.equilibrium(system).q, 0.0, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["parallelogram", "bricard"])
 def test_redundant_joints(name):
     """The potential is least where nothing accelerates."""

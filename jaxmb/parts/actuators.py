@@ -18,7 +18,8 @@ class Actuator(AbstractCoordinatePart, AbstractDynamicForce):
 
     - `mode="force"`: `command`;
     - `mode="speed"`: `gain (command − ẋ)`;
-    - `mode="position"`: `gain (command − x) − damping ẋ`; of an angle the shortest way to the command;
+    - `mode="position"`: `gain (command − x) − damping ẋ`; of an angle the shortest way to the command, up to half a
+        turn, in the plane as in space;
 
     with a limit F it becomes `F tanh(demand / F)`. The force of the motor, an internal state, follows it as
     `lag · d(force)/dt = demand − force`.
@@ -59,7 +60,7 @@ class Actuator(AbstractCoordinatePart, AbstractDynamicForce):
         elif self.mode == "speed":
             demand = self.gain * (self.command.reshape(-1) - v)
         else:
-            demand = -self.gain * self.difference(x, self.command) - self.damping * v
+            demand = -self.gain * self.shortest_difference(x, self.command) - self.damping * v
         if self.limit is not None:
             demand = self.limit * jnp.tanh(demand / self.limit)
         return {"force": (demand.reshape(self.force.shape) - self.force) / self.lag}

@@ -112,7 +112,11 @@ class AbstractSpatialPart(AbstractPart):
 
 
 class AbstractBody(AbstractPart):
-    """A body with mass. The origin of its frame is the mass centre.
+    """A body with mass. The origin of its frame is the mass centre, unless it has a field `centre` that is not None:
+    the mass centre [m] in the frame.
+
+    Points that parts have on a body, and poses, velocities and wrenches in the kernels of parts, are those of its
+    frame. The coordinates of the body and its motion are those of the mass centre.
 
     Fields declared with `fields.guess` hold its initial guess; all other numbers are parameters. `mass` and `inertia`
     are fields, or properties computed from other fields, such as a radius and a density.
@@ -133,11 +137,13 @@ class AbstractBody(AbstractPart):
 
     @abc.abstractmethod
     def pose(self) -> Any:
-        """The initial guess of the pose, a vector; only the position for a body that does not rotate."""
+        """The initial guess of the pose at the mass centre, a vector; only the position for a body that does not
+        rotate.
+        """
 
     @abc.abstractmethod
     def velocities(self) -> Any:
-        """The initial guess of the velocity, likewise."""
+        """The initial guess of the velocity at the mass centre, likewise."""
 
 
 class _Bodies:
@@ -163,8 +169,13 @@ class AbstractLink(AbstractPart):
     bodies = _Bodies()
     path_kind: ClassVar[PathKind] = "rod"
 
-    # Names of the coordinates that are angles known up to full turns.
-    periodic: ClassVar[frozenset[str]] = frozenset()
+    # Names of the coordinates that are angles.
+    angles: ClassVar[frozenset[str]] = frozenset()
+
+    @property
+    def periodic(self) -> frozenset[str]:
+        """Names of the coordinates that are angles known up to full turns; in the plane full turns are counted."""
+        return frozenset() if 2 in self.dimensions else self.angles
 
     def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
         """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""
@@ -360,7 +371,7 @@ def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
     declared, given, values = fields.declarations(type(part)), fields.values_of(part), {}
     for name, own in declared.items():
         value = given[name]
-        if own.centred and value is None:
+        if own.at_origin and value is None:
             values[name] = fields.as_parameter(np.zeros(space.dimension))
         elif own.gives:
             _check_given(part, name, own)

@@ -252,7 +252,7 @@ class Contact(AbstractContact):
     - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
-    - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the mass centres.
+    - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
     - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
     - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """

@@ -39,8 +39,8 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
         computed together.
     - `measures`: measured quantities by the name that the function knows them by: a joint's coordinate
         `"hinge.angle"` or its rate `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m,
-        m/s] (world axes), `angular_velocity` [rad/s] (in space in the axes of the body or frame), in the plane
-        `angle`, in space `orientation`.
+        m/s] (world axes; of a body those of the mass centre, as in its motion), `angular_velocity` [rad/s] (in space in
+        the axes of the body or frame), in the plane `angle`, in space `orientation`.
     - `acts_on`: a coordinate, `"slide.displacement"`, or several.
     - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
     - `parameters`: numbers by name; they become parameters of the system, `"pid.gain"`.

@@ -6,7 +6,7 @@ A part declares its fields with the helpers of this file, in place of `equinox.f
         name: str = name()
         body: str = body_name()
         stiffness: Number = parameter(unit="N/m", sign="positive")
-        point: Number = point(body=0, default="mass centre")
+        point: Number = point(body=0, default="origin")
 
 Numbers become read-only arrays and are the part's parameters, `"name.field"`; all other fields are static. A
 declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign and unit, the body that it is
@@ -53,8 +53,8 @@ class Declaration:
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
     - `sizes`: whether the scene's size is computed from this length.
-    - `optional`: whether the field may be None, and is computed from the given poses; `centred`: whether an omitted
-        point is the mass centre.
+    - `optional`: whether the field may be None, and is computed from the given poses; `at_origin`: whether a point that
+        is left out is the origin of its frame.
     - `gives`: the body-fixed fields that a world point or direction determines; `needed`: whether one or the other must
         be given.
     - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
@@ -70,7 +70,7 @@ class Declaration:
     is_attitude: bool = False
     sizes: bool = False
     optional: bool = False
-    centred: bool = False
+    at_origin: bool = False
     gives: tuple[str, ...] = ()
     needed: bool = True
     of: Any = None
@@ -237,11 +237,16 @@ def point(
 ) -> Any:
     """A point [m], fixed in a body, or in the world with `body=None`.
 
-    **Arguments:** `body`: index among the part's bodies; `default`: `"mass centre"`, or coordinates; `optional`:
-    default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a world point
-    determines at the given poses.
+    A point of a body is given in the frame of the body, or in that of the frame that the part names in its place. The
+    origin of a body's frame is its mass centre, unless the body was given `centre=`.
+
+    **Arguments:** `body`: index among the part's bodies; `default`: `"origin"`, of that frame, or coordinates;
+    `optional`: default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a
+    world point determines at the given poses.
     """
-    centred = isinstance(default, str)
+    at_origin = isinstance(default, str)
+    if at_origin and default != "origin":
+        raise ValueError(f"the default of a point must be 'origin' or coordinates, got {default!r}")
     declaration = Declaration(
         "number",
         shape=("d",),
@@ -249,8 +254,8 @@ def point(
         body=body,
         is_point=True,
         sizes=sizes,
-        optional=optional or centred or bool(gives),
-        centred=centred,
+        optional=optional or at_origin or bool(gives),
+        at_origin=at_origin,
         gives=gives,
     )
     default = None if declaration.optional else default

@@ -42,14 +42,14 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     free length is linear there.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
-    given poses; `point_a`, `point_b` [m], body-fixed, default the mass centres.
+    given poses; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative")
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: fields.Number = fields.point(body=0, default="mass centre")
-    point_b: fields.Number = fields.point(body=1, default="mass centre")
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
 
     def complete(self, space, poses):
@@ -78,12 +78,12 @@ class Damper(AbstractPair, AbstractForce):
 
     The two points should coincide or `body_a` be the ground; otherwise the pair of forces has a moment.
 
-    **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the mass centres.
+    **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
     """
 
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative")
-    point_a: fields.Number = fields.point(body=0, default="mass centre")
-    point_b: fields.Number = fields.point(body=1, default="mass centre")
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
 
     def wrenches(self, space, poses, velocities, t):
         rate = separation_rate(space, self, poses, velocities)
@@ -94,13 +94,13 @@ class PointForce(AbstractForce):
     """A constant force at a body-fixed point.
 
     **Arguments:** `force` [N], in world axes or, with `frame="body"`, turning with the body; `point` [m], body-fixed,
-    default the mass centre.
+    default the origin of the frame.
     """
 
     name: str = fields.name()
     body: str = fields.body_name()
     force: fields.Number = fields.parameter(shape=("d",), unit="N")
-    point: fields.Number = fields.point(body=0, default="mass centre")
+    point: fields.Number = fields.point(body=0, default="origin")
     frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
 
     def wrenches(self, space, poses, velocities, t):

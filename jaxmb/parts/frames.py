@@ -64,6 +64,16 @@ class AbstractFrame(AbstractPart):
             return self.own_wrench(space, pose, wrench)
         return self.base.wrench(space, pose, self.own_wrench(space, self.base.pose(space, pose), wrench))
 
+    def wrench_on_frame(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
+        """The wrench on the frame that is equivalent to one on the body."""
+        if self.base is not None:
+            pose, wrench = self.base.pose(space, pose), self.base.wrench_on_frame(space, pose, wrench)
+        d = space.dimension
+        at_origin = space.point_force(pose, self.own_point(jnp.zeros(d, wrench.dtype)), wrench[:d])
+        # Components of moments change as those of angular velocities do.
+        moment = jnp.concatenate([jnp.zeros_like(wrench[:d]), wrench[d:] - at_origin[d:]])
+        return jnp.concatenate([wrench[:d], self.own_velocity(space, pose, moment)[d:]])
+
     def point(self, point: Point) -> Point:
         """The point of the body [m] at a point of the frame."""
         own = self.own_point(point)
@@ -71,7 +81,7 @@ class AbstractFrame(AbstractPart):
 
 
 class LinkFrame(AbstractFrame):
-    """The frame that a body is given in if its mass centre is not the origin.
+    """The frame of a body whose mass centre is not its origin.
 
     **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are those of the body.
     """

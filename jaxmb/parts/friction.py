@@ -24,8 +24,8 @@ class Friction(AbstractNonIdeal):
     - `joint`: the joint's name. Its reaction must be determinate: no other joint may imply any of its rows.
     - `coefficient` μ ≥ 0.
     - `radius` [m] ≥ 0 of the pin or ball, default zero: sliding only.
-    - `point` [m]: the point of sliding, fixed in the joint's last body; default the joint's point there, or the mass
-        centre if it has none.
+    - `point` [m]: the point of sliding, fixed in the joint's last body; default the joint's point there, or the origin
+        of the frame if it has none.
     - `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
 

@@ -1,4 +1,8 @@
-"""Parts from user functions: position constraints, velocity constraints, forces and non-ideal constraint forces."""
+"""Parts from user functions: position constraints, velocity constraints, forces and non-ideal constraint forces.
+
+Functions see the poses and velocities of the frames of the bodies. The origin of a body's frame is its mass centre,
+unless the body was given `centre=`, or the part names a `Frame` in its place.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,8 +29,8 @@ class Constraint(AbstractConstraint):
     **Arguments:**
 
     - `bodies`: one name or several; `"ground"` may be among them.
-    - `function(poses, t, parameters)`: returns shape `(rows,)`; `poses` has a row per body (plane: x, y, angle;
-        space: r, Euler parameters). It must be twice differentiable by JAX.
+    - `function(poses, t, parameters)`: returns shape `(rows,)`; `poses` has a row per body, of its frame (plane: x, y,
+        angle; space: r, Euler parameters). It must be twice differentiable by JAX.
     - `rows`: the number of equations.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
     - `rheonomic`: whether the function depends on `t`.
@@ -47,9 +51,9 @@ class Constraint(AbstractConstraint):
 class VelocityConstraint(AbstractVelocityConstraint):
     """A nonholonomic constraint from a function, `function(poses, velocities, t, parameters) = 0`.
 
-    **Arguments:** as `Constraint`; `velocities` has a row per body (plane: ẋ, ẏ, angular rate; space: ṙ in the world,
-    ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term (cheaper);
-    `homogeneous`: it also vanishes at rest.
+    **Arguments:** as `Constraint`; `velocities` has a row per body, of its frame (plane: ẋ, ẏ, angular rate; space: ṙ
+    in the world, ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term
+    (cheaper); `homogeneous`: it also vanishes at rest.
     """
 
     name: str = fields.name()
@@ -71,8 +75,10 @@ class Force(AbstractPotentialForce):
     **Arguments:**
 
     - `bodies`: one name or several; `"ground"` may be among them (its wrench is dropped).
-    - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment about the mass centre [N m]) or
-        `(len(bodies), 6)` in space (force in the world frame, moment in the body frame).
+    - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment [N m]) or `(len(bodies), 6)` in space
+        (force in the world frame, moment in the body frame). The force acts at the origin of the body's frame, whose
+        pose and velocity the function sees, and the moment is about it: the mass centre, unless the body was given
+        `centre=`.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
     - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
         energy balance.
@@ -107,7 +113,8 @@ class NonIdeal(AbstractNonIdeal):
     - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
     - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the wrenches that the joint
         exerts on them besides, in the same axes, in the presence of all these forces. What the function returns in
-        directions that the joint blocks the reactions balance, and have that much less themselves.
+        directions that the joint blocks the reactions balance, and have that much less themselves. Moments of both are
+        about the origins of the frames.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
     """
 

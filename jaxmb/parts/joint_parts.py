@@ -70,6 +70,11 @@ class AbstractCoordinatePart(AbstractLink):
         out = value - target.reshape(-1)
         return shortest(out) if self.within in self.joint.periodic else out
 
+    def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """`value − target`; of an angle less full turns, in [−π, π]."""
+        out = value - target.reshape(-1)
+        return shortest(out) if self.within in self.joint.angles else out
+
     def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
         return middle.reshape(-1) + self.difference(value, middle) if self.within in self.joint.periodic else value

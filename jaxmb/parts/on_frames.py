@@ -12,6 +12,7 @@ from .base import (
     AbstractDynamicForce,
     AbstractForce,
     AbstractLink,
+    AbstractNonIdeal,
     AbstractPart,
     AbstractPotentialForce,
     AbstractTendon,
@@ -49,19 +50,21 @@ def _on(part: AbstractLink, frames: dict[str, AbstractFrame]) -> AbstractLink:
     raise ValueError(f"{part.label} has friction of its own parts and cannot be on frames; name its bodies.")
 
 
-class AbstractOnFrames(AbstractPart):
+def law_on_frames(law: AbstractNonIdeal, frames: tuple[AbstractFrame | None, ...]) -> AbstractNonIdeal:
+    """A law of a joint with every number filled in, on the frames of the joint's bodies, if there are any."""
+    given = {str(k): frame for k, frame in enumerate(frames) if frame is not None}
+    return NonIdealOnFrames(part=law, frames=given) if given else law
+
+
+class AbstractFramedPart(AbstractPart):
     """A `part` on `frames`, by the number of the body."""
 
-    part: Any = fields.part(AbstractLink)
+    part: Any = fields.part(AbstractPart)
     frames: Any = fields.parts()
 
     @property
     def name(self):
         return self.part.name
-
-    @property
-    def bodies(self):
-        return self.part.bodies
 
     @property
     def dimensions(self):
@@ -81,6 +84,26 @@ class AbstractOnFrames(AbstractPart):
     def named(self, name):
         return self.with_fields(part=self.part.named(name))
 
+    def _poses(self, space, poses):
+        rows = [self.frames[str(k)].pose(space, x) if str(k) in self.frames else x for k, x in enumerate(poses)]
+        return jnp.stack(rows)
+
+    def _velocities(self, space, poses, velocities):
+        own = lambda k, x, v: self.frames[str(k)].velocity(space, x, v) if str(k) in self.frames else v
+        return jnp.stack([own(k, x, v) for k, (x, v) in enumerate(zip(poses, velocities, strict=True))])
+
+    def _to_bodies(self, space, poses, wrenches):
+        to_body = lambda k, x, w: self.frames[str(k)].wrench(space, x, w) if str(k) in self.frames else w
+        return jnp.stack([to_body(k, x, w) for k, (x, w) in enumerate(zip(poses, wrenches, strict=True))])
+
+
+class AbstractOnFrames(AbstractFramedPart, AbstractLink):
+    """A link on frames."""
+
+    @property
+    def bodies(self):
+        return self.part.bodies
+
     def anchor(self, k):
         point, frame = self.part.anchor(k), self.frames.get(str(k))
         return point if frame is None or point is None else frame.point(point)
@@ -99,14 +122,6 @@ class AbstractOnFrames(AbstractPart):
             (k, moved(k, shape) if str(k) in self.frames else shape) for k, shape in self.part.shapes(space, size)
         )
 
-    def _poses(self, space, poses):
-        rows = [self.frames[str(k)].pose(space, x) if str(k) in self.frames else x for k, x in enumerate(poses)]
-        return jnp.stack(rows)
-
-    def _velocities(self, space, poses, velocities):
-        own = lambda k, x, v: self.frames[str(k)].velocity(space, x, v) if str(k) in self.frames else v
-        return jnp.stack([own(k, x, v) for k, (x, v) in enumerate(zip(poses, velocities, strict=True))])
-
 
 class ConstraintOnFrames(AbstractOnFrames, AbstractConstraint):
     """A position constraint on frames."""
@@ -120,8 +135,8 @@ class ConstraintOnFrames(AbstractOnFrames, AbstractConstraint):
         return self.part.rheonomic
 
     @property
-    def periodic(self):
-        return self.part.periodic
+    def angles(self):
+        return self.part.angles
 
     def residual(self, space, poses, t):
         return self.part.residual(space, self._poses(space, poses), t)
@@ -168,8 +183,7 @@ class AbstractForceOnFrames(AbstractOnFrames, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         own = self.part.wrenches(space, self._poses(space, poses), self._velocities(space, poses, velocities), t)
-        to_body = lambda k, x, w: self.frames[str(k)].wrench(space, x, w) if str(k) in self.frames else w
-        return jnp.stack([to_body(k, x, w) for k, (x, w) in enumerate(zip(poses, own, strict=True))])
+        return self._to_bodies(space, poses, own)
 
 
 class DynamicForceOnFrames(AbstractForceOnFrames, AbstractDynamicForce):
@@ -184,3 +198,17 @@ class DynamicForceOnFrames(AbstractForceOnFrames, AbstractDynamicForce):
 
 class ForceOnFrames(AbstractForceOnFrames):
     """A force law on frames without internal states."""
+
+
+class NonIdealOnFrames(AbstractFramedPart, AbstractNonIdeal):
+    """A non-ideal force of a joint on frames."""
+
+    @property
+    def joint(self):
+        return self.part.joint
+
+    def wrenches(self, space, poses, velocities, reactions, t):
+        on_frame = lambda k, x, w: self.frames[str(k)].wrench_on_frame(space, x, w) if str(k) in self.frames else w
+        own = jnp.stack([on_frame(k, x, w) for k, (x, w) in enumerate(zip(poses, reactions, strict=True))])
+        at = self._poses(space, poses), self._velocities(space, poses, velocities)
+        return self._to_bodies(space, poses, self.part.wrenches(space, *at, own, t))

@@ -27,7 +27,8 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
 
     **Fields:**
 
-    - `body`: the wheel, or a frame fixed in it; `radius` [m] > 0; `centre` [m], default the mass centre.
+    - `body`: the wheel, or a frame fixed in it; `radius` [m] > 0; `centre` [m], default the
+        origin of the frame.
     - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
         `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
         of the depth, `½ (δ + √(δ² + smoothing²))`.
@@ -42,7 +43,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     name: str = fields.name()
     body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
-    centre: fields.Number = fields.point(body=0, default="mass centre")
+    centre: fields.Number = fields.point(body=0, default="origin")
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     coefficient: fields.Number = fields.parameter(sign="positive")

@@ -148,8 +148,13 @@ def _cannot_assemble(system, t, q, fixed, names):
     if dependent:
         return f"{text}: {dependent}{f'; {remain}' if listed else ''}. Fix fewer of them, or give values that agree."
     if listed:
-        return f"{text}: {remain}. Check lengths and points, or give a better guess of the positions."
-    return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
+        return f"{text}: {remain}. Check lengths, points and axes, or give a better guess."
+    if held:
+        return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
+    return (
+        f"{text}: the configuration that is closest to the guess is singular, or not the only one. Give another guess "
+        "of the positions."
+    )
 
 
 def _dependent(system, t, q, held, names):

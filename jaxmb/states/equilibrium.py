@@ -2,7 +2,8 @@
 
 At rest the applied forces and the constraint forces balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search follows
 the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and bounded
-steps, so that a conservative system reaches a minimum of its potential and not a maximum. Derivatives are those of the
+steps, so that a conservative system reaches a minimum of its potential. Where it ends at an equilibrium from which
+forces lead away, because there are none at the guess, it starts again beside that. Derivatives are those of the
 balance, by the implicit function theorem.
 """
 
@@ -36,6 +37,12 @@ _FIRST, _LONGEST = 0.025, 0.5
 # Singular values and curvatures below this fraction of the largest are rounding errors.
 _NEGLIGIBLE = 1e-12
 
+# An equilibrium is left if an eigenvalue of the stiffness is negative and larger than this fraction of the largest. The
+# search starts again at this distance from it, in units of the system's size and radians, at most so often.
+_FALLS = 1e-10
+_BESIDE = 0.05
+_STARTS = 10
+
 
 @names_arguments
 def equilibrium(
@@ -44,9 +51,15 @@ def equilibrium(
     *,
     fix: Mapping[str, VectorLike] | None = None,
     t: Scalar = 0.0,
+    stable: bool = True,
     throw: bool = True,
 ) -> State:
-    """Find a static equilibrium near a guess.
+    """Find a static equilibrium near a guess, by default one that is stable: a pendulum hangs.
+
+    An equilibrium is stable here if the forces lead back from displacements that the constraints allow: if no
+    eigenvalue of the stiffness has a negative real part, which for conservative forces are those of a minimum of the
+    potential. One that is not is left along the displacement from which the forces lead away, on one side and if need
+    be on the other. Whether motions about an equilibrium are damped, `linearise` tells.
 
     Where displacements meet no resistance (a vehicle may roll along level ground, its wheels may turn) equilibria form
     a family. One near the guess is found, by the shortest steps in the scales of the velocities; `fix` selects another.
@@ -59,14 +72,17 @@ def equilibrium(
     - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription may exert a force.
         Internal states have the values that it gives, or those of the guess, and must rest at them.
     - `t`: the time, for forces and drivers that depend on it [s].
+    - `stable`: with `False` the search is Newton's method on the balance of forces, which goes to an equilibrium near
+        the guess whether it is stable or not, such as that of a pendulum upright.
     - `throw`: whether a failed search is an error. With `False` the state is NaN instead, so that one member of a
         batch does not spoil the others.
 
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
     **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
-    internal states change, or if there is no equilibrium; the message names the unbalanced coordinates. Under `jit` a
-    run-time error without the names.
+    internal states change, if there is no equilibrium, or only one that is not stable; the message names the
+    coordinates that are unbalanced, or along which the equilibrium falls. Under `jit` a run-time error without the
+    names.
     """
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
@@ -87,9 +103,9 @@ def equilibrium(
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    q, unbalanced, ok = _balanced(system, time, start, held)
+    q, unbalanced, falling, ok = _balanced(system, time, start, held, bool(stable))
     if concrete and throw and not bool(ok):
-        raise ValueError(_not_found(system, unbalanced))
+        raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, unbalanced))
     steady = True if z is None else _steady(system, time, q, u)
     if concrete and throw and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
@@ -98,7 +114,9 @@ def equilibrium(
     ok = ok & still & assembled & jnp.all(jnp.asarray(steady))
     if throw:
         q = eqx.error_if(
-            q, ~ok, "No static equilibrium was found; call equilibrium outside jit to see the unbalanced coordinates."
+            q,
+            ~ok,
+            "No static equilibrium was found; call equilibrium outside jit to see the coordinates at fault.",
         )
     state = State(q, u, z)
     return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, time))
@@ -228,8 +246,8 @@ def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
     )
 
 
-def _step(local: _Linearised) -> Float[Array, "n"]:
-    """Newton's step with curvatures made positive; none along loose directions without force."""
+def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
+    """Newton's step, with curvatures made positive if it leads downhill; none along loose directions without force."""
     along = local.directions.T @ local.force
     largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
     noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
@@ -237,17 +255,21 @@ def _step(local: _Linearised) -> Float[Array, "n"]:
     size = jnp.abs(local.curvatures)
     # Directions without force count as stiff, so that rounding errors cause no motion along them.
     size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
+    size = size if downhill else jnp.where(~quiet & (local.curvatures < 0), -size, size)
     stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
     return jnp.linalg.solve(stiffness, local.directions @ jnp.where(quiet, 0.0, along))
 
 
 @eqx.filter_jit
 def _balanced(
-    system: AbstractSystem, t: Array, start: Float[Array, "nq"], held: tuple[int, ...]
-) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Bool[Array, ""]]:
-    """The equilibrium, the residual forces there, and whether they vanish."""
+    system: AbstractSystem, t: Array, start: Float[Array, "nq"], held: tuple[int, ...], stable: bool
+) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Float[Array, "nu"], Bool[Array, ""]]:
+    """The equilibrium, the residual forces there, the displacement along which one that was left falls, zero if none
+    was, and whether the equilibrium was found.
+    """
     balance = _Balance(system, t, start[np.array(held, int)], held)
-    q, local, ok = _search(lax.stop_gradient(balance), lax.stop_gradient(start))
+    found = _settled if stable else _nearest
+    q, local, falling, ok = found(lax.stop_gradient(balance), lax.stop_gradient(start))
 
     # The equations of the equilibrium, for its derivatives. Loose directions and implied rows are made definite: the
     # configuration does not move along loose directions, and multipliers are the smallest ones.
@@ -266,11 +288,59 @@ def _balanced(
 
     known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
     solved = root(equations, known, lambda _, x: x)
-    return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), ok
+    return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), falling, ok
 
 
-def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
-    """Follow the forces until they vanish; also returns whether they do."""
+def _nearest(balance: _Balance, start: Float[Array, "nq"]):
+    """The equilibrium to which Newton's method leads from a guess."""
+    q, local, found = _search(balance, start, downhill=False)
+    return q, local, balance.rest, found
+
+
+def _settled(balance: _Balance, start: Float[Array, "nq"]):
+    """The equilibrium to which the forces lead from a guess, or from beside an equilibrium that is not stable."""
+
+    def proceed(carry):
+        *_, done, k = carry
+        return ~done & (k < _STARTS)
+
+    def start_again(carry):
+        begin, _, origin, falling, side, *_, k = carry
+        q, local, found = _search(balance, begin, downhill=True)
+        stable, softest = _softest(local.stiffness)
+        ok = found & stable
+        leave, turn_round = found & ~ok, ~found & (side > 0)
+        origin, falling = jnp.where(leave, q, origin), jnp.where(leave, softest, falling)
+        side = jnp.where(leave, 1.0, jnp.where(turn_round, -1.0, side))
+        begin = jnp.where(ok, q, balance.moved(origin, side * _BESIDE * falling))
+        return begin, local, origin, falling, side, ok, ok | ~(leave | turn_round), k + 1
+
+    none = jnp.zeros((), start.dtype)
+    at = start, _unknown(balance, start), start, balance.rest, none, jnp.array(False), jnp.array(False), 0
+    q, local, _, falling, _, ok, _, _ = lax.while_loop(proceed, start_again, at)
+    return q, local, falling, ok
+
+
+def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Array, "n"]]:
+    """Whether no eigenvalue has a negative real part, and the direction of the least, its largest entry about one."""
+    values, vectors = jnp.linalg.eig(stiffness)
+    direction = vectors[:, jnp.argmin(values.real)].real
+    size = jnp.abs(direction)
+    # Of entries of about the same size the first one has the sign, so that rounding errors do not decide.
+    first = direction[jnp.argmax(size > 0.5 * jnp.max(size))]
+    stable = jnp.min(values.real) >= -_FALLS * jnp.max(jnp.abs(values))
+    return stable, direction / jnp.where(first != 0, first, 1.0)
+
+
+def _unknown(balance, q):
+    """A linearisation of zeros."""
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, q))
+
+
+def _search(
+    balance: _Balance, start: Float[Array, "nq"], *, downhill: bool
+) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
+    """Follow the forces until they vanish, or the steps of Newton's method; also returns whether they do."""
     close = jnp.finfo(start.dtype).eps ** 0.5
 
     def proceed(carry):
@@ -286,11 +356,12 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         # The effect of the rows' correction on the forces is not counted.
         other = jnp.max(jnp.abs(local.curvatures)) * norm(local.correction) * norm(step)
         back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(local.force, step)) - other
-        better = ~back | (norm(there.force) < norm(local.force))
+        weaker = norm(there.force) < norm(local.force)
+        better = ~back | weaker if downhill else (size <= close) | weaker
         good = (k == 0) | (better & jnp.all(jnp.isfinite(there.force)))
         q, local = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, local))
         radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
-        step = _step(local)
+        step = _step(local, downhill=downhill)
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
         # The error after a small step of Newton's method is of the size of its square, and of that of the correction,
@@ -298,17 +369,28 @@ def _search(balance: _Balance, start: Float[Array, "nq"]) -> tuple[Float[Array, 
         return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
     # Before the first linearisation nothing is known, and the step is zero.
-    unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, start))
-    at = (start, unknown, balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
+    at = (start, _unknown(balance, start), balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
     q, local, _, _, found, _ = lax.while_loop(proceed, advance, at)
     return q, local, found
 
 
-def _not_found(system, unbalanced):
-    size = np.abs(np.asarray(unbalanced))
+def _largest(system, values, least):
+    """The rates with the largest values, those above a fraction of the largest, with these."""
+    size = np.abs(np.asarray(values))
     names = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
-    worst = [k for k in np.argsort(-size)[:4] if size[k] > 1e-6 * np.max(size)]
-    listed = ", ".join(f"{names[k]} ({unbalanced[k]:.3g})" for k in worst)
+    return ", ".join(f"{names[k]} ({values[k]:.3g})" for k in np.argsort(-size)[:4] if size[k] > least * np.max(size))
+
+
+def _only_unstable(system, falling):
+    return (
+        "No stable equilibrium was found. There is one that is not stable, which falls along "
+        f"{_largest(system, falling, 0.1)}, and no forces balance where this leads. Hold such a coordinate with fix, "
+        "give a guess nearer to the equilibrium, or ask for the unstable one with stable=False."
+    )
+
+
+def _not_found(system, unbalanced):
+    listed = _largest(system, unbalanced, 1e-6)
     return (
         f"No static equilibrium was found: residual forces along {listed or 'nothing'}, in N and N m. Hold such a "
         "coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium."

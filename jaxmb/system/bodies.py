@@ -41,7 +41,7 @@ from .parameter_checks import are_in_range, check_parts, stacked_part
 from .parameter_paths import parameter_paths, positive_parameters
 from .picture import picture
 from .quantities import Quantity
-from .reactions import applied_wrenches, reaction
+from .reactions import applied_wrenches, nonideal_wrenches, reaction
 
 
 class Implied(NamedTuple):
@@ -172,6 +172,20 @@ class AbstractBodySystem(AbstractBodies):
     def parameter_paths(self):
         return parameter_paths(self._gravity_name, self._groups, self.servos)
 
+    def with_frames_of(self, before):
+        space, q, u = self.layout.space, self.guess.q, self.guess.u
+        poses, velocities = self.poses(q), self.velocities(u)
+        for group, old in zip(self.bodies, before.bodies, strict=True):
+            centre, was = getattr(group.group.part, "centre", None), getattr(old.group.part, "centre", None)
+            if centre is None or centre is was:
+                continue
+            bodies, d = group.group.body_index[:, 0], space.dimension
+            moved = jax.vmap(space.direction)(poses[bodies], centre - was)
+            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], centre - was)
+            q = q.at[self.layout.pose_index[bodies, :d]].add(moved)
+            u = u.at[self.layout.velocity_index[bodies, :d]].set(velocity)
+        return self if q is self.guess.q else dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
+
     def positive_parameters(self):
         return frozenset(positive_parameters(self._groups))
 
@@ -282,15 +296,22 @@ class AbstractBodySystem(AbstractBodies):
         return jax.vmap(single)(ts, ys, multipliers)
 
     def force_names(self):
-        return tuple(dict.fromkeys(name for g in self.forces for name in g.group.names))
+        return tuple(dict.fromkeys(name for g in (*self.forces, *self.nonideal) for name in g.group.names))
 
     @eqx.filter_jit
-    def applied_wrenches(self, name, ts, ys):
-        def single(t, y):
-            own = self.at(y)
-            return applied_wrenches(own.forces, name, t, self.prepared_poses(y.q), self.all_velocities(y.u))
+    def applied_wrenches(self, name, ts, ys, multipliers):
+        forces = [k for k, g in enumerate(self.forces) if name in g.group.names]
+        laws = [g for g in self.nonideal if name in g.group.names]
 
-        return jax.vmap(single)(ts, ys)
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            if laws:
+                wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, own)
+                return applied_wrenches(laws, name, wrenches)
+            groups = [self.at(y).forces[k] for k in forces]
+            return applied_wrenches(groups, name, [g.wrenches(t, poses, velocities) for g in groups])
+
+        return jax.vmap(single)(ts, ys, multipliers)
 
     def outline(self, ys):
         groups = (*self.constraints, *self.velocity_constraints, *self.forces)

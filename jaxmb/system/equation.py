@@ -311,8 +311,12 @@ class AbstractSystem(eqx.Module):
         """Names of the force elements."""
 
     @abc.abstractmethod
-    def applied_wrenches(self, name: str, ts: Float[Array, "times"], ys: State) -> Float[Array, "times bodies v"]:
-        """Wrenches of one force element on its bodies along a motion."""
+    def applied_wrenches(
+        self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"] | None
+    ) -> Float[Array, "times bodies v"]:
+        """Wrenches of one force element, or of the friction of one joint, on its bodies along a motion. `multipliers`
+        of the rows may be None if the constraints are ideal.
+        """
 
     @abc.abstractmethod
     def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
@@ -322,6 +326,12 @@ class AbstractSystem(eqx.Module):
     def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
         """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
         space.
+        """
+
+    @abc.abstractmethod
+    def with_frames_of(self, before: Self) -> Self:
+        """The system with the guess of its bodies' frames from before its parameters changed: where the mass centre of
+        a body was moved in its frame, the guess of the mass centre follows.
         """
 
     def at(self, y: State) -> Self:

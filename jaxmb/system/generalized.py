@@ -113,6 +113,10 @@ class AbstractGeneralizedSystem(AbstractSystem):
 
     # There are no bodies to act on.
 
+    def with_frames_of(self, before):
+        del before
+        return self
+
     def joint_names(self):
         raise ValueError("reactions are defined for joints between bodies; this system has constraint_forces.")
 
@@ -122,7 +126,7 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def force_names(self):
         raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
-    def applied_wrenches(self, name, ts, ys):
+    def applied_wrenches(self, name, ts, ys, multipliers):
         raise ValueError("forces are defined for parts that act on bodies; this system has none.")
 
     def linear_momentum(self, q, u):

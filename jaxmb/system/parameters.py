@@ -37,7 +37,8 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
 def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
 
-    Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew.
+    Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
+    the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows.
 
     **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. Where design
     variables are among them, all parameters that follow from them are computed anew.
@@ -60,7 +61,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
                     f"Parameter {name!r} follows from the design variable{several} {names}; set "
                     f"{'those' if several else 'that'} instead."
                 )
-    given, design = dict(values), []
+    given, design, before = dict(values), [], system
     # Variables of a design may follow from those of a later one.
     for own in reversed(system.design):
         mine = {name: given.pop(name) for name in own.values if name in given}
@@ -81,6 +82,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
             if value.shape != shape:
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
+    system = system.with_frames_of(before)
     if design:
         system = eqx.tree_at(lambda s: s.design, system, tuple(design))
     system.check_parameters(given)

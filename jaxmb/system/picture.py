@@ -74,6 +74,8 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
     shapes = [
         (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in part.shapes(space, width)
     ]
+    # The friction of a joint acts where the joint does.
+    of_laws = {law: joint for g in system.nonideal for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
     if not system.spatial:
         moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
@@ -83,7 +85,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         width=width,
         positions=dict(zip(names, position, strict=True)),
         orientations=dict(zip(names, orientation, strict=True)),
-        parts=parts,
+        parts=parts | {law: parts[joint] for law, joint in of_laws.items()},
         shapes=shapes,
         paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
         centres={name: np.asarray(space.in_space(own)) for g in system.bodies for name, own in _centres(g.group)},

@@ -1,4 +1,4 @@
-"""Forces that joints and force elements exert on their bodies."""
+"""Forces that joints, their friction, and force elements exert on their bodies."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,24 +8,53 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import cross
 from .constraint_groups import AbstractConstraintGroup
-from .force_groups import ForceGroup
+from .force_groups import ForceGroup, NonIdealGroup
 from .groups import Group
 from .quantities import Reaction
 
 
-def applied_wrenches(
-    forces: Sequence[ForceGroup],
-    name: str,
+def reaction_wrenches(
+    joints: Sequence[AbstractConstraintGroup],
     t: Scalar,
     poses: Float[Array, "b_ground p"],
     velocities: Float[Array, "b_ground v"],
+    multipliers: Float[Array, "rows"],
+) -> list[Float[Array, "parts k v"]]:
+    """Wrenches of the constraints on their bodies, group by group."""
+    out, row = [], 0
+    for g in joints:
+        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
+        out.append(g.wrenches(t, poses, velocities, own))
+        row += own.size
+    return out
+
+
+def nonideal_wrenches(
+    joints: Sequence[AbstractConstraintGroup],
+    laws: Sequence[NonIdealGroup],
+    t: Scalar,
+    poses: Float[Array, "b_ground p"],
+    velocities: Float[Array, "b_ground v"],
+    multipliers: Float[Array, "rows"],
+) -> list[Float[Array, "parts k v"]]:
+    """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
+    wrenches = [own.reshape(-1) for own in reaction_wrenches(joints, t, poses, velocities, multipliers)]
+    reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
+    bodies = [(g.group.names, g.group.bodies) for g in joints]
+    # A joint may be made of several constraints, all between the same bodies.
+    take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
+    return [g.wrenches(t, poses, velocities, jnp.sum(take(g), axis=1)) for g in laws]
+
+
+def applied_wrenches(
+    groups: Sequence[ForceGroup | NonIdealGroup], name: str, wrenches: Sequence[Float[Array, "parts k v"]]
 ) -> Float[Array, "bodies v"]:
-    """Wrenches of one force element on its bodies, summed over its components."""
-    own = [
-        g.wrenches(t, poses, velocities)[k] for g in forces for k, other in enumerate(g.group.names) if other == name
-    ]
+    """Wrenches of one force element on its bodies, summed over its components, from those of all parts by groups."""
+    of_groups = zip(groups, wrenches, strict=True)
+    own = [values[k] for g, values in of_groups for k, other in enumerate(g.group.names) if other == name]
     return sum(own[1:], start=own[0])
 
 

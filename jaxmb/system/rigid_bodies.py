@@ -16,6 +16,7 @@ from ..linalg.rotations import cross, rotate
 from ..linalg.sums import placed_sums
 from .bodies import AbstractBodySystem
 from .layout import Layout
+from .reactions import nonideal_wrenches, reaction_wrenches
 
 
 class RigidBodySystem(AbstractBodySystem):
@@ -87,28 +88,13 @@ class RigidBodySystem(AbstractBodySystem):
 
     @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):
-        wrenches = self._reactions(t, self.prepared_poses(q), self.all_velocities(u), multipliers)
+        wrenches = reaction_wrenches(self.joints, t, self.prepared_poses(q), self.all_velocities(u), multipliers)
         return self._add_up(wrenches, [g.group.body_index for g in self.joints], u.dtype)
-
-    def _reactions(self, t, poses, velocities, multipliers):
-        """Wrenches of the constraints on their bodies, group by group (parts, k, velocity size)."""
-        out, row = [], 0
-        for g in self.joints:
-            own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-            out.append(g.wrenches(t, poses, velocities, own))
-            row += own.size
-        return out
 
     @eqx.filter_jit
     def nonideal_force(self, t, q, u, multipliers):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        reactions = _join([*self._reactions(t, poses, velocities, multipliers), jnp.zeros(1, u.dtype)], u.dtype)
-        joints = [(g.group.names, g.group.bodies) for g in self.joints]
-        wrenches = []
-        for g in self.nonideal:
-            # A joint may be made of several constraints, all between the same bodies.
-            own = unchecked_take(reactions, self.layout.reaction_source(joints, g.joints))
-            wrenches.append(g.wrenches(t, poses, velocities, jnp.sum(own, axis=1)))
+        wrenches = nonideal_wrenches(self.joints, self.nonideal, t, poses, velocities, multipliers)
         return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
 
     @eqx.filter_jit

@@ -13,8 +13,8 @@ from ..base import AbstractBody, AbstractPlanarPart
 class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     """A planar rigid body with its initial guess; subclasses define mass and inertia.
 
-    **Arguments:** `position` [m], shape (2,), of the mass centre, and `angle` [rad], a guess that `assemble` improves;
-    `velocity` [m/s], shape (2,), and `angular_velocity` [rad/s] likewise.
+    **Arguments:** `position` [m], shape (2,), of the origin of the body's frame, and `angle` [rad], a guess that
+    `assemble` improves; `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s] likewise.
     """
 
     name: str = fields.name()
@@ -32,13 +32,16 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
 
 
 class Body(AbstractRigidBody):
-    """A rigid body; its frame has its origin in the mass centre, or with `centre` elsewhere.
+    """A rigid body with a frame, whose origin is the mass centre unless `centre` is given.
+
+    Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
+    pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
+    moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
-    mass centre, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), and
-    `angular_velocity` [rad/s] likewise; `centre` [m], shape (2,), the mass centre in the body's frame: points that
-    parts have on the body, `position` and `velocity` are then those of the frame and its origin. (The motion of the
-    body, `Trajectory["name"]`, is that of the mass centre; a `Frame` on the body shows that of the origin.)
+    origin of the frame, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), of the
+    origin, and `angular_velocity` [rad/s] likewise; `centre` [m], shape (2,), the mass centre in the frame, default
+    its origin. Where a changed `"name.centre"` moves the mass centre, the guess of the frame stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")

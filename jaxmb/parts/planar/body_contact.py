@@ -52,7 +52,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
     radius: fields.Number = fields.length(sign="positive")
-    centre: fields.Number = fields.point(body=0, default="mass centre")
+    centre: fields.Number = fields.point(body=0, default="origin")
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
@@ -160,7 +160,7 @@ class PlateContact(AbstractBodyContact):
 
     - `bodies`: names, first that of the disc's body, then those of the plates' bodies.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
-    - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the mass centre.
+    - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
     - `edge` [m] > 0, at most half as long as a plate.
     - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least.
@@ -278,7 +278,8 @@ class DiscContact(AbstractBodyContact):
     - `bodies`: names, first that of the body of `radius` and `centre`, then those of the others.
     - `normal`, `friction`, `radius`, `centre`, `damping`, `damping_depth`, `smoothing`: as in `PlateContact`.
     - `radii` [m] ≥ 0 of the other discs, shape () or (others,), 0 for points.
-    - `centres` [m] of the other discs, fixed in their bodies, shape (2,) or (others, 2), default the mass centres.
+    - `centres` [m] of the other discs, fixed in their bodies, shape (2,) or (others, 2), default the
+        origins of the frames.
     """
 
     radii: fields.Number = fields.length(shape=None, sign="non-negative")

@@ -38,8 +38,8 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     - `damping` c [N s/m] ≥ 0, acting outside the slack.
     - `transition_speed` v₀ [m/s] > 0, the speed at which 76 % of the friction acts; `smoothing` [m] > 0. The smaller
         they are, the shorter the steps.
-    - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the mass
-        centres.
+    - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the
+        origins of the frames.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
@@ -52,8 +52,8 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=0.005)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: fields.Number = fields.point(body=0, default="mass centre")
-    point_b: fields.Number = fields.point(body=1, default="mass centre")
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
 
     def validate(self):

@@ -24,7 +24,7 @@ class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
         in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
-    - `point_a`, `point_b` [m], body-fixed, default the mass centres.
+    - `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
     """
 
     quantity: Literal["angle", "x", "y", "distance"] = fields.choice("angle", "x", "y", "distance")

@@ -34,6 +34,7 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
     """
 
     rows: ClassVar[int] = 2
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -71,6 +72,7 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def residual(self, space, poses, t):
         return _offset(space, self, poses)[None]
@@ -161,6 +163,7 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
     parameters: fields.Numbers = fields.numbers()
     rows: ClassVar[int] = 1
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):

@@ -12,6 +12,9 @@ from ...linalg.arrays import namespace
 
 Vector3 = Float[Array, "3"]
 
+# Angles nearer to half a turn than 0.1 rad count as opposite, by their cosine plus one.
+_OPPOSITE = 0.005
+
 
 def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     """Two directions that make a right-handed orthogonal triad `(u, v, axis)`, u of unit length.
@@ -39,6 +42,24 @@ def offset_in_a(space, part, poses: Float[Array, "k p"]) -> Vector3:
 def across(axis: Vector3, w: Vector3) -> Float[Array, "2"]:
     """The components `u·w`, `v·w` of a vector in A along the perpendiculars of an axis; zero if it is parallel."""
     return jax.numpy.sum(perpendiculars(axis) * w[None, :], axis=1)
+
+
+def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array, "n"]:
+    """The vector of twice the sine of half an angle [rad, for small angles], along that of its sine.
+
+    Sine and cosine may have a common factor, of which the result does not depend; it is zero where both are. It
+    vanishes where the angle does, and there has the first and second derivatives of the sine. It does not vanish half a
+    turn away, where its length is two.
+    """
+    xp = namespace(sine, cosine)
+    square = xp.sum(sine * sine) + cosine * cosine
+    defined = square > 0
+    size = xp.sqrt(xp.where(defined, square, 1.0))
+    opposite = size + cosine < _OPPOSITE * size
+    half = xp.where(opposite, size, size + cosine)
+    # Near half a turn the direction of the sine is undetermined, and any one leads back.
+    away = 2.0 * (np.arange(sine.shape[0]) == 0) - sine / size
+    return xp.where(defined, xp.where(opposite, away, sine * xp.sqrt(2.0 / (size * half))), 0.0)
 
 
 def displacement_along(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -92,17 +113,32 @@ def rotation_vector(part, poses: Float[Array, "k p"]) -> Vector3:
 
 
 def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
-    """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if None."""
+    """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if None.
+
+    Where a part has an `axis_b` that is not parallel to `axis_a` at these poses, they are those after the shortest turn
+    of B that makes it parallel.
+    """
+    axis_b = getattr(part, "axis_b", None)
     if (part.x_a is None) != (part.x_b is None):
         raise ValueError(
             f"{part.label}: give both x_a and x_b (body-fixed), or neither to measure from the given poses."
         )
     if part.x_a is None:
         x_a, _ = perpendiculars(part.axis_a)
-        return part.filled(x_a=x_a, x_b=space.body_direction(poses[1], space.direction(poses[0], x_a)))
-    if abs(float(part.x_a @ part.axis_a)) > 1e-6:
-        raise ValueError(f"{part.label}: x_a must be perpendicular to axis_a, got {np.asarray(part.x_a)}.")
+        turned = x_a if axis_b is None else _carried(x_a, part.axis_a, direction_in_a(space, poses, axis_b))
+        return part.filled(x_a=x_a, x_b=space.body_direction(poses[1], space.direction(poses[0], turned)))
+    for x, axis, names in ((part.x_a, part.axis_a, ("x_a", "axis_a")), (part.x_b, axis_b, ("x_b", "axis_b"))):
+        if axis is not None and abs(float(x @ axis)) > 1e-6:
+            raise ValueError(f"{part.label}: {names[0]} must be perpendicular to {names[1]}, got {np.asarray(x)}.")
     return part
+
+
+def _carried(x: Vector3, start: Vector3, end: Vector3) -> Vector3:
+    """A vector perpendicular to the direction `start`, after the shortest turn of that to the direction `end`."""
+    half = 1.0 + start @ end
+    # Between opposite directions any turn by half a turn is a shortest one.
+    turned = x if half < 1e-12 else x - (end @ x) / half * (start + end)
+    return turned / np.sqrt(turned @ turned)
 
 
 def with_given_orientation(part, poses: Float[Array, "k p"]):

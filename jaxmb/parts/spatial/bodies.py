@@ -23,9 +23,9 @@ def inertia_matrix(value: Any) -> Array:
 class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
     """A spatial rigid body with its initial guess; subclasses define mass and inertia.
 
-    **Arguments:** `position` [m], shape (3,), of the mass centre, and `orientation`, shape (4,), unit Euler parameters
-    (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,), of the mass
-    centre in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, likewise.
+    **Arguments:** `position` [m], shape (3,), of the origin of the body's frame, and `orientation`, shape (4,), unit
+    Euler parameters (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,),
+    of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, likewise.
     """
 
     name: str = fields.name()
@@ -46,20 +46,23 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
 
 
 class Body(AbstractRigidBody):
-    """A rigid body; its frame has its origin in the mass centre, or with `centre` elsewhere.
+    """A rigid body with a frame, whose origin is the mass centre unless `centre` is given.
+
+    Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
+    pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
+    moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
 
     **Arguments:**
 
     - `mass` [kg] > 0.
     - `inertia` [kg m²], shape (3, 3), about the mass centre in body axes, symmetric and positive definite (products of
         inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes.
-    - `position` [m], shape (3,), of the mass centre, and `orientation`, shape (4,), unit Euler parameters (scalar
-        first) from body to world: a guess that `assemble` improves.
-    - `velocity` [m/s], shape (3,), of the mass centre in the world frame, and `angular_velocity` [rad/s], shape (3,),
-        in the body frame, likewise.
-    - `centre` [m], shape (3,), the mass centre in the body's frame: points that parts have on the body, `position` and
-        `velocity` are then those of the frame and its origin. (The motion of the body, `Trajectory["name"]`, is that of
-        the mass centre; a `Frame` on the body shows that of the origin.)
+    - `position` [m], shape (3,), of the origin of the frame, and `orientation`, shape (4,), unit Euler parameters
+        (scalar first) from body to world: a guess that `assemble` improves.
+    - `velocity` [m/s], shape (3,), of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the
+        body frame, likewise.
+    - `centre` [m], shape (3,), the mass centre in the frame, default its origin. Where a changed `"name.centre"` moves
+        the mass centre, the guess of the frame stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")

@@ -11,15 +11,15 @@ from ..._types import Scalar
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractConstraint, AbstractPair, AbstractSpatialPart
-from .axes import angle, cosine_sine, measured_from_given_poses, offset_in_a
+from .axes import angle, cosine_sine, half_sine, measured_from_given_poses, offset_in_a
 
 
 class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
-    An angle is prescribed as `sin(angle − motion) = 0`, written with products of direction components, which holds for
-    any number of turns. The joint should let B turn about the axis only; otherwise the angle is that of the projections
-    perpendicular to the axis.
+    An angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], written with products of direction
+    components, which holds for any number of turns. The joint should let B turn about the axis only; otherwise the
+    angle is that of the projections perpendicular to the axis.
 
     **Arguments:**
 
@@ -28,7 +28,8 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         B relative to point A in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
-    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the mass centres: for a coordinate or distance only.
+    - `point_a`, `point_b` [m], shape (3,), body-fixed, default the origins of the frames: for a coordinate or distance
+        only.
     - `axis_a`, unit, shape (3,), fixed in `body_a`, or `axis` in the world: for an angle only.
     - `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis: an angle is measured between them; by
         default it is zero at the given poses.
@@ -74,7 +75,6 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         motion = self.motion(t, self.parameters)
         if self.quantity == "angle":
             c, s = cosine_sine(space, self, poses)
-            row = s * jnp.cos(motion) - c * jnp.sin(motion)
-        else:
-            row = self.value(space, poses) - motion
-        return jnp.reshape(row, (1,))
+            sine, cosine = s * jnp.cos(motion) - c * jnp.sin(motion), c * jnp.cos(motion) + s * jnp.sin(motion)
+            return half_sine(jnp.reshape(sine, (1,)), jnp.reshape(cosine, ()))
+        return jnp.reshape(self.value(space, poses) - motion, (1,))

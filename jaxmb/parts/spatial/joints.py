@@ -5,6 +5,10 @@ the body frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a 
 (`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two points, `d = B − A`, `a`
 and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 
+Where axes are parallel, they point the same way. Their rows are those of the tilt, the components along u and v of
+`2 sin(θ/2)` times the unit vector of `b` across `a`, with the angle θ between the axes: they vanish only where the axes
+agree, and not where they point against each other.
+
 Their own coordinates are `angle` [rad], the turn of `body_b` about the axis, and `displacement` [m], the component of d
 along it. An angle is zero at the given poses, or where the directions `x_a` and `x_b` that are given with the joint
 coincide.
@@ -26,6 +30,7 @@ from .axes import (
     cosine_sine,
     direction_in_a,
     displacement_along,
+    half_sine,
     measured_from_given_poses,
     offset_in_a,
     relative_orientation,
@@ -37,7 +42,8 @@ from .axes import (
 
 
 def _parallel(space, part, poses):
-    return across(part.axis_a, direction_in_a(space, poses, part.axis_b))
+    b = direction_in_a(space, poses, part.axis_b)
+    return half_sine(across(part.axis_a, b), jnp.dot(part.axis_a, b))
 
 
 class Spherical(AbstractSpatialPart, AbstractJoint):
@@ -67,7 +73,7 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
 
 
 class Revolute(AbstractSpatialPart, AbstractJoint):
-    """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, `u·b`, `v·b`.
+    """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, and two of the tilt.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), direction of the hinge fixed in each
     body; or `axis`, unit, shape (3,), world; `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis:
@@ -80,7 +86,7 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 5
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -113,7 +119,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
 
     def validate(self):
         if self.axis_a_W is not None and self.axis_b_W is not None:
@@ -165,7 +171,7 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
     orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
 
     def complete(self, space, poses):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
@@ -192,7 +198,7 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
 
 
 class Cylindrical(AbstractSpatialPart, AbstractJoint):
-    """A pin that turns and slides: two axes stay on one line. Rows 4: `u·b`, `v·b`, `u·d`, `v·d`.
+    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
 
     **Arguments:** as in `Revolute`.
     """
@@ -203,7 +209,7 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -225,10 +231,9 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
 class Screw(AbstractSpatialPart, AbstractJoint):
     """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
 
-    With the angle θ from `x_a` to `x_b` about the axis and the shift s = a·d, the last row is
-    `pitch/2π · sin(θ − 2π (s − offset)/pitch) = 0`, written with products of direction components: it is periodic in θ
-    and in s, as the screw is, and so holds for any number of turns; near zero its value is the axial error [m]. (The
-    sine has a second family of zeros half a turn away, which a solution that is followed continuously never meets.)
+    With the angle θ from `x_a` to `x_b` about the axis, the shift s = a·d and ψ = θ − 2π (s − offset)/pitch, the last
+    row is `pitch/2π · 2 sin(ψ/2) = 0` with ψ in (−π, π], written with products of direction components: it is periodic
+    in θ and in s, as the screw is, and so holds for any number of turns; near zero its value is the axial error [m].
 
     **Arguments:** points and axes as in `Revolute`; `pitch` [m], advance of B along the axis per turn, positive for a
     right-handed screw, not zero; `offset` [m], the shift at θ = 0, default that of the given poses; `x_a`, `x_b`, unit,
@@ -244,7 +249,7 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     x_b: fields.Number = fields.axis(body=1, optional=True)
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -256,8 +261,9 @@ class Screw(AbstractSpatialPart, AbstractJoint):
         lead = self.pitch / (2 * np.pi)
         turn = (jnp.dot(self.axis_a, shift) - self.offset) / lead
         c, s = cosine_sine(space, self, poses)
-        thread = lead * (s * jnp.cos(turn) - c * jnp.sin(turn))
-        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread[None]])
+        cosine, sine = c * jnp.cos(turn) + s * jnp.sin(turn), s * jnp.cos(turn) - c * jnp.sin(turn)
+        thread = lead * half_sine(sine[None], cosine)
+        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
@@ -302,7 +308,7 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
 
 class Planar(AbstractSpatialPart, AbstractJoint):
-    """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: `u·b`, `v·b`, `a·d`.
+    """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: two of the tilt, `a·d`.
 
     Its displacement, shape (2,), has the components of d along `x_a` and along `a × x_a`.
 
@@ -315,7 +321,7 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 3
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)

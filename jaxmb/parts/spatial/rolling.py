@@ -75,8 +75,8 @@ class RollingDisk(AbstractDisk, AbstractCompound):
     axle. The disk must never lie flat.
 
     **Arguments:** `radius` [m] > 0; `axis`, unit, shape (3,), the axle fixed in the body; `center` [m], shape (3,), of
-    the disk, fixed in the body, default the mass centre; `point` [m] and `normal` (unit), shape (3,), of the plane in
-    the world.
+    the disk, fixed in the body, default the origin of the frame; `point` [m] and `normal` (unit), shape (3,), of the
+    plane in the world.
     """
 
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
@@ -128,9 +128,9 @@ class AbstractBall(AbstractSpatialPart):
 class RollingSphere(AbstractBall, AbstractCompound):
     """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
-    **Arguments:** `radius` [m] > 0; `center` [m], shape (3,), of the sphere, fixed in the body, default the mass
-    centre; `point` [m] and `normal` (unit), shape (3,), of the plane in the world; `spin` [rad/s], of a turntable: the
-    rate at which the plane turns about its normal through `point`, default a plane at rest.
+    **Arguments:** `radius` [m] > 0; `center` [m], shape (3,), of the sphere, fixed in the body, default the origin of
+    the frame; `point` [m] and `normal` (unit), shape (3,), of the plane in the world; `spin` [rad/s], of a turntable:
+    the rate at which the plane turns about its normal through `point`, default a plane at rest.
     """
 
     spin: fields.Number = fields.parameter(unit="rad/s", optional=True)

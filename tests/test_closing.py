@@ -1,0 +1,121 @@
+"""Joints close as they were meant: with axes that point the same way, and in their thread."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import spatial
+from jaxmb.linalg.rotations import multiply, rotate
+
+UP = np.array([0.0, 0.0, 1.0])
+PITCH = 0.1
+
+
+def turn(axis, angle):
+    axis = np.asarray(axis) / np.linalg.norm(axis)
+    return np.append(np.cos(angle / 2), np.sin(angle / 2) * axis)
+
+
+def body(orientation=(1.0, 0.0, 0.0, 0.0), position=(0.3, 0.1, 0.2)):
+    return spatial.Body("body", mass=1.0, inertia=(0.1, 0.2, 0.25), position=position, orientation=orientation)
+
+
+JOINTS = {
+    "Revolute": spatial.Revolute,
+    "Cylindrical": spatial.Cylindrical,
+    "Planar": spatial.Planar,
+    "Screw": functools.partial(spatial.Screw, pitch=PITCH),
+}
+
+
+def scene(kind, orientation=(1.0, 0.0, 0.0, 0.0), **own):
+    own = {"point_a": (0.1, 0.0, 0.0), "point_b": (-0.3, 0.0, 0.0), "axis_a": UP, "axis_b": UP} | own
+    return mb.Scene([body(orientation)], joints=[JOINTS[kind]("joint", "ground", "body", **own)])
+
+
+@functools.cache
+def compiled(kind):
+    return scene(kind).compile()
+
+
+@eqx.filter_jit
+def closed(system, guesses):
+    """The configurations that are closest to guesses of the pose."""
+    rest = jnp.zeros(system.nu)
+    return jax.vmap(lambda q: mb.assemble(system, mb.State(q, rest), throw=False).q)(guesses)
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[] if kind in ("Revolute", "Screw") else pytest.mark.long) for kind in JOINTS]
+)
+def test_axes_close_the_same_way_from_guesses_tilted_past_a_right_angle(kind):
+    tilts = [(angle, axis) for angle in (80, 100, 140, 170, 179.9) for axis in ((1.0, 0.0, 0.0), (1.0, 2.0, 0.0))]
+    guesses = np.stack([np.append([0.3, 0.1, 0.2], turn(axis, np.deg2rad(angle))) for angle, axis in tilts])
+    q = closed(compiled(kind), jnp.asarray(guesses))
+    axes = jax.vmap(lambda p: rotate(p, UP))(q[:, 3:])
+    np.testing.assert_allclose(axes, np.tile(UP, (len(tilts), 1)), rtol=0, atol=1e-10)
+
+
+def test_a_screw_closes_in_its_thread():
+    x = np.array([1.0, 0.0, 0.0])
+    system = scene("Screw", point_a=(0.0, 0.0, 0.0), point_b=(0.0, 0.0, 0.0), offset=0.0, x_a=x, x_b=x).compile()
+    off = np.deg2rad([0.0, 20.0, 90.0, 100.0, 178.0, 180.0, 182.0, 260.0, 300.0, 340.0])
+    guesses = [np.append([0.0, 0.0, 0.02], multiply(turn(UP, a), turn(UP, 0.4 * np.pi))) for a in off]
+    q = closed(system, jnp.asarray(guesses))
+    heading, theta = jax.vmap(lambda p: rotate(p, x))(q[:, 3:]), 2 * np.pi * q[:, 2] / PITCH
+    np.testing.assert_allclose(heading[:, :2], np.stack([np.cos(theta), np.sin(theta)], 1), rtol=0, atol=1e-9)
+
+
+def test_a_scene_is_compiled_where_its_axes_agree():
+    tilt = turn((1.0, 0.0, 0.0), np.deg2rad(100))
+    system = scene("Revolute", tilt, point_a=(0.3, 0.1, 0.2), point_b=(0.0, 0.0, 0.0)).compile()
+    state = mb.assemble(system)
+    # The shortest turn that makes the axes parallel leads to the angle zero.
+    np.testing.assert_allclose(state.q[3:], [1.0, 0.0, 0.0, 0.0], rtol=0, atol=1e-9)
+    angle = system.joint_coordinates()["joint.angle"]
+    np.testing.assert_allclose(system.joint_coordinate(angle, 0.0, state.q), 0.0, rtol=0, atol=1e-9)
+
+
+@pytest.mark.long
+def test_derivatives_of_the_configuration_closest_to_a_tilted_guess():
+    tilt, point = turn((1.0, 0.0, 0.0), np.deg2rad(100)), np.array([0.1, 0.0, 0.0])
+    system = scene("Revolute", tilt, point_a=(0.3, 0.1, 0.2), point_b=(0.0, 0.0, 0.0)).compile()
+
+    def pose(x):
+        return mb.assemble(mb.with_parameters(system, {"joint.point_b": x}), throw=False).q
+
+    pose, at, along, h = jax.jit(pose), jnp.asarray(point), np.array([0.3, 1.0, -0.5]), 1e-5
+    forward = jax.jvp(pose, (at,), (along,))[1]
+    (reverse,) = jax.vjp(pose, at)[1](jnp.ones(7))
+    central = (pose(at + h * along) - pose(at - h * along)) / (2 * h)
+    np.testing.assert_allclose(forward, central, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(jnp.sum(forward), reverse @ along, rtol=1e-12)
+
+
+def test_axes_against_each_other_are_refused():
+    system = compiled("Revolute")
+    for angle in (np.pi, np.deg2rad(179.999), np.deg2rad(160)):
+        p = turn((1.0, 2.0, 0.0), angle)
+        q = jnp.append(jnp.array([0.1, 0.0, 0.0]) - rotate(jnp.asarray(p), jnp.array([-0.3, 0.0, 0.0])), p)
+        opposed = mb.State(q, jnp.zeros(6))
+        with pytest.raises(ValueError, match=r"violates the constraints joint \("):
+            mb.simulate(system, opposed, t1=0.1)
+    # Where the attitude is held there is no other one.
+    held = {f"body.e{k}": value for k, value in enumerate(p)}
+    with pytest.raises(ValueError, match=r"residuals remain in joint \("):
+        mb.assemble(system, opposed, fix=held)
+
+
+def test_a_prescribed_angle_is_met_and_not_its_opposite():
+    hinge = spatial.Revolute("joint", "ground", "body", point=(0.0, 0.0, 0.0), axis=UP)
+    x = {"axis_a": UP, "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
+    drive = spatial.Driver("drive", "ground", "body", quantity="angle", motion=lambda t, p: 2.0 + t, **x)
+    system = mb.Scene([body()], joints=[hinge, drive]).compile()
+    state = mb.assemble(system)
+    heading = rotate(state.q[3:], jnp.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(heading[:2], [np.cos(2.0), np.sin(2.0)], rtol=0, atol=1e-10)
