@@ -328,8 +328,9 @@ def _distance(a, b):
 @eqx.filter_jit
 def _between(system, interpolation, ts):
     # Before a jump a step ends at the number before it, and the next one starts at the number after it.
-    starts, direction = lax.stop_gradient((interpolation.ts, interpolation.direction))
-    beyond = direction * next_number(lax.stop_gradient(ts), direction)
+    starts, fixed = lax.stop_gradient((interpolation.ts, ts))
+    direction = jnp.asarray(interpolation.direction, fixed.dtype)
+    beyond = direction * next_number(fixed, direction)
     jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
     ts = after_jumps(ts, jumps, interpolation.t0, interpolation.t1)
     return jax.vmap(lambda t: project_normalized(system, t, interpolation.evaluate(t, left=False)))(ts)

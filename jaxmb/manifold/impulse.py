@@ -34,8 +34,8 @@ def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*
     """The next larger number, or smaller one for a direction of −1, as solvers have it that stop just before a jump:
     after zero the least normal number.
     """
-    least = direction * jnp.finfo(t.dtype).tiny
-    return jnp.where(t == 0, least, jnp.nextafter(t, direction * jnp.asarray(jnp.inf, t.dtype)))
+    sign = jnp.asarray(direction, t.dtype)
+    return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
 
 
 def after_jumps(
@@ -127,14 +127,14 @@ def _prescribed(system, q, t):
 def _least_smooth(system, q, starts, ends, count):
     """For all rows between all restarts how much they look like a jump, and the interval where they do so most."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
-    grid = starts[:, None] + (ends - starts)[:, None] * share
+    grid = starts[:, None] + (ends - starts)[:, None] * share[None]
     values = lax.map(lambda t: _prescribed(system, q, t), grid.reshape(-1), batch_size=_INTERVALS)
     values = values.reshape(*grid.shape, -1)
     changes = jnp.diff(values, axis=1)
     uneven = jnp.abs(jnp.diff(changes, n=2, axis=1))
     largest = jnp.max(jnp.abs(changes), axis=1)
     sizes = jnp.max(jnp.abs(values), axis=(0, 1))
-    visible = (largest > _VISIBLE * sizes) & (largest > _ROUNDED * jnp.max(sizes))
+    visible = (largest > _VISIBLE * sizes[None]) & (largest > _ROUNDED * jnp.max(sizes))
     likeness = jnp.where(visible, jnp.max(uneven, axis=1) / largest, 0.0)
     return likeness, jnp.argmax(uneven, axis=1) + 1
 

@@ -164,7 +164,7 @@ def _corrected(system, options, ts, saved, correction):
     finite = jnp.isfinite(ts)
     # Elsewhere something is corrected that has no failure and no derivative.
     at_start, start = lax.stop_gradient((options["t0"], options["y0"]))
-    inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0), saved, start)
+    inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0[None]), saved, start)
     corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, at_start), inside)
     lost = [jnp.any(~jnp.isfinite(y), axis=1) for y in jax.tree.leaves(corrected)]
     corrected = jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved)
