@@ -155,6 +155,7 @@ def test_jumps_that_are_refused(arm, case):
 # States between steps
 
 
+@pytest.mark.long
 def test_states_at_a_jump_are_those_after_it(arm):
     """Of a run over the jump, and of one back to its start, saved and between steps."""
     start = mb.assemble(arm, rates={"rod.angle": 0.0})
