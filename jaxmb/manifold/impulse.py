@@ -128,8 +128,7 @@ def _least_smooth(system, q, starts, ends, count):
     """For all rows between all restarts how much they look like a jump, and the interval where they do so most."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
     grid = starts[:, None] + (ends - starts)[:, None] * share[None]
-    values = lax.map(lambda t: _prescribed(system, q, t), grid.reshape(-1), batch_size=_INTERVALS)
-    values = values.reshape(*grid.shape, -1)
+    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, t)), grid)
     changes = jnp.diff(values, axis=1)
     uneven = jnp.abs(jnp.diff(changes, n=2, axis=1))
     largest = jnp.max(jnp.abs(changes), axis=1)

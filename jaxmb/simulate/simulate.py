@@ -96,10 +96,11 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is
-        `Adams`, which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how
-        many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion that is detected
-        to be stiff is simulated again from `t0` with `Hermite`; not under `jit`, `vmap` or `grad`.
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is `Adams`,
+        which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how many
+        steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. Counting takes some percent of a step. With
+        `"switch"` a motion that is detected to be stiff is simulated again from `t0` with `Hermite`; not under `jit`,
+        `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
         `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
