@@ -1,5 +1,7 @@
 """Drivers and forces with kinks and jumps that are announced."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -159,8 +161,8 @@ def test_jumps_that_are_refused(arm, case):
 def test_states_at_a_jump_are_those_after_it(arm):
     """Of a run over the jump, and of one back to its start, saved and between steps."""
     start = mb.assemble(arm, rates={"rod.angle": 0.0})
-    both = {"jumps": [WHEN], "rtol": 1e-9, "max_steps": 512}
-    saved = lambda *ts: {"saveat": diffrax.SaveAt(ts=jnp.array(ts), dense=True)}
+    both: Any = {"jumps": jnp.array([WHEN]), "rtol": 1e-9, "max_steps": 512}
+    saved: Any = lambda *ts: {"saveat": diffrax.SaveAt(ts=jnp.array(ts), dense=True)}
     forward = mb.simulate(arm, start, t1=END, **both, **saved(0.0, WHEN, END))
     end = jax.tree.map(lambda y: y[-1], forward.ys)
     back = mb.simulate(arm, end, t0=END, t1=0.0, **both, **saved(END, WHEN, 0.0))
@@ -170,12 +172,12 @@ def test_states_at_a_jump_are_those_after_it(arm):
     # Before the jump no impulse has turned the rod: its moment of momentum about the elbow is the same.
     before = after + MASS * A * B * np.cos(BEFORE * WHEN - angle) * (AFTER - BEFORE) / (INERTIA + MASS * B**2)
     for motion in (forward, back):
-        between = motion.at([np.nextafter(WHEN, 0.0), WHEN, np.nextafter(WHEN, 1.0)])
+        between = motion.at(jnp.array([np.nextafter(WHEN, 0.0), WHEN, np.nextafter(WHEN, 1.0)]))
         np.testing.assert_allclose(between.u[:, 5], [before, after, after], rtol=0, atol=1e-6)
         np.testing.assert_allclose(between.u[:, 2], [BEFORE, AFTER, AFTER], rtol=0, atol=1e-9)
         np.testing.assert_allclose(motion["rod"].angular_velocity[1], after, rtol=0, atol=1e-6)
         assert np.all(motion.constraint_violation.velocity < 1e-9)
-        assert np.all(np.isnan(motion.at(2 * END).q)) and np.all(np.isfinite(motion.at([0.0, END]).q))
+        assert np.all(np.isnan(motion.at(2 * END).q)) and np.all(np.isfinite(motion.at(jnp.array([0.0, END])).q))
 
 
 @pytest.mark.long
@@ -296,7 +298,7 @@ def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
     state = mb.assemble(system, fix={"pendulum.angle": 0.1}, rates={"pendulum.angle": 0.0})
     with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.5, .*jumps=\[0.5\]"):
         missed = mb.simulate(system, state, t1=1.0)
-    found = mb.simulate(system, state, t1=1.0, jumps=[0.5])["pendulum"].angle[-1]
+    found = mb.simulate(system, state, t1=1.0, jumps=jnp.array([0.5]))["pendulum"].angle[-1]
     field = lambda t, y: [y[1], -1.5 * G * np.sin(y[0])]
     angle, rate = solve_ivp(field, (0.0, 0.5), [0.1, 0.0], rtol=1e-12, atol=1e-13).y[:, -1]
     # The pin jumps by one metre a second: about it the moment of momentum of the pendulum changes.

@@ -46,7 +46,7 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
         saved, lost = _corrected(system, options, ts, saved, correction)
     if after is not times:
         ts = _replaced(ts, after, times)
-    end: Any = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
+    end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
