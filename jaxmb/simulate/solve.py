@@ -166,6 +166,8 @@ def _corrected(system, options, ts, saved, correction):
     at_start, start = lax.stop_gradient((options["t0"], options["y0"]))
     inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0[None]), saved, start)
     corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, at_start), inside)
-    lost = [jnp.any(~jnp.isfinite(y), axis=1) for y in jax.tree.leaves(corrected)]
-    corrected = jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved)
-    return corrected, jnp.any(functools.reduce(jnp.logical_or, lost) & finite)
+    is_known = lambda y: functools.reduce(
+        jnp.logical_and, [jnp.all(jnp.isfinite(x), axis=1) for x in jax.tree.leaves(y)]
+    )
+    lost = jnp.any(is_known(inside) & ~is_known(corrected))
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved), lost
