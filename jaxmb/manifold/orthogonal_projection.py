@@ -114,8 +114,8 @@ def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Ar
 
         unknown = jnp.zeros((), start.dtype)
         x, _, failed = chord(correct, start, first=unknown, tol=64 * eps, most=_CHORDS, rounding=eps**0.5)
-        # The derivative at a root that was not found would not be finite. A flag has a derivative of another type, which
-        # JAX does not give it here.
+        # The derivative at a root that was not found would not be finite. The flag is a number, since JAX gives a truth
+        # value no tangent of the right type here.
         return jnp.where(failed, start, x), failed.astype(x.dtype)
 
     x, failed = lax.custom_root(residual, start, solve, solve_linear, has_aux=True)
