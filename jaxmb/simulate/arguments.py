@@ -19,7 +19,7 @@ from ..system import AbstractSystem
 from ..system.arguments import check_kind, real_array
 from ..system.parameters import parameters
 
-_RTOL = 1e-8
+DEFAULT_RTOL = 1e-8
 
 KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
@@ -75,7 +75,6 @@ def named_solver(name: str, state: State) -> Adams:
 def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     dtype = state.q.dtype
     least = 10 * float(jnp.finfo(dtype).eps)
-    whose, rtol = ("The default rtol", _RTOL) if rtol is None else ("rtol", rtol)
     relative = real_array("rtol", rtol, dtype)
     size = sum(x.size for x in jax.tree.leaves(state))
     absolute = None if atol is None else real_array("atol", atol, dtype, ((), (size,)))
@@ -85,6 +84,7 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     if not is_traced(relative) and relative < least:
         if dtype != jnp.float32:
             raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
+        whose = "The default rtol" if rtol == DEFAULT_RTOL else "rtol"
         warnings.warn(
             f"{whose}={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
             'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',

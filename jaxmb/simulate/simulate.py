@@ -27,6 +27,7 @@ from ..system.inputs import Signals, check_inputs, input_break_times, with_input
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .arguments import (
+    DEFAULT_RTOL,
     KINDS,
     check_error_estimate,
     checked_jumps,
@@ -58,7 +59,7 @@ def simulate(
     solver: diffrax.AbstractSolver | Literal["auto", "switch"] | None = None,
     formulation: AbstractFormulation | None = None,
     manifold: AbstractManifold | None = None,
-    rtol: Scalar | None = None,
+    rtol: Scalar = DEFAULT_RTOL,
     atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -79,16 +80,16 @@ def simulate(
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
     - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
         `Trajectory.at(t)`.
-    - `rtol`, `atol`: tolerances; `rtol` is 1e-8 by default. `Adams` and `Hermite` let a step err by a twentieth of
-        them, as errors add up: the error of the result, relative to the largest coordinates and velocities, is then
-        mostly below `rtol`; some ten times `rtol` over many periods, more where neighbouring motions part quickly, and
-        about the same as that of `diffrax.Dopri8()`; `error=True` estimates it. Near rounding the part grows, up to all
-        of it: steps are not asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth
-        of `rtol`, times the largest coordinate (in units of the machine's size, or radians) and the largest velocity so
-        far, so that the units do not matter and slow or small motions are as accurate as others; internal states count
-        by kinds, each with its largest value, at least 1e-4 of its typical size. A number is in SI units; it may be a
-        vector of one for each coordinate, velocity and internal state, (nq + nu + nz,): where stiff springs vibrate too
-        little to matter in positions, a coarser one for velocities saves most of the steps of `Hermite`.
+    - `rtol`, `atol`: tolerances. `Adams` and `Hermite` let a step err by a twentieth of them, as errors add up: the
+        error of the result, relative to the largest coordinates and velocities, is then mostly below `rtol`; some ten
+        times `rtol` over many periods, more where neighbouring motions part quickly, and about the same as that of
+        `diffrax.Dopri8()`; `error=True` estimates it. Near rounding the part grows, up to all of it: steps are not
+        asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
+        largest coordinate (in units of the machine's size, or radians) and the largest velocity so far, so that the
+        units do not matter and slow or small motions are as accurate as others; internal states count by kinds, each
+        with its largest value, at least 1e-4 of its typical size. A number is in SI units; it may be a vector of one
+        for each coordinate, velocity and internal state, (nq + nu + nz,): where stiff springs vibrate too little to
+        matter in positions, a coarser one for velocities saves most of the steps of `Hermite`.
 
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
         of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where
