@@ -12,8 +12,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "`throw=False` the motion up to there is kept."
     )
     newton_failed = (
-        "Newton's method for the dependent coordinates failed however small the step: constraints whose derivatives "
-        "are not smooth, or numbers that are not finite. With `throw=False` the motion up to there is kept."
+        "Newton's method found no state on the constraints, however small the step: constraints whose derivatives are "
+        "not smooth or that cannot be met, or numbers that are not finite. Where no error estimate shortens the steps, "
+        "or where states are interpolated between them, the steps may be too long. With `throw=False` the motion up to "
+        "there is kept."
     )
     inconsistent_constraints = (
         "Constraint rows that others implied when the system was compiled are violated along the motion: they "

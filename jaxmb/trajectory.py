@@ -10,13 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
-from .manifold import project_normalized
+from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import unknown
 from .system import Reaction, Solved
 from .system.violation import row_sizes
@@ -130,6 +131,10 @@ class Trajectory(eqx.Module):
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
         same times of every member.
+
+        At a jump that was announced to `simulate` velocities are those after it, as in states that are saved; those
+        before it are at the time `numpy.nextafter(t, -numpy.inf)`. Where Newton's method finds no state on the
+        constraints, as between steps that are too long, and outside of the run, the state is not a number.
         """
         if self.interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
@@ -326,7 +331,13 @@ def _distance(a, b):
 
 @eqx.filter_jit
 def _between(system, interpolation, ts):
-    return jax.vmap(lambda t: project_normalized(system, t, interpolation.evaluate(t)))(ts)
+    # Before a jump a step ends at the number before it, and the next one starts at the number after it.
+    starts, fixed = lax.stop_gradient((interpolation.ts, ts))
+    direction = jnp.asarray(interpolation.direction, fixed.dtype)
+    beyond = direction * next_number(fixed, direction)
+    jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
+    ts = after_jumps(ts, jumps, interpolation.t0, interpolation.t1)
+    return jax.vmap(lambda t: project_normalized(system, t, interpolation.evaluate(t, left=False)))(ts)
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:

@@ -235,10 +235,11 @@ def test_nothing_to_solve_implicitly():
 
 def test_single_precision_warns(pendulum):
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, pendulum)
-    with jax.enable_x64(False), pytest.warns(UserWarning, match=r"single precision.*jax_enable_x64"):
-        state = mb.State(jnp.array([0.5, 0.0, 0.0]), jnp.zeros(3))
-        sol = mb.simulate(single, state, t1=0.1, rtol=1e-10)
-    assert sol.ys.q.dtype == jnp.float32 and np.all(np.isfinite(sol.ys.q))
+    for whose, options in (("^rtol=1e-10", {"rtol": 1e-10}), ("^The default rtol=1e-08", {})):
+        with jax.enable_x64(False), pytest.warns(UserWarning, match=rf"{whose} .*single precision.*jax_enable_x64"):
+            state = mb.State(jnp.array([0.5, 0.0, 0.0]), jnp.zeros(3))
+            sol = mb.simulate(single, state, t1=0.1, **options)
+        assert sol.ys.q.dtype == jnp.float32 and np.all(np.isfinite(sol.ys.q))
 
 
 def steady_turn(t, p):
@@ -295,7 +296,11 @@ ARGUMENTS = {
         {"solver": mb.solvers.Adams},
         r"solver must be an object .*Adams\(\).*the class Adams",
     ),
-    "solver by a name": ({"solver": "adams"}, "solver must be an object, or one of the words 'auto' and 'switch'"),
+    "solver by a name": (
+        {"solver": "rk45"},
+        r"solver must be an object, such as jaxmb.solvers.Adams\(\), jaxmb.solvers.Hermite\(\) or diffrax.Tsit5\(\), "
+        "or one of the words 'auto' and 'switch'; got 'rk45'",
+    ),
     "number as a solver": ({"solver": 3}, "solver must be .*got 3"),
     "name of a manifold": ({"manifold": "partition"}, r"manifold must be .*Partition\(\), got 'partition'"),
     "class of a manifold": ({"manifold": mb.manifold.Partition}, "manifold must be .*the class Partition"),

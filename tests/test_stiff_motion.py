@@ -249,6 +249,20 @@ def test_auto_leaves_other_motions_to_adams(solver):
     np.testing.assert_allclose(found.ys.q, plain.ys.q, rtol=1e-9)
 
 
+@pytest.mark.long
+def test_the_error_of_too_few_steps_says_whether_a_motion_is_stiff():
+    """By some more steps with Adams' method, also where a Runge–Kutta method took the others."""
+    stiff, other = library("stiff_four_bar"), library("four_bar")
+    run = lambda mechanism, **options: mb.simulate(mechanism.system, mechanism.state, rtol=1e-6, **options)
+    where = r"came to t = 0\.0\d+ of 0.1 in max_steps = 400 steps, with steps of about \S+ in the end"
+    with pytest.raises(RuntimeError, match=rf"{where}. It is stiff there.*solver=jaxmb.solvers.Hermite\(\)"):
+        run(stiff, t1=0.1, max_steps=400)
+    with pytest.raises(RuntimeError, match=rf"{where}. It is stiff there.*solver=jaxmb.solvers.Hermite\(\)"):
+        run(stiff, t1=0.1, max_steps=400, solver=diffrax.Tsit5())
+    with pytest.raises(RuntimeError, match=r"max_steps = 256 steps.*in the end. A larger max_steps or a coarser rtol"):
+        run(other, t1=1e3, max_steps=256)
+
+
 def test_bad_words():
     mechanism = library("four_bar")
     with pytest.raises(ValueError, match="'auto' and 'switch'"):

@@ -2,7 +2,7 @@
 
 from .baumgarte import Baumgarte as Baumgarte
 from .default import default_manifold as default_manifold
-from .impulse import find_jump as find_jump
+from .impulse import after_jumps as after_jumps, find_jumps as find_jumps, next_number as next_number
 from .internal_states import with_internal_states as with_internal_states
 from .manifold import AbstractManifold as AbstractManifold
 from .orthogonal_projection import project as project, project_normalized as project_normalized

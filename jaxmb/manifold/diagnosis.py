@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -14,6 +15,9 @@ from ..formulations.friction import contracts
 from ..linalg.elimination import full_pivot
 from ..system import AbstractSystem
 
+# Result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a run
+# only where no error estimate shortens the step.
+NOT_PROJECTED: Any = diffrax.RESULTS.nonlinear_max_steps_reached
 # A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
 _SINGULAR_PIVOT = 1e-3
 # The same for the coupling of friction with its own reactions, which it is this close to a singular one.
@@ -23,8 +27,8 @@ _SINGULAR_COUPLING = 1e-3
 def diagnose(
     system: AbstractSystem, t: Scalar, y: State, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]
 ) -> Any:
-    """Tell singular configurations, and failures of Newton's method, from other failures of a simulation on independent
-    coordinates.
+    """Tell singular configurations, and failures of Newton's method, from other failures of a simulation whose steps
+    end on the constraints.
 
     **Arguments:** `t`, `y`: the last state; `singular`: whether the chart there has lost rank already; `result`: a
     `RESULTS`; `failed`: whether it is a failure.
@@ -37,11 +41,17 @@ def diagnose(
         pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), level=row_levels(system))
         return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
-    pivot = lax.cond(failed, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
+    known = failed & jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.u))
+    pivot = lax.cond(known, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
     singular = failed & ((pivot < _SINGULAR_PIVOT) | singular)
-    newton = failed & ~singular & (result == RESULTS.dt_min_reached)
     result = RESULTS.where(singular, RESULTS.singular_configuration, result)
-    return RESULTS.where(newton, RESULTS.newton_failed, result)
+    return diagnose_newton(result, failed & ~singular)
+
+
+def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
+    """Tell failures of Newton's method from others; arguments as in `diagnose`."""
+    unsolved = (result == RESULTS.dt_min_reached) | (result == RESULTS.promote(NOT_PROJECTED))
+    return RESULTS.where(failed & unsolved, RESULTS.newton_failed, result)
 
 
 def diagnose_friction(

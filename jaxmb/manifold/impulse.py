@@ -1,12 +1,14 @@
 """Jumps of prescribed rates: the velocities after them, and a search for them."""
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, State
 from ..linalg.elimination import solve_positive
@@ -14,10 +16,42 @@ from ..system import AbstractSystem
 from ..system.padded_rows import binding_velocities, velocity_rows
 from .orthogonal_projection import independent_rows
 
-# A jump is looked for in this number of intervals, and the one chosen is halved so often.
-_INTERVALS, _HALVINGS = 256, 32
-# Variations smaller than this fraction of the largest value are not looked at.
-_VISIBLE = 1e-6
+# Jumps are looked for in this number of intervals in all, and in no fewer between two restarts.
+_INTERVALS, _FEWEST = 256, 16
+# Each row's least smooth place between two restarts is followed; of more places than this, those that look most like
+# jumps. The program follows some at once.
+_PLACES, _AT_ONCE = 64, 8
+# A place is divided into this number of parts, and three of them are left, this number of times: down to rounding.
+_PARTS, _ROUNDS = 8, 38
+# Variations smaller than these fractions of the largest value, of their row and of all rows, are not looked at.
+_VISIBLE, _ROUNDED = 1e-6, 1e-11
+# At a jump the second difference of the changes is at least this fraction of the largest change, and this fraction of
+# that is left in the end; of a smooth function next to nothing is.
+_UNEVEN, _LEFT = 0.02, 0.01
+
+
+def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
+    """The next larger number, or smaller one for a direction of −1, as solvers have it that stop just before a jump:
+    after zero the least normal number.
+    """
+    sign = jnp.asarray(direction, t.dtype)
+    return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
+
+
+def after_jumps(
+    t: Float[Array, "*batch"], jumps: Float[Array, "jumps"], t0: Scalar, t1: Scalar
+) -> Float[Array, "*batch"]:
+    """Times of a run from `t0` to `t1`, those at jumps replaced by the next number, and its last by the one before it;
+    the derivative is one.
+
+    They are then on the same side of a jump as the states of a solver that stops just before and restarts just after.
+    """
+    fixed = lax.stop_gradient(t)
+    at_jump = jnp.isin(fixed, jumps, method="binary_search")
+    # A run without a step has one time only.
+    at_end = (fixed == jnp.maximum(t0, t1)) & (t0 != t1)
+    moved = jnp.where(at_end, next_number(fixed, -1), jnp.where(at_jump, next_number(fixed, 1), fixed))
+    return t + (moved - fixed)
 
 
 def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
@@ -41,41 +75,88 @@ def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
     return dataclasses.replace(y, u=u)
 
 
-def find_jump(
-    system: AbstractSystem, q: Float[Array, "nq"], t0: Scalar, t1: Scalar
-) -> tuple[Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-    """Look for a time between two others at which a prescribed rate, or its derivative, jumps.
-
-    Of all rows that with the largest share of its variation in one of many equal intervals is followed into the half
-    that varies more, again and again: a smooth function varies less and less, one that jumps as before.
-
-    **Returns:** the time, the number of the row among those of ψ and of A one after the other, and whether it jumps.
+class Jump(NamedTuple):
+    """A jump of a prescribed rate or of its derivative: the first time after it [s], in the precision of the state, and
+    the number of the `row`, among those of ψ and of A one after the other.
     """
-    return _find_jump(system, q, jnp.asarray(t0, q.dtype), jnp.asarray(t1, q.dtype))
+
+    t: np.floating
+    row: int
+
+
+def find_jumps(
+    system: AbstractSystem, q: Float[Array, "nq"], t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
+) -> list[Jump]:
+    """Look for times between two others at which prescribed rates, or their derivatives, jump.
+
+    Each row is looked at between each two neighbouring `restarts`. Where its changes in equal intervals are least even
+    is followed into the parts where they remain so, again and again: a smooth function becomes even, one that jumps
+    does not. At most one jump of a row is found between two restarts.
+    """
+    dtype = q.dtype
+    first, last = sorted((np.asarray(t0, dtype), np.asarray(t1, dtype)))
+    inside = np.unique(np.asarray(restarts, dtype))
+    inside = inside[(inside > first) & (inside < last)]
+    # A restart is no part of the intervals beside it.
+    starts = np.append(first, np.nextafter(inside, np.array(np.inf, dtype)))
+    ends = np.append(np.nextafter(inside, np.array(-np.inf, dtype)), last)
+    count = max(_INTERVALS // starts.size, _FEWEST)
+    likeness, k = (np.asarray(x) for x in _least_smooth(system, q, starts, ends, count))
+    between, rows = np.nonzero(likeness > _UNEVEN)
+    order = np.argsort(-likeness[between, rows], kind="stable")[:_PLACES]
+    between, rows = between[order], rows[order]
+    width = (ends[between] - starts[between]) / count
+    at = starts[between] + k[between, rows] * width
+    a, b = np.maximum(at - width, starts[between]), np.minimum(at + 2 * width, ends[between])
+    found = []
+    for n in range(0, rows.size, _AT_ONCE):
+        several = slice(n, n + _AT_ONCE)
+        own = [np.resize(x[several], _AT_ONCE) for x in (a.astype(dtype), b.astype(dtype), rows)]
+        times, jumps = (np.asarray(x)[: rows[several].size] for x in _followed(system, q, *own))
+        found += [Jump(t, int(row)) for t, jump, row in zip(times, jumps, rows[several], strict=True) if jump]
+    return sorted(found)
+
+
+def _prescribed(system, q, t):
+    """What ψ and A have where nothing moves."""
+    rest = jnp.zeros(system.nu, q.dtype)
+    return jnp.concatenate([system.velocity_residual(t, q, rest), system.acceleration_residual(t, q, rest, rest)])
 
 
 @eqx.filter_jit
-def _find_jump(system, q, t0, t1):
-    rest = jnp.zeros(system.nu, q.dtype)
+def _least_smooth(system, q, starts, ends, count):
+    """For all rows between all restarts how much they look like a jump, and the interval where they do so most."""
+    share = jnp.arange(count + 1, dtype=q.dtype) / count
+    grid = starts[:, None] + (ends - starts)[:, None] * share[None]
+    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, t)), grid)
+    changes = jnp.diff(values, axis=1)
+    uneven = jnp.abs(jnp.diff(changes, n=2, axis=1))
+    largest = jnp.max(jnp.abs(changes), axis=1)
+    sizes = jnp.max(jnp.abs(values), axis=(0, 1))
+    visible = (largest > _VISIBLE * sizes[None]) & (largest > _ROUNDED * jnp.max(sizes))
+    likeness = jnp.where(visible, jnp.max(uneven, axis=1) / largest, 0.0)
+    return likeness, jnp.argmax(uneven, axis=1) + 1
 
-    def prescribed(t):
-        return jnp.concatenate([system.velocity_residual(t, q, rest), system.acceleration_residual(t, q, rest, rest)])
 
-    grid = jnp.linspace(t0, t1, _INTERVALS + 1)
-    values = jax.vmap(prescribed)(grid)
-    changes = jnp.abs(jnp.diff(values, axis=0))
-    visible = jnp.max(changes, axis=0) > _VISIBLE * jnp.max(jnp.abs(values))
-    share = jnp.where(visible, jnp.max(changes, axis=0) / jnp.sum(changes, axis=0), 0.0)
-    row = jnp.argmax(share)
-    k = jnp.argmax(changes[:, row])
+@eqx.filter_jit
+def _followed(system, q, starts, ends, rows):
+    """The times at which rows jump between others, and whether they do."""
+    share = jnp.arange(_PARTS + 1, dtype=q.dtype) / _PARTS
 
-    def halve(_, ends):
-        a, b = ends
-        middle = 0.5 * (a + b)
-        first, second, third = jax.vmap(prescribed)(jnp.stack([a, middle, b]))[:, row]
-        left = jnp.abs(second - first) > jnp.abs(third - second)
-        return jnp.where(left, a, middle), jnp.where(left, middle, b)
+    def follow(a, b, row):
+        def values(a, b):
+            grid = a + (b - a) * share
+            return grid, jax.vmap(lambda t: _prescribed(system, q, t)[row])(grid)
 
-    a, b = lax.fori_loop(0, _HALVINGS, halve, (grid[k], grid[k + 1]))
-    left = jnp.abs(prescribed(b)[row] - prescribed(a)[row])
-    return b, row, visible[row] & (left > 0.5 * changes[k, row])
+        def narrow(_, ends):
+            grid, own = values(*ends)
+            k = jnp.argmax(jnp.abs(jnp.diff(own, n=3)))
+            return grid[k], grid[k + 3]
+
+        largest = jnp.max(jnp.abs(jnp.diff(values(a, b)[1])))
+        grid, own = values(*lax.fori_loop(0, _ROUNDS, narrow, (a, b)))
+        left = jnp.abs(jnp.diff(own))
+        k = jnp.argmax(left)
+        return grid[k + 1], left[k] > _LEFT * largest
+
+    return jax.vmap(follow)(starts, ends, rows)

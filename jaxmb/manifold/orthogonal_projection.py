@@ -19,13 +19,20 @@ from .._types import Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
-from ..linalg.newton import chord, newton, root
+from ..linalg.newton import chord, solve_linear
 from ..system import AbstractSystem
 from ..system.displacement import displaced
 from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
 from .manifold import normalize_state
 
 _ITERATIONS = 8
+# The chord method of `project` may converge slowly where a step is long and no error estimate shortens it.
+_CHORDS = 32
+# Newton's method ends with a correction that is not measured, so the one before may be of this power of eps.
+_MEASURED = 0.6
+# The last measured correction of velocities that constraints are not linear in, relative to the speed, as a power of
+# eps: the error that is left is of the size of its square.
+_MEASURED_SPEED = 0.4
 
 
 def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
@@ -35,32 +42,54 @@ def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
 
 def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order where the
-    Jacobian is one dense matrix.
+    Jacobian is one dense matrix. Where Newton's method fails the state and its derivatives are not a number.
     """
+    found, failed = projected(system, t, y)
+    factor = jnp.where(failed, jnp.nan, 1.0)
+    return jax.tree.map(lambda x: x * factor.astype(x.dtype), found)
+
+
+def projected(system: AbstractSystem, t: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
+    """The state that `project` reaches, and whether Newton's method failed; a state that was not found has no meaning,
+    and finite derivatives.
+    """
+    eps = jnp.finfo(y.q.dtype).eps
     if system.elimination is not None:
-        t, tol = jnp.asarray(t, y.q.dtype), 64 * jnp.finfo(y.q.dtype).eps
+        t, tol = jnp.asarray(t, y.q.dtype), eps**_MEASURED
         metric_of = lambda system, t, y: DiagonalInertia(1 / system.velocity_scale() ** 2)
-        return project_in_metric(system, t, y, metric_of, None, tol)[0]
-    q = y.q
+        found, _, _, failed = project_in_metric(system, t, y, metric_of, None, tol)
+        return found, failed | ~_is_finite(found)
+    q, failed = y.q, jnp.array(False)
     if system.coordinate_rank > 0:
         t = jnp.asarray(t, q.dtype)
-        square = system.coordinate_scale() ** 2
+        scale = system.coordinate_scale()
         jacobian = system.coordinate_jacobian(t, q)
-        rows = independent_rows(jacobian, system.coordinate_scale(), system.coordinate_rank)
-        ahead = jacobian[rows] * square[None, :]
+        rows = independent_rows(jacobian, scale, system.coordinate_rank)
+        ahead = jacobian[rows] * (scale**2)[None, :]
         gram = ahead @ jacobian[rows].T
         moved = lambda multipliers: q - ahead.T @ multipliers
         residual = lambda multipliers: system.coordinate_residual(t, moved(multipliers))[rows]
-        q = moved(_multipliers(residual, gram))
+        multipliers, failed = _multipliers(residual, gram, ahead / scale[None, :])
+        q = moved(multipliers)
     u = y.u
     if system.velocity_rank > 0:
-        square = system.velocity_scale() ** 2
-        for _ in range(1 if system.linear else 3):
+        scale = system.velocity_scale()
+        change, passes = u, 1 if system.linear else 3
+        for _ in range(passes):
             jacobian = system.velocity_jacobian(t, q, u)
-            rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)
-            ahead = jacobian[rows] * square[None, :]
-            u = u - ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
-    return dataclasses.replace(y, q=q, u=u)
+            rows = independent_rows(jacobian, scale, system.velocity_rank)
+            ahead = jacobian[rows] * (scale**2)[None, :]
+            change = ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
+            u = u - change
+        if not system.linear:
+            size = lambda u: jnp.max(jnp.abs(u) / scale)
+            failed = failed | ~(size(change) <= eps**_MEASURED_SPEED * size(u))
+    found = dataclasses.replace(y, q=q, u=u)
+    return found, failed | ~_is_finite(found)
+
+
+def _is_finite(y: State) -> Bool[Array, ""]:
+    return jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.u))
 
 
 def independent_rows(jacobian: Array, scale: Array, rank: int) -> Any:
@@ -68,20 +97,29 @@ def independent_rows(jacobian: Array, scale: Array, rank: int) -> Any:
     return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
 
 
-def _multipliers(residual, gram: Array) -> Array:
-    """The root of the residual, by the chord method from zero multipliers."""
+def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Array, ""]]:
+    """The root of the residual, by the chord method from zero multipliers, and whether it failed; then they are zero.
+
+    **Arguments:** `gram`: the derivative of the residual at zero, with the other sign; `unscaled`: the displacement of
+    the coordinates that the multipliers make, in scales of the coordinates.
+    """
     start = jnp.zeros(gram.shape[0], gram.dtype)
-    gram = lax.stop_gradient(gram)
+    gram, unscaled = lax.stop_gradient((gram, unscaled))
+    eps = jnp.finfo(gram.dtype).eps
 
     def solve(residual, start):
         def correct(x):
             step = solve_positive(gram, residual(x))  # the residual falls as the multipliers grow
-            return x + step, jnp.max(jnp.abs(step))
+            return x + step, jnp.max(jnp.abs(unscaled.T @ step))
 
-        far = lambda x, size: size > 64 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=1e-8)
-        return newton(correct, far, start, most=_ITERATIONS, dtype=start.dtype)[0]
+        unknown = jnp.zeros((), start.dtype)
+        x, _, failed = chord(correct, start, first=unknown, tol=64 * eps, most=_CHORDS, rounding=eps**0.5)
+        # The derivative at a root that was not found would not be finite. The flag is a number, since JAX gives a truth
+        # value no tangent of the right type here.
+        return jnp.where(failed, start, x), failed.astype(x.dtype)
 
-    return root(residual, start, solve)
+    x, failed = lax.custom_root(residual, start, solve, solve_linear, has_aux=True)
+    return x, lax.stop_gradient(failed) > 0
 
 
 def project_in_metric(
@@ -157,4 +195,8 @@ def _by_newton(projector_at, correction, moved, start, tol):
     q, _, projector, _, left, k = lax.while_loop(
         proceed, advance, (start.q, jnp.zeros_like(start.u), empty, far, far, jnp.array(0))
     )
-    return q, projector, k, ~(left <= tol)
+    failed = ~(left <= tol)
+    # Derivatives at a root that was not found would not be finite.
+    q = jnp.where(failed, start.q, q)
+    projector = jax.tree.map(lambda x: jnp.where(failed, jnp.ones((), x.dtype), x), projector)
+    return q, projector, k, failed

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -21,10 +22,11 @@ from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractSystem
 from ..system.padded_rows import binding_velocities
 from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
+from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
 from .motion_jacobian import motion_jacobian
-from .orthogonal_projection import project, project_in_metric, project_normalized
+from .orthogonal_projection import project_in_metric, project_normalized, projected
 from .restoration import SolvedState, restore_near
 from .vector_field import VectorField
 
@@ -98,6 +100,11 @@ class Projection(AbstractManifold):
         return {}
 
     def diagnose(self, system, t, y, solver_state, result, failed):
+        if system.elimination is None:
+            result = diagnose(system, t, y, jnp.array(False), result, failed)
+        elif system.velocity_rows:
+            # The rank of constraints that are eliminated along the graph of joints is not looked at.
+            result = diagnose_newton(result, failed)
         if not drops_rows(system):
             return result
         violated = _violated(*lax.stop_gradient((system, t, y)))
@@ -241,7 +248,13 @@ class ProjectedSolver(WrappedSolver):
             y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction
-        y1 = project(self.system, t1, y1)
+        y1, failed = projected(self.system, t1, y1)
+        # Of a step whose end was not found nothing is known, so that its error is infinite; where no error estimate
+        # shortens it, the run ends with it.
+        unknown = lambda x: jnp.where(failed, jnp.nan, x) if eqx.is_inexact_array(x) else x
+        y1, dense_info = jax.tree.map(unknown, (y1, dense_info))
+        error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), error)
+        result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
         if drops_rows(self.system):
             # diffrax forgets the result of a step that is rejected.
             violated = _violated(*lax.stop_gradient((self.system, t1, y1)))

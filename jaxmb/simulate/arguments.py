@@ -19,6 +19,8 @@ from ..system import AbstractSystem
 from ..system.arguments import check_kind, real_array
 from ..system.parameters import parameters
 
+DEFAULT_RTOL = 1e-8
+
 KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
     "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
@@ -58,7 +60,10 @@ def parameter_changes(system: AbstractSystem, direction: Mapping[str, VectorLike
 
 def named_solver(name: str, state: State) -> Adams:
     if name not in ("auto", "switch"):
-        raise ValueError(f"solver must be an object, or one of the words 'auto' and 'switch'; got {name!r}.")
+        raise ValueError(
+            "solver must be an object, such as jaxmb.solvers.Adams(), jaxmb.solvers.Hermite() or diffrax.Tsit5(), or "
+            f"one of the words 'auto' and 'switch'; got {name!r}."
+        )
     if name == "switch" and is_traced(state):
         raise ValueError(
             "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
@@ -79,8 +84,9 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     if not is_traced(relative) and relative < least:
         if dtype != jnp.float32:
             raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
+        whose = "The default rtol" if rtol == DEFAULT_RTOL else "rtol"
         warnings.warn(
-            f"rtol={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
+            f"{whose}={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
             'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
             stacklevel=3,
         )

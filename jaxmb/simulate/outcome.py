@@ -1,7 +1,7 @@
 """How a simulation ended: whether it failed, why, and warnings."""
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -9,8 +9,27 @@ import numpy as np
 from .._results import RESULTS
 from ..formulations.friction import coupled_most
 from ..linalg.arrays import is_traced
-from ..manifold import find_jump
+from ..manifold import find_jumps
+from ..solvers import Adams
 from ..states.consistency import contradiction
+
+# Stiffness is not looked for after fewer steps than this, and found in this number.
+_ENOUGH, _LOOKED = 200, 256
+
+
+class Outcome(NamedTuple):
+    """How a simulation ended, beside its `Trajectory`.
+
+    **Fields:** whether it `failed`; the last time `t` and state `y`; `step`: the length of the next step, None where
+    the controller does not tell; `coupling` of friction with its own reactions where that is the reason of a failure,
+    None without friction.
+    """
+
+    failed: Any
+    t: Any
+    y: Any
+    step: Any
+    coupling: Any
 
 
 def about_friction(system, coupling) -> str:
@@ -27,21 +46,65 @@ def has_failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
 
 
-def warn_of_jumps(system, q, t0, t1) -> None:
-    t, row, found = find_jump(system, q, t0, t1)
-    if found:
-        # The rows of ψ, then those of A.
-        name = (*system.rows[: system.velocity_rows], *system.rows)[int(row)][0]
-        warnings.warn(
-            f"The motion that {name!r} prescribes has a jump or a kink at t = {float(t):.6g}, which an integration "
-            f"passes without an impulse or in many steps; simulate(..., jumps=[{float(t):.6g}]) restarts there.",
-            stacklevel=3,
+def warn_of_jumps(system, q, t0, t1, restarts, announced) -> None:
+    """Warn of jumps of prescribed rates between restarts; `announced` are those that the user gave, or None."""
+    found = find_jumps(system, q, t0, t1, np.zeros(0) if restarts is None else restarts)
+    if not found:
+        return
+    # The rows of ψ, then those of A.
+    rows = (*system.rows[: system.velocity_rows], *system.rows)
+    names = " and ".join(dict.fromkeys(repr(rows[jump.row][0]) for jump in found))
+    times = list(dict.fromkeys(jump.t for jump in found))
+    known = [] if announced is None else list(np.asarray(announced, times[0].dtype))
+    every = ", ".join(str(t) for t in sorted({*known, *times}))
+    warnings.warn(
+        f"The motion that {names} prescribes has a jump or a kink at t = {' and '.join(str(t) for t in times)}, which "
+        "an integration passes without an impulse or in many steps; "
+        f"simulate(..., jumps=[{every}]) restarts there.",
+        stacklevel=3,
+    )
+
+
+def about_steps(outcome: Outcome, t1, stats, stiff) -> str:
+    """How far a motion came in the largest number of steps, and what takes it further.
+
+    **Arguments:** `stiff`: whether it is stiff at its end, None where that is not known, and False with a solver for
+    stiff motions.
+    """
+    steps = int(stats["num_steps"])
+    length = "" if outcome.step is None else f", with steps of about {abs(float(outcome.step)):.2g} in the end"
+    text = f"The motion came to t = {float(outcome.t):.6g} of {float(t1):.6g} in max_steps = {steps} steps{length}. "
+    if stiff:
+        return text + (
+            "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
+            "takes longer ones."
         )
+    more = "A larger max_steps or a coarser rtol takes it further"
+    if stiff is None:
+        more += (
+            '; or it may be stiff, which solver="auto" detects: solver=jaxmb.solvers.Hermite() then takes longer steps'
+        )
+    return text + more + "."
 
 
-def reason_of_failure(system, result, t1, t, y) -> str:
+def is_stiff_at_end(probe, stats, solver) -> bool | None:
+    """Whether a motion that took the largest number of steps is stiff where it stopped; None where too few of them
+    were taken to tell.
+
+    **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most this number of steps.
+    """
+    if getattr(solver, "solves_implicitly", False):
+        return False
+    if "stiff" in stats:
+        return bool(stats["stiff"])
+    if stats["num_steps"] < _ENOUGH:
+        return None
+    return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
+
+
+def reason_of_failure(system, result, t1, outcome: Outcome) -> str:
     """Why a simulation ended at a state, in one line, with what is not finite there or just beyond."""
-    text = RESULTS[result]
+    text, t, y = RESULTS[result], outcome.t, outcome.y
     if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate(jax.tree.leaves(y)))):
         return text
     if result == RESULTS.inconsistent_constraints:

@@ -11,6 +11,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
@@ -26,6 +27,7 @@ from ..system.inputs import Signals, check_inputs, input_break_times, with_input
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .arguments import (
+    DEFAULT_RTOL,
     KINDS,
     check_error_estimate,
     checked_jumps,
@@ -37,7 +39,7 @@ from .arguments import (
     parameter_changes,
     with_end,
 )
-from .outcome import about_friction, reason_of_failure, warn_of_jumps
+from .outcome import about_friction, about_steps, is_stiff_at_end, reason_of_failure, warn_of_jumps
 from .solve import integrate, running_scales
 
 # Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
@@ -57,7 +59,7 @@ def simulate(
     solver: diffrax.AbstractSolver | Literal["auto", "switch"] | None = None,
     formulation: AbstractFormulation | None = None,
     manifold: AbstractManifold | None = None,
-    rtol: Scalar = 1e-8,
+    rtol: Scalar = DEFAULT_RTOL,
     atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -95,10 +97,11 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is
-        `Adams`, which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how
-        many steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. With `"switch"` a motion that is detected
-        to be stiff is simulated again from `t0` with `Hermite`; not under `jit`, `vmap` or `grad`.
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is `Adams`,
+        which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how many
+        steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. Counting takes some percent of a step. With
+        `"switch"` a motion that is detected to be stiff is simulated again from `t0` with `Hermite`; not under `jit`,
+        `vmap` or `grad`.
     - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
         `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
     - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
@@ -119,8 +122,10 @@ def simulate(
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
         then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
         does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
-        Without any, a warning tells of a jump or kink of a driver, except under `jit`, `vmap` or a derivative.
-    - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
+        A warning tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
+    - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
+        error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
+        some more steps are simulated; not under `jit`, `vmap` or a derivative.
 
     **Returns:** a `Trajectory`.
 
@@ -223,12 +228,30 @@ def simulate(
                 "simulate(..., adjoint=diffrax.ForwardMode())."
             ) from None
 
+    def probe(solver, steps):
+        with warnings.catch_warnings():
+            # This motion's own are said already.
+            warnings.simplefilter("ignore")
+            return simulate(
+                *lax.stop_gradient((system, outcome.y)),
+                t0=outcome.t,
+                t1=t1,
+                solver=solver,
+                formulation=formulation,
+                manifold=manifold,
+                rtol=relative,
+                atol=None if atol is None else absolute,
+                jumps=jumps,
+                max_steps=steps,
+                throw=False,
+            )
+
     used = solver
-    trajectory, failed, end, coupling = motion(solver)
+    trajectory, outcome = motion(solver)
     if choice == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
         used = Hermite()
-        trajectory, failed, end, coupling = motion(used)
+        trajectory, outcome = motion(used)
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
         warnings.warn(
@@ -237,13 +260,18 @@ def simulate(
             stacklevel=2,
         )
     prescribed = system.acceleration_rows > 0 and not system.drift_free
-    if restarts is None and prescribed and not is_traced((system, end, options["t0"], options["t1"])):
-        warn_of_jumps(system, end[1].q, options["t0"], options["t1"])
+    if prescribed and not is_traced((system, outcome.y, options["t0"], options["t1"], restarts)):
+        warn_of_jumps(system, outcome.y.q, options["t0"], options["t1"], restarts, jumps)
+    failed = outcome.failed
     if throw and not isinstance(failed, Tracer) and failed:
-        reason = about_friction(system, coupling) if np.any(coupling) else None
-        raise RuntimeError(
-            reason or reason_of_failure(system, trajectory.result, options["t1"], *lax.stop_gradient(end))
-        )
+        outcome, stats = lax.stop_gradient((outcome, trajectory.stats))
+        if np.any(outcome.coupling):
+            reason = about_friction(system, outcome.coupling)
+        elif trajectory.result == RESULTS.max_steps_reached and not is_traced((system, outcome, options["t1"], rtol)):
+            reason = about_steps(outcome, options["t1"], stats, is_stiff_at_end(probe, stats, used))
+        else:
+            reason = reason_of_failure(system, trajectory.result, options["t1"], outcome)
+        raise RuntimeError(reason)
     if is_traced((failed, trajectory.ys)):
         # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.

@@ -1,5 +1,6 @@
 """The integration of a motion as one compiled program, whose mesh resolves derivatives where they are taken."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -9,13 +10,14 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._results import RESULTS
+from ..manifold import after_jumps
 from ..manifold.diagnosis import diagnose_friction
 from ..solvers import AbstractMultistep
-from ..solvers._one_step import with_tangents
+from ..solvers._one_step import intended_step, with_tangents
 from ..solvers._scales import RunningScales
 from ..solvers._tangent import TangentControl
 from ..trajectory import Trajectory
-from .outcome import has_failed
+from .outcome import Outcome, has_failed
 
 
 @eqx.filter_jit
@@ -27,17 +29,23 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
     options = options | {"t1": at_once(options["t1"])}
+    jumps, after = getattr(options["stepsize_controller"], "jump_ts", None), times
     if times is not None:
-        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(times))
+        if jumps is not None:
+            # States that are saved at a jump are those after it, also in a run that comes to it from there.
+            after = after_jumps(times, jumps, options["t0"], options["t1"])
+        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
     solution: Any = _solve(term, solver, options, _tangent_control(system, options, direction))
     ts, saved = solution.ts[0], solution.ys[0]
     if times is not None:
         ts = jnp.where(finite, ts, jnp.inf)
-    correction = manifold.correction(interpolated)
+    correction, lost = manifold.correction(interpolated), None
     # `SaveAt(fn=...)` may save something else than states.
     are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
     if are_states and correction is not None:
-        saved = _corrected(system, ts, saved, correction)
+        saved, lost = _corrected(system, options, ts, saved, correction)
+    if after is not times:
+        ts = _replaced(ts, after, times)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
@@ -45,6 +53,8 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
     stuck = has_failed(result) & finite
     result = manifold.diagnose(system, *end, solution.solver_state, result, stuck)
+    if lost is not None:
+        result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
     coupling = None
     if system.friction_parts:
         result, coupling = diagnose_friction(system, formulation, *end, result, stuck)
@@ -61,7 +71,7 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
         interpolation=solution.interpolation,
         event_mask=solution.event_mask,
     )
-    return trajectory, has_failed(result), end, coupling
+    return trajectory, Outcome(has_failed(result), *end, intended_step(solution.controller_state), coupling)
 
 
 def _solve(term, solver, options, control):
@@ -140,10 +150,24 @@ def _group_ends(system) -> tuple[int, ...]:
     return (system.nq, first, *(first + end for end in system.state_ends))
 
 
-def _corrected(system, ts, saved, correction):
-    """Saved states, returned to the constraints; entries after the end of a run stay as they are."""
+def _replaced(values, old, new):
+    """Values with those that are among the `old` ones, which run up or down, replaced by the `new` ones."""
+    order = jnp.argsort(old)
+    k = order[jnp.clip(jnp.searchsorted(old[order], values), 0, old.size - 1)]
+    return jnp.where(values == old[k], new[k], values)
+
+
+def _corrected(system, options, ts, saved, correction):
+    """Saved states, returned to the constraints, and whether one of them could not be; entries after the end of a run
+    stay as they are.
+    """
     finite = jnp.isfinite(ts)
-    first = lambda y: jnp.where(jnp.isfinite(y[:1]), y[:1], 1.0)
-    inside = jax.tree.map(lambda y: jnp.where(finite[:, None], y, lax.stop_gradient(first(y))), saved)
-    corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, 0.0), inside)
-    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved)
+    # Elsewhere something is corrected that has no failure and no derivative.
+    at_start, start = lax.stop_gradient((options["t0"], options["y0"]))
+    inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0[None]), saved, start)
+    corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, at_start), inside)
+    is_known = lambda y: functools.reduce(
+        jnp.logical_and, [jnp.all(jnp.isfinite(x), axis=1) for x in jax.tree.leaves(y)]
+    )
+    lost = jnp.any(is_known(inside) & ~is_known(corrected))
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), corrected, saved), lost

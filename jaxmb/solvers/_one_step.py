@@ -96,6 +96,24 @@ class ErrorWithTangents(NamedTuple):
     of_tangents: list[Float[Array, " n"]]
 
 
+class OneStepState(NamedTuple):
+    """The state of `OneStepController`: that of the controller inside, the running sizes, the least step that is tried,
+    and the `intended` length of the next step.
+    """
+
+    inner: Any
+    sizes: Float[Array, " groups"] | None
+    least: Float[Array, ""]
+    intended: Float[Array, ""]
+
+
+def intended_step(controller_state: Any) -> Float[Array, ""] | None:
+    """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
+    while hasattr(controller_state, "inner_state"):
+        controller_state = controller_state.inner_state
+    return getattr(controller_state, "intended", None)
+
+
 class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
     """A PID controller of the error of a state in units of tolerances that may be relative to running `scales`, and of
     the errors of `tangents` where the solver carries them along. `rtol`, `atol` and `norm` are those of `controller`.
@@ -121,7 +139,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
         if self.scales is None:
             first, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-            return first, (state, None, least)
+            return first, OneStepState(state, None, least, first - t0)
         flat = ravel(y0)
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
         # The first step is chosen in units of these sizes, and of the time that they change in: it then depends on no
@@ -135,10 +153,11 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         y0 = unravel_like(y0, flat / unit)
         dt0 = None if dt0 is None else dt0 * rate
         first, state = self.controller.init(terms, t0 * rate, t1 * rate, y0, dt0, args, field, error_order)
-        return t0 + (first - t0 * rate) / rate, (state, sizes, least)
+        intended = (first - t0 * rate) / rate
+        return t0 + intended, OneStepState(state, sizes, least, intended)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        state, sizes, least = controller_state
+        state, sizes, least, _ = controller_state
         of_state, of_tangents = (y_error.error, y_error.of_tangents) if self.tangents else (y_error, [])
         scale = Tolerances(self.rtol, self.atol, MultistepNorm(self.norm, self.scales)).scale(
             ravel(y0), ravel(y1_candidate), sizes
@@ -156,4 +175,5 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
         if self.scales is not None and sizes is not None:
             sizes = jnp.where(keep, self.scales.grown(sizes, ravel(y1_candidate)), sizes)
-        return keep, *times, made_jump, (state, sizes, least), result
+        state = OneStepState(state, sizes, least, times[1] - times[0])
+        return keep, *times, made_jump, state, result

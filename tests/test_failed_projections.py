@@ -1,0 +1,162 @@
+"""Steps and states between them that cannot be returned to the constraints."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.system.joint_graph import joint_order
+
+METHOD: dict[str, Any] = {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Projection(), "max_steps": 3000}
+FIXED: dict[str, Any] = METHOD | {"stepsize_controller": diffrax.ConstantStepSize()}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A rod that turns at thirty radians a second."""
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    return system, mb.assemble(system, rates={"rod.angle": 30.0})
+
+
+def by_blocks(system):
+    """The system with sparse elimination, also where a dense matrix is faster."""
+    return dataclasses.replace(system, elimination=joint_order(system, ()))
+
+
+def as_it_is(system):
+    return system
+
+
+STRUCTURES = [as_it_is, pytest.param(by_blocks, marks=pytest.mark.long)]
+
+
+def in_long_steps(pendulum, structure, dt, **options):
+    own: Any = {"dt0": dt, "saveat": [0.1, 0.8, 2.0], "throw": False} | FIXED | options
+    return mb.simulate(structure(pendulum[0]), pendulum[1], t1=2.0, **own)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
+def test_steps_that_are_too_long_fail(pendulum, structure):
+    """Nothing shortens them, and the run ends."""
+    failed = in_long_steps(pendulum, structure, 0.4)
+    assert failed.result == mb.RESULTS.newton_failed and not np.any(np.isfinite(failed.ys.q))
+    with pytest.raises(RuntimeError, match="no state on the constraints"):
+        in_long_steps(pendulum, structure, 0.4, throw=True)
+    fine = in_long_steps(pendulum, structure, 0.05)
+    assert fine.result == mb.RESULTS.successful and np.all(fine.constraint_violation.position < 1e-12)
+
+
+@pytest.mark.long
+def test_a_step_that_fails_in_a_batch(pendulum):
+    batch = jax.jit(jax.vmap(lambda dt: in_long_steps(pendulum, as_it_is, dt)))(jnp.array([0.05, 0.4]))
+    np.testing.assert_array_equal(batch.result == mb.RESULTS.newton_failed, [False, True])
+    fine = in_long_steps(pendulum, as_it_is, 0.05)
+    np.testing.assert_allclose(batch.ys.q[0], fine.ys.q, rtol=0, atol=1e-10)
+    assert np.all(np.isnan(batch.ys.q[1]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
+def test_derivatives_of_a_run_whose_first_steps_fail(pendulum, structure):
+    system = structure(pendulum[0])
+
+    def end(x, adjoint, rtol=1e-7):
+        own = mb.with_parameters(system, {"rod.inertia": x[0], "pin.point_a": jnp.stack([0.0 * x[1], x[1]])})
+        start = mb.assemble(own, mb.State(pendulum[1].q, x[2] * pendulum[1].u))
+        motion = mb.simulate(own, start, t1=0.45, dt0=0.4, rtol=rtol, adjoint=adjoint, **METHOD | {"max_steps": 1024})
+        return motion.ys.q[-1, 2], motion.stats["num_rejected_steps"]
+
+    x, h = jnp.array([0.1, 0.0, 1.0]), 1e-5
+    value = jax.jit(lambda x: end(x, None, 1e-10))
+    assert value(x)[1] > 0
+    forward = jax.jit(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode())[0]))(x)
+    reverse = jax.jit(jax.grad(lambda x: end(x, None)[0]))(x)
+    central = [(value(x + h * e)[0] - value(x - h * e)[0]) / (2 * h) for e in jnp.eye(3)]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    np.testing.assert_allclose(forward, central, rtol=1e-4, atol=1e-5)
+
+
+def crank_beyond_reach():
+    """A driven crank of length 1 and a rod of 0.8: the slider cannot follow beyond 53 degrees."""
+    bodies = [
+        planar.Body("crank", mass=1.0, inertia=0.1, position=(0.5, 0.0)),
+        planar.Body("rod", mass=1.0, inertia=0.1, position=(1.4, 0.0)),
+        planar.Body("slider", mass=1.0, inertia=0.1, position=(1.8, 0.0)),
+    ]
+    joints = [
+        planar.Revolute("a", "ground", "crank", point=(0.0, 0.0)),
+        planar.Revolute("b", "crank", "rod", point=(1.0, 0.0)),
+        planar.Revolute("c", "rod", "slider", point=(1.8, 0.0)),
+        planar.Prismatic("guide", "ground", "slider", point=(1.8, 0.0), axis=(1.0, 0.0)),
+        planar.Driver("drive", "ground", "crank", quantity="angle", motion=lambda t, p: 2.0 * t),
+    ]
+    return mb.Scene(bodies, joints=joints).compile(), {}, np.arcsin(0.8) / 2, "singular_configuration"
+
+
+def gear_past_its_end():
+    """A gear whose ratio is no whole number, which serves half a turn to either side."""
+    inertia = np.diag([0.1, 0.1, 0.1])
+    bodies = [spatial.Body(name, mass=1.0, inertia=inertia, position=(x, 0.0, 0.0)) for name, x in (("a", 0), ("b", 1))]
+    joints = [
+        spatial.Revolute("axle a", "ground", "a", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        spatial.Revolute("axle b", "ground", "b", point=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        mb.JointCoupling("gear", "axle a.angle", "axle b.angle", coefficients=(0.0, 1.5)),
+    ]
+    return mb.Scene(bodies, joints=joints).compile(), {"axle b.angle": 2.0}, np.pi / 2, "newton_failed"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", [crank_beyond_reach, gear_past_its_end])
+def test_a_motion_ends_where_constraints_cannot_be_met(case):
+    system, rates, when, result = case()
+    state = mb.assemble(system, rates=rates)
+    found = mb.simulate(system, state, t1=4.0, throw=False, **METHOD)
+    assert found.result == getattr(mb.RESULTS, result)
+    assert np.all(found.constraint_violation.position < 1e-10)
+    kept = mb.simulate(system, state, t1=4.0, saveat=diffrax.SaveAt(steps=True), throw=False, **METHOD)
+    np.testing.assert_allclose(kept.ts[-1], when, rtol=0, atol=1e-4)
+    fixed = mb.simulate(system, state, t1=4.0, dt0=0.05, throw=False, **FIXED)
+    assert fixed.result == mb.RESULTS.newton_failed
+    with pytest.raises(RuntimeError, match="no state on the constraints"):
+        mb.simulate(system, state, t1=4.0, dt0=0.05, **FIXED)
+
+
+def test_a_state_that_cannot_be_returned_is_not_a_number(pendulum):
+    """Together with its derivatives, beside one that can be."""
+    system, state = pendulum
+
+    @jax.jit
+    @jax.vmap
+    def projected(size):
+        found = lambda x: mb.manifold.project(system, 0.0, mb.State(state.q + x, state.u)).q
+        return found(size), jax.jacfwd(found)(size), jax.jacrev(found)(size)
+
+    value, *derivatives = projected(jnp.array([1e-3, 30.0]))
+    assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1]))
+    for derivative in derivatives:
+        assert np.all(np.isfinite(derivative[0])) and np.all(np.isnan(derivative[1]))
+
+
+class Losing(mb.manifold.Projection):
+    """A projection that finds no state from the middle of a run on, of those that are saved."""
+
+    def correction(self, interpolated):
+        return lambda system, t, y: mb.State(jnp.where(t > 0.5, jnp.nan, y.q), y.u)
+
+
+@pytest.mark.long
+def test_a_saved_state_that_cannot_be_returned_is_a_failure(pendulum):
+    method: Any = METHOD | {"manifold": Losing(), "saveat": [0.3, 1.0], "rtol": 1e-4}
+    found = mb.simulate(*pendulum, t1=1.0, throw=False, **method)
+    assert found.result == mb.RESULTS.newton_failed
+    assert np.all(np.isfinite(found.ys.q[0])) and np.all(np.isnan(found.ys.q[1]))
+    with pytest.raises(RuntimeError, match="interpolated"):
+        mb.simulate(*pendulum, t1=1.0, **method)
