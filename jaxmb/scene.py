@@ -15,6 +15,7 @@ from .parts.base import (
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
+    AbstractInertialConstraint,
     AbstractLink,
     AbstractNonIdeal,
     AbstractTendon,
@@ -23,7 +24,7 @@ from .parts.base import (
 )
 from .parts.boundary import check_kernels
 from .parts.contents import anonymous, inner_parts
-from .parts.fields import declarations, values_of
+from .parts.fields import as_parameter, declarations, values_of
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
@@ -40,7 +41,7 @@ from .system.description import Description
 from .system.equation import Ranks
 from .system.force_groups import ForceGroup, NonIdealGroup
 from .system.groups import BodyGroup, FrameGroup, TendonGroup, stack
-from .system.layout import Layout
+from .system.layout import Layout, ScalarCoordinate
 
 # Parts that act on other parts, given by their names.
 _OF_OTHERS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractOfSources)
@@ -86,11 +87,13 @@ class Scene(eqx.Module):
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        layout = Layout(space, tuple(body.rotates for body in self.bodies))
-        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
+        inertial = [part for part in self.joints if isinstance(part, AbstractInertialConstraint)]
+        layout = Layout(space, tuple(body.rotates for body in self.bodies), tuple(map(_scalar_coordinate, inertial)))
+        index = {part.name: k for k, part in enumerate((*self.bodies, *inertial))} | {GROUND: layout.ground}
+        zeros = as_parameter(np.zeros(len(inertial)))
         guess = State(
-            jax.device_put(np.concatenate([_call(body, "pose") for body in self.bodies])),
-            jax.device_put(np.concatenate([_call(body, "velocities") for body in self.bodies])),
+            jax.device_put(np.concatenate([*(_call(body, "pose") for body in self.bodies), zeros])),
+            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros])),
         )
         if is_traced(guess):
             raise ValueError(
@@ -128,7 +131,7 @@ class Scene(eqx.Module):
             implied=(),
             elimination=None,
         )
-        return with_structure(system.with_initial_states())
+        return with_structure(system.with_initial_states().with_initial_scalars())
 
 
 def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[str, AbstractFrame], given: Any):
@@ -153,6 +156,7 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
             placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
             resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
+            own = (*own, index[part.name]) if isinstance(part, AbstractInertialConstraint) else own
             joints[part.name] = resolved, own, (None,) * len(own)
             parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
@@ -172,6 +176,10 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             part.check(space.dimension)
             gravity = part
     return parts, laws, gravity
+
+
+def _scalar_coordinate(part):
+    return ScalarCoordinate(f"{part.name}.{'displacement' if part.is_length else 'angle'}", part.is_length)
 
 
 def _source(name, joints, named, frames, index):
@@ -305,6 +313,6 @@ def _length(parts, guess, layout):
     size = max(sizes, default=0.0)
     if size == 0.0:
         dimension = layout.space.dimension
-        position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[:-1]])
+        position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[: layout.bodies]])
         size = float(np.max(np.abs(position)))
     return jax.device_put(np.asarray(size if size > 0 else 1.0, guess.q.dtype))

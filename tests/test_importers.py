@@ -58,8 +58,6 @@ def body_accelerations(model, data, imported):
     out = {}
     for k, body in enumerate(imported.scene.bodies):
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name)
-        if number < 0:  # a rotor
-            continue
         turn = data.xmat[number].reshape(3, 3)
         centre = data.xpos[number] + turn @ np.asarray(body.centre)
         moves, turns, more_moves, more_turns = (np.zeros((3, model.nv)) for _ in range(4))
@@ -114,7 +112,7 @@ def check_dynamics(imported, count=20, *, scale=1.0):
         np.testing.assert_allclose(rates, data.act_dot[order], rtol=1e-12, atol=0)
         assert unmet < 1e-12
         expected = body_accelerations(model, data, imported)
-        found = udot.reshape(-1, 6)[list(expected)]
+        found = udot[: 6 * len(expected)].reshape(-1, 6)
         size = np.max(np.abs(list(expected.values())))
         np.testing.assert_allclose(found, list(expected.values()), rtol=0, atol=1e-9 * size)
         potential_there, kinetic_there = data.energy
@@ -147,9 +145,18 @@ def test_a_small_tree_moves_as_in_mujoco():
     check_dynamics(importers.mjcf(small_tree()))
 
 
-def test_a_pendulum_with_armature_moves_as_in_mujoco():
-    joint = '<joint name="hip" axis="0 1 1" armature=".02" stiffness="2" springref="10"/>'
-    check_dynamics(importers.mjcf(file(rod("arm", joint))), 3)
+def test_armature_moves_as_in_mujoco():
+    """Of a hinge, of a slide, of a tendon along both, and of one between points; with it a machine has its mass."""
+    hinge = '<joint name="hip" axis="0 1 1" armature=".02" stiffness="2" springref="10" ref="7"/>'
+    slide = '<joint name="reach" type="slide" axis="1 0 .2" armature=".3" ref=".1"/>'
+    fixed = '<fixed name="cord" armature=".4"><joint joint="hip" coef=".5"/><joint joint="reach" coef="2"/></fixed>'
+    straight = '<spatial name="line" armature=".6"><site site="far"/><site site="tip"/></spatial>'
+    hand = rod("hand", slide + '<site name="tip" pos=".1 .2 0"/>', pos=".4 0 0")
+    body = rod("arm", hinge, hand) + '<site name="far" pos="0 1 .5"/>'
+    model = importers.mjcf(file(body, f"<tendon>{fixed}{straight}</tendon>"))
+    system = check_dynamics(model, 3)
+    assert system.nu == 2 * 6 + 4 and not any("rotor" in own.name for own in model.scene.bodies)
+    assert float(jnp.sum(system.mass)) == pytest.approx(float(np.sum(model.locate.model.body_mass)), rel=1e-14)
 
 
 @pytest.mark.long
@@ -186,8 +193,13 @@ HINGE = '<joint name="hip" axis="0 1 0"/>'
         ('<joint name="hip" type="ball"/>', "", "hip", {}),
         ('<joint name="hip" stiffness="2" springref="90"/>', "", "hip spring", {"stiffness": 2, "free": np.pi / 2}),
         ('<joint name="hip" damping=".5"/>', "", "hip spring", {"damping": 0.5, "stiffness": 0}),
-        ('<joint name="hip" armature=".1"/>', "", "hip rotor", {"inertia": 0.1 * np.eye(3)}),
-        ('<joint name="hip" armature=".1"/>', "", "hip gear", {"coefficients": [0, 1]}),
+        ('<joint name="hip" armature=".1"/>', "", "hip armature", {"inertia": 0.1}),
+        (
+            HINGE,
+            '<tendon><fixed name="cord" armature=".3"><joint joint="hip" coef="2"/></fixed></tendon>',
+            "cord armature",
+            {"inertia": 0.3},
+        ),
         (
             HINGE,
             '<equality><connect name="loop" body1="a" anchor=".3 0 0"/></equality>',

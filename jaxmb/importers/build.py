@@ -9,13 +9,14 @@ import numpy as np
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, Tendon
 from ..parts.forces import Damper, Gravity, PointForce
+from ..parts.joint_inertia import JointInertia
 from ..parts.joint_laws import JointActuator, JointFriction, JointStop
 from ..parts.joint_parts import JointDriver, JointSpring
 from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body
 from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
-from ..parts.spatial.joints import Fixed, Revolute, Spherical
+from ..parts.spatial.joints import Fixed, Spherical
 from ..scene import Scene
 from . import chains
 from .description import Joint, Link, Machine, quaternion
@@ -33,15 +34,16 @@ class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each
-    rotor its joint; `shapes` and `collision_shapes` of bodies by name.
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `inertias`, in the
+    order of the scene: whether each is of a tendon, the name of the joint or tendon, and what must be added to its
+    coordinate to give that of the file; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
     coordinates: dict[str, tuple[str | None, float]]
     controls: dict[str, str]
     fused: Fused
-    rotors: dict[str, str]
+    inertias: list[tuple[bool, str, float]]
     shapes: dict[str, tuple[AbstractShape, ...]]
     collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
@@ -62,7 +64,7 @@ class _Builder:
         self.frames: list[Any] = []
         self.coordinates: dict[str, tuple[str | None, float]] = {}
         self.controls: dict[str, str] = {}
-        self.rotors: dict[str, str] = {}
+        self.inertias: list[tuple[bool, str, float]] = []
         self.names: set[str] = {GROUND}
         self.tendons: dict[str, tuple[str, float]] = {}
 
@@ -90,7 +92,7 @@ class _Builder:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
         collisions = self._of_bodies(machine.collisions)
         shapes = collisions | self._of_bodies(machine.shapes)
-        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, shapes, collisions)
+        return Built(scene, self.coordinates, self.controls, self.fused, self.inertias, shapes, collisions)
 
     def _named(self, name, kind=""):
         """A name that nothing in the scene has yet."""
@@ -161,7 +163,7 @@ class _Builder:
         if "springs" in wanted:
             self._shortest(joint)
         if "armature" in wanted:
-            self._rotor(joint.name, coordinate, joint.armature)
+            self._inertia(joint.name, coordinate, offset, joint.armature)
         if "friction" in wanted:
             self._friction(joint.name, coordinate, joint.friction)
         if "limits" in wanted:
@@ -189,16 +191,9 @@ class _Builder:
         for kind in sorted(left):
             self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of the {joint.kind} joint {joint.name!r}")
 
-    def _rotor(self, name, coordinate, armature):
-        """A flywheel at the origin of the world, geared to a joint: there weight does no work on it."""
-        rotor, bearing = self._named(f"{name} rotor"), self._named(f"{name} bearing")
-        zero = np.zeros(3)
-        self.bodies.append(Body(rotor, mass=armature, inertia=np.full(3, armature), centre=zero))
-        self.joints.append(Revolute(bearing, GROUND, rotor, point=zero, axis=(0.0, 0.0, 1.0)))
-        self.joints.append(
-            JointCoupling(self._named(f"{name} gear"), f"{bearing}.angle", coordinate, coefficients=(0.0, 1.0))
-        )
-        self.rotors[rotor] = name
+    def _inertia(self, name, coordinate, offset, armature, *, of_tendon=False):
+        self.joints.append(JointInertia(self._named(f"{name} armature"), coordinate, inertia=armature))
+        self.inertias.append((of_tendon, name, offset))
 
     def _friction(self, name, coordinate, force):
         self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
@@ -309,6 +304,8 @@ class _Builder:
                 "free": tendon.free - offset,
             }
             self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
+        if tendon.armature and not self.notes.leaves_out("armature", tendon.name):
+            self._inertia(tendon.name, coordinate, offset, tendon.armature, of_tendon=True)
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
             self._friction(tendon.name, coordinate, tendon.friction)
         if tendon.limits is not None and not self.notes.leaves_out("limits", tendon.name):

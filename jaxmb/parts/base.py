@@ -247,6 +247,22 @@ class AbstractConstraint(AbstractLink):
         """Φ(poses, t) of this part."""
 
 
+class AbstractInertialConstraint(AbstractConstraint):
+    """A position constraint that binds a coordinate of its own, a number x, which has an inertia and nothing else.
+
+    The kernel sees one body more than `bodies`, the last one, of which the first entry of the pose is x.
+    """
+
+    inertia: AbstractVar[Float[Array, ""]]
+
+    @property
+    @abc.abstractmethod
+    def is_length(self) -> bool:
+        """Whether x is a length [m] and the inertia a mass [kg]; otherwise they are an angle [rad] and a moment of
+        inertia [kg m²].
+        """
+
+
 class AbstractJoint(AbstractPair, AbstractConstraint):
     """A constraint between a point of `body_a` and one of `body_b`.
 

@@ -58,42 +58,47 @@ class AbstractBodies(AbstractSystem):
 
     @property
     def mass(self) -> Float[Array, "b"]:
-        """Masses [kg] of the bodies."""
+        """Masses [kg] of the bodies; zeros for scalar coordinates."""
         return self._in_order([g.mass for g in self.bodies])
 
     @property
     def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
-        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
+        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space;
+        zeros for scalar coordinates.
+        """
         return self._in_order([g.inertia for g in self.bodies])
 
     def _in_order(self, of_groups):
-        """Per-body values of all groups, in the order of the bodies."""
-        if len(of_groups) == 1:
-            return of_groups[0]
-        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
-        return unchecked_take(jnp.concatenate(of_groups), order)
+        """Per-body values of all groups, in the order of the bodies, and zeros for scalar coordinates."""
+        values = of_groups[0]
+        if len(of_groups) > 1:
+            order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
+            values = unchecked_take(jnp.concatenate(of_groups), order)
+        if not self.layout.scalars:
+            return values
+        return jnp.pad(values, ((0, len(self.layout.scalars)), *[(0, 0)] * (values.ndim - 1)))
 
     # Kinematics
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
-        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
+        """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
         return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
-        """Velocities of the bodies and of the ground."""
+        """Velocities of the bodies, of scalar coordinates and of the ground."""
         return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
 
     def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
-        """Poses of the bodies."""
+        """Poses of the bodies, and of scalar coordinates."""
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
         return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
     def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
-        """Velocities of the bodies."""
+        """Velocities of the bodies, and of scalar coordinates."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
         return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
@@ -109,7 +114,7 @@ class AbstractBodies(AbstractSystem):
         return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
 
     def normalize_fixed(self, q, fixed):
-        rotating = np.array(self.layout.rotates) & self.spatial
+        rotating = np.flatnonzero(np.array(self.layout.rotates) & self.spatial)
         turns = self.layout.pose_index[:-1][rotating, 3:]
         whole = turns[np.all(fixed[turns], axis=1)]
         for index in whole:
@@ -128,7 +133,5 @@ class AbstractBodies(AbstractSystem):
         return of_bodies.reshape(-1)[self.layout.velocity_place]
 
     def _pack(self, poses):
-        if self.layout.uniform:
-            return poses.reshape(-1)
-        sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
-        return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
+        raveled = poses.reshape(-1)
+        return raveled if self.layout.uniform else unchecked_take(raveled, self.layout.coordinate_place)

@@ -2,41 +2,58 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
 from ..parts.space import AbstractSpace
 
 
+class ScalarCoordinate(NamedTuple):
+    """A coordinate with inertia that belongs to a part: its name, `"rotor.angle"`, and whether it is a length [m],
+    otherwise an angle [rad].
+    """
+
+    name: str
+    is_length: bool
+
+
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Bodies in order, each with its pose and velocity contiguous; the ground is the body after the last.
+    """Bodies in order, each with its pose and velocity contiguous; then scalar coordinates; the ground is the last.
 
-    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant.
+    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant. A scalar
+    coordinate is like a body that has only the first entries of pose and velocity.
     """
 
     space: AbstractSpace
     rotates: tuple[bool, ...]
+    scalars: tuple[ScalarCoordinate, ...] = ()
 
     @property
     def bodies(self) -> int:
         return len(self.rotates)
 
     @property
+    def ground(self) -> int:
+        """The number of the ground: that of bodies and scalar coordinates."""
+        return len(self.rotates) + len(self.scalars)
+
+    @property
     def uniform(self) -> bool:
-        """Whether every body rotates, so that poses are a plain reshape of the coordinates."""
-        return all(self.rotates)
+        """Whether there are only bodies that rotate, so that poses are a plain reshape of the coordinates."""
+        return all(self.rotates) and not self.scalars
 
     @functools.cached_property
     def pose_index(self) -> np.ndarray:
-        """Index of every pose entry, shape (bodies + 1, pose size), into the coordinates followed by the ground's
+        """Index of every pose entry, shape (ground + 1, pose size), into the coordinates followed by the ground's
         pose.
         """
         return self._index(self.space.pose_size, [*range(self.nq, self.nq + self.space.pose_size)])
 
     @functools.cached_property
     def velocity_index(self) -> np.ndarray:
-        """Index of every velocity entry, shape (bodies + 1, velocity size), into the velocities followed by a zero."""
+        """Index of every velocity entry, shape (ground + 1, velocity size), into the velocities followed by a zero."""
         return self._index(self.space.velocity_size, [self.nu] * self.space.velocity_size)
 
     @functools.cached_property
@@ -51,16 +68,19 @@ class Layout:
 
     @functools.cached_property
     def nq(self) -> int:
-        return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)
+        return sum(self._sizes(self.space.pose_size))
 
     @functools.cached_property
     def nu(self) -> int:
-        return sum(self.space.velocity_size if r else self.space.dimension for r in self.rotates)
+        return sum(self._sizes(self.space.velocity_size))
+
+    def _sizes(self, size: int) -> list[int]:
+        """The number of entries of each body, of which one that rotates has `size`, and of each scalar coordinate."""
+        return [*(size if rotates else self.space.dimension for rotates in self.rotates), *(1 for _ in self.scalars)]
 
     def _index(self, size: int, constant: list[int]) -> np.ndarray:
         index, start = [], 0
-        for rotates in self.rotates:
-            own = size if rotates else self.space.dimension
+        for own in self._sizes(size):
             index.append([*range(start, start + own), *constant[own:]])
             start += own
         return np.array([*index, constant], np.int32)

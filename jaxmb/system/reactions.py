@@ -83,6 +83,7 @@ def reaction(
 def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Array, Array]:
     layout = group.layout
     bodies = group.bodies[k]
+    # Scalar coordinates and the ground are no bodies.
     last = max(i for i, body in enumerate(bodies) if body < layout.bodies)
     pose, wrench = group.gather(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)

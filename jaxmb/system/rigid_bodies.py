@@ -112,17 +112,30 @@ class RigidBodySystem(AbstractBodySystem):
     def inertia(self, t, q, u) -> AbstractInertia:
         if self.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
+        mass = self._masses_of_coordinates
         if self.spatial:
-            points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular.
+            points = np.ones((self.layout.ground, 1, 1), bool)
+            points[_rotating(self.layout)] = False
+            # Others than bodies that rotate get a unit moment of inertia, which has no effect, to make the matrix
+            # regular.
             moments = self.moments_of_inertia
             moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
-            return _MixedInertia(BlockInertia(self.mass, moments), self.layout)
-        columns = [jnp.repeat(self.mass[:, None], 2, axis=1), self.moments_of_inertia[:, None]]
+            return _MixedInertia(BlockInertia(mass, moments), self.layout)
+        columns = [jnp.repeat(mass[:, None], 2, axis=1), self.moments_of_inertia[:, None]]
         bodies = jnp.concatenate(columns, axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
+
+    @property
+    def _masses_of_coordinates(self):
+        """What counts as the mass of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]."""
+        own = self._inertial
+        if not own:
+            return self.mass
+        order = np.argsort(np.concatenate([g.group.body_index[:, -1] for g in own]))
+        inertias = unchecked_take(jnp.concatenate([g.group.part.inertia for g in own]), order)
+        return jnp.concatenate([self.mass[: self.layout.bodies], inertias])
 
     @eqx.filter_jit
     def force(self, t, q, u):
@@ -141,13 +154,13 @@ class RigidBodySystem(AbstractBodySystem):
             return jnp.zeros(self.nu, dtype)
         size = self.layout.space.velocity_size
         entries = jnp.concatenate([own.reshape(-1, size) for own in wrenches])
-        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.bodies)(entries).reshape(
+        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.ground)(entries).reshape(
             -1
         )
         return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
 
     def _own_wrenches(self, u):
-        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
+        """Gravity and the gyroscopic moment `−ω × J ω`, shape (ground, velocity size); None where there is neither."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if self.gravity is not None:
@@ -162,7 +175,7 @@ class RigidBodySystem(AbstractBodySystem):
         """The derivative of each body's gyroscopic moment with respect to its own velocity."""
         size = self.layout.space.velocity_size
         if not self.spatial:
-            return jnp.zeros((self.layout.bodies, size, size), u.dtype)
+            return jnp.zeros((self.layout.ground, size, size), u.dtype)
         moment = lambda J, w: -cross(w, J @ w)
         own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
         return jnp.pad(own, ((0, 0), (3, 0), (3, 0)))
@@ -211,14 +224,18 @@ class RigidBodySystem(AbstractBodySystem):
     def _scale(self, index, size):
         length = lax.stop_gradient(self.length)
         translation = [False] * size
-        for body in index[:-1]:
+        for body in index[: self.layout.bodies]:
             for k in body[: self.layout.space.dimension]:
                 translation[k] = True
+        for own, row in zip(self.layout.scalars, index[self.layout.bodies : -1], strict=True):
+            translation[row[0]] = own.is_length
         return jnp.where(np.array(translation), length, 1.0)
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies and point masses together. `blocks` has unit blocks for the rotations of point masses."""
+    """Spatial bodies, point masses and scalar coordinates together. `blocks` has unit blocks for the rotations of
+    those that do not rotate.
+    """
 
     blocks: BlockInertia
     layout: Layout = eqx.field(static=True)
@@ -251,4 +268,4 @@ def _rotating(layout: Layout):
 
 
 def _all_bodies(layout: Layout):
-    return np.arange(layout.bodies)[:, None]
+    return np.arange(layout.ground)[:, None]
