@@ -126,7 +126,7 @@ def _acts_on(group, part, k):
 
 def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> Tree:
     """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
-    places = dict(zip(system.body_names, poses[: system.layout.bodies], strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
+    places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
     tree = Tree(places)
     parts = [
         p

@@ -161,7 +161,7 @@ def _asked(system, q):
 
 
 def _motions_as_one(system, q):
-    poses, d = system.poses(q)[: system.layout.bodies], system.layout.space.dimension
+    poses, d = system.poses(q), system.layout.space.dimension
     moved = jnp.tile(jnp.eye(d, system.layout.space.velocity_size, dtype=q.dtype)[:, None], (1, len(poses), 1))
     if d == 2:
         turned = jnp.stack([-poses[:, 1], poses[:, 0], jnp.ones_like(poses[:, 0])], axis=1)[None]

@@ -58,25 +58,20 @@ class AbstractBodies(AbstractSystem):
 
     @property
     def mass(self) -> Float[Array, "b"]:
-        """Masses [kg] of the bodies; zeros for scalar coordinates."""
+        """Masses [kg] of the bodies."""
         return self._in_order([g.mass for g in self.bodies])
 
     @property
     def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
-        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space;
-        zeros for scalar coordinates.
-        """
+        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
         return self._in_order([g.inertia for g in self.bodies])
 
     def _in_order(self, of_groups):
-        """Per-body values of all groups, in the order of the bodies, and zeros for scalar coordinates."""
-        values = of_groups[0]
-        if len(of_groups) > 1:
-            order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
-            values = unchecked_take(jnp.concatenate(of_groups), order)
-        if not self.layout.scalars:
-            return values
-        return jnp.pad(values, ((0, len(self.layout.scalars)), *[(0, 0)] * (values.ndim - 1)))
+        """Per-body values of all groups, in the order of the bodies."""
+        if len(of_groups) == 1:
+            return of_groups[0]
+        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
+        return unchecked_take(jnp.concatenate(of_groups), order)
 
     # Kinematics
 
@@ -84,21 +79,29 @@ class AbstractBodies(AbstractSystem):
         """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
+        return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
         """Velocities of the bodies, of scalar coordinates and of the ground."""
-        return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
+        return jnp.pad(self._velocities(u), ((0, 1), (0, 0)))
 
     def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
-        """Poses of the bodies, and of scalar coordinates."""
+        """Poses of the bodies."""
+        return self._poses(q)[: self.layout.bodies]
+
+    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+        """Velocities of the bodies."""
+        return self._velocities(u)[: self.layout.bodies]
+
+    def _poses(self, q):
+        """Poses of the bodies and of scalar coordinates."""
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
         return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
-    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
-        """Velocities of the bodies, and of scalar coordinates."""
+    def _velocities(self, u):
+        """Velocities of the bodies and of scalar coordinates."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
         return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
@@ -106,12 +109,12 @@ class AbstractBodies(AbstractSystem):
     def rates(self, t, q, u):
         if self.rates_are_velocities:
             return u
-        return self._pack(jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u)))
+        return self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
 
     def normalize(self, q):
         if self.rates_are_velocities:
             return q
-        return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
+        return self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
 
     def normalize_fixed(self, q, fixed):
         rotating = np.flatnonzero(np.array(self.layout.rotates) & self.spatial)

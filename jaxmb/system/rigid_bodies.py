@@ -114,14 +114,16 @@ class RigidBodySystem(AbstractBodySystem):
             return BlockInertia(self.mass, self.moments_of_inertia)
         mass = self._masses_of_coordinates
         if self.spatial:
-            points = np.ones((self.layout.ground, 1, 1), bool)
-            points[_rotating(self.layout)] = False
-            # Others than bodies that rotate get a unit moment of inertia, which has no effect, to make the matrix
-            # regular.
+            points = np.array([not rotates for rotates in self.layout.rotates])[:, None, None]
+            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular; a scalar
+            # coordinate as well.
             moments = self.moments_of_inertia
-            moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
+            unit = jnp.eye(3, dtype=moments.dtype)
+            of_scalars = jnp.tile(unit, (len(self.layout.scalars), 1, 1))
+            moments = jnp.concatenate([jnp.where(points, unit, moments), of_scalars])
             return _MixedInertia(BlockInertia(mass, moments), self.layout)
-        columns = [jnp.repeat(mass[:, None], 2, axis=1), self.moments_of_inertia[:, None]]
+        moments = jnp.pad(self.moments_of_inertia, (0, len(self.layout.scalars)))
+        columns = [jnp.repeat(mass[:, None], 2, axis=1), moments[:, None]]
         bodies = jnp.concatenate(columns, axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
@@ -135,7 +137,7 @@ class RigidBodySystem(AbstractBodySystem):
             return self.mass
         order = np.argsort(np.concatenate([g.group.body_index[:, -1] for g in own]))
         inertias = unchecked_take(jnp.concatenate([g.group.part.inertia for g in own]), order)
-        return jnp.concatenate([self.mass[: self.layout.bodies], inertias])
+        return jnp.concatenate([self.mass, inertias])
 
     @eqx.filter_jit
     def force(self, t, q, u):
@@ -160,7 +162,7 @@ class RigidBodySystem(AbstractBodySystem):
         return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
 
     def _own_wrenches(self, u):
-        """Gravity and the gyroscopic moment `−ω × J ω`, shape (ground, velocity size); None where there is neither."""
+        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if self.gravity is not None:
@@ -171,14 +173,16 @@ class RigidBodySystem(AbstractBodySystem):
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         return sum(parts[1:], start=parts[0]) if parts else None
 
-    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "b v v"]:
-        """The derivative of each body's gyroscopic moment with respect to its own velocity."""
+    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "ground v v"]:
+        """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
+        coordinates.
+        """
         size = self.layout.space.velocity_size
         if not self.spatial:
             return jnp.zeros((self.layout.ground, size, size), u.dtype)
         moment = lambda J, w: -cross(w, J @ w)
         own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
-        return jnp.pad(own, ((0, 0), (3, 0), (3, 0)))
+        return jnp.pad(own, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
 
     # Energy and momentum
 
@@ -268,4 +272,4 @@ def _rotating(layout: Layout):
 
 
 def _all_bodies(layout: Layout):
-    return np.arange(layout.ground)[:, None]
+    return np.arange(layout.bodies)[:, None]
