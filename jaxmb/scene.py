@@ -1,5 +1,6 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,6 @@ from .parts.base import (
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
-    AbstractInertialConstraint,
     AbstractLink,
     AbstractNonIdeal,
     AbstractTendon,
@@ -41,7 +41,7 @@ from .system.description import Description
 from .system.equation import Ranks
 from .system.force_groups import ForceGroup, NonIdealGroup
 from .system.groups import BodyGroup, FrameGroup, TendonGroup, stack
-from .system.layout import Layout, ScalarCoordinate
+from .system.layout import Layout
 
 # Parts that act on other parts, given by their names.
 _OF_OTHERS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractOfSources)
@@ -87,13 +87,17 @@ class Scene(eqx.Module):
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        inertial = [part for part in self.joints if isinstance(part, AbstractInertialConstraint)]
-        layout = Layout(space, tuple(body.rotates for body in self.bodies), tuple(map(_scalar_coordinate, inertial)))
-        index = {part.name: k for k, part in enumerate((*self.bodies, *inertial))} | {GROUND: layout.ground}
-        zeros = as_parameter(np.zeros(len(inertial)))
+        joints = {part.name: part for part in self.joints}
+        scalars = {part.name: _call(part, "scalar_coordinates", joints) for part in self.joints}
+        layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
+        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
+        numbers = iter(range(layout.bodies, layout.ground))
+        of_parts = {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
+        zeros = as_parameter(np.zeros(len(layout.scalars)))
+        moving = [k for k, own in enumerate(layout.scalars) if own.moves]
         guess = State(
             jax.device_put(np.concatenate([*(_call(body, "pose") for body in self.bodies), zeros])),
-            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros])),
+            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros[moving]])),
         )
         if is_traced(guess):
             raise ValueError(
@@ -104,7 +108,7 @@ class Scene(eqx.Module):
 
         frames = frames_by_name(self.frames, self.bodies)
         index |= {name: index[frame.of_body] for name, frame in frames.items()}
-        parts, laws, gravity = _resolved(self, layout, index, frames, given)
+        parts, laws, gravity = _resolved(self, layout, index, of_parts, frames, given)
 
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
@@ -134,10 +138,18 @@ class Scene(eqx.Module):
         return with_structure(system.with_initial_states().with_initial_scalars())
 
 
-def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[str, AbstractFrame], given: Any):
+def _resolved(
+    scene: Scene,
+    layout: Layout,
+    index: dict[str, int],
+    scalars: dict[str, tuple[int, ...]],
+    frames: dict[str, AbstractFrame],
+    given: Any,
+):
     """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity.
 
-    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `given`: the poses of all bodies.
+    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `scalars`: those of the scalar
+    coordinates of parts by their names; `given`: the poses of all bodies and scalar coordinates.
     """
     space = layout.space
     gravity, parts, laws, joints = None, [], [], {}
@@ -156,7 +168,7 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
             placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
             resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
-            own = (*own, index[part.name]) if isinstance(part, AbstractInertialConstraint) else own
+            own = (*own, *scalars.get(part.name, ()))
             joints[part.name] = resolved, own, (None,) * len(own)
             parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
@@ -176,10 +188,6 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             part.check(space.dimension)
             gravity = part
     return parts, laws, gravity
-
-
-def _scalar_coordinate(part):
-    return ScalarCoordinate(f"{part.name}.{'displacement' if part.is_length else 'angle'}", part.is_length)
 
 
 def _source(name, joints, named, frames, index):

@@ -82,7 +82,9 @@ def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
     expected = rates_of(plain, state.q[:n], state.u[:m])
     np.testing.assert_allclose(state.u[m:], expected, rtol=0, atol=1e-13)
     own = by_mass_matrix(plain, state.q[:n], state.u[:m])
-    found = jax.jit(lambda q, u: [accelerations(system, f, 0.0, q, u)[0] for f in FORMULATIONS.values()])(*_parts(state))
+    found = jax.jit(lambda q, u: [accelerations(system, f, 0.0, q, u)[0] for f in FORMULATIONS.values()])(
+        *_parts(state)
+    )
     for name, udot in zip(FORMULATIONS, found, strict=True):
         np.testing.assert_allclose(udot[:m], own, rtol=0, atol=1e-11 * np.max(np.abs(own)), err_msg=name)
 
@@ -174,8 +176,9 @@ def test_sparse_elimination():
     system = geared(8)
     assert system.elimination is not None and system.implicit_in_blocks
     start = mb.assemble(system, rates={f"hinge{k}.angle": 0.5 for k in range(8)})
-    sparse, dense = (accelerations(system, FORMULATIONS[name], 0.0, *_parts(start))[0] for name in
-                     ("multipliers", "null_space"))
+    sparse, dense = (
+        accelerations(system, FORMULATIONS[name], 0.0, *_parts(start))[0] for name in ("multipliers", "null_space")
+    )
     np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-10 * np.max(np.abs(dense)))
     ts = np.linspace(0.0, 0.5, 3)
     ends = [mb.simulate(system, start, t1=0.5, rtol=1e-9, saveat=ts, **own) for own in ({}, {"solver": Hermite()})]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,21 +29,31 @@ STOP_TIME = 0.02
 _ROUNDING = 1e-3
 
 
+class Scalar(NamedTuple):
+    """A scalar coordinate of the scene: the name of the file's joint or, if it is `of_tendon`, tendon; what must be
+    added to it to give the coordinate of the file; and whether it `moves`, see `ScalarCoordinate` of `jaxmb.parts`.
+    """
+
+    name: str
+    offset: float
+    of_tendon: bool = False
+    moves: bool = True
+
+
 @dataclasses.dataclass
 class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `inertias`, in the
-    order of the scene: whether each is of a tendon, the name of the joint or tendon, and what must be added to its
-    coordinate to give that of the file; `shapes` and `collision_shapes` of bodies by name.
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `scalars`: the
+    scalar coordinates of the scene in order; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
     coordinates: dict[str, tuple[str | None, float]]
     controls: dict[str, str]
     fused: Fused
-    inertias: list[tuple[bool, str, float]]
+    scalars: list[Scalar]
     shapes: dict[str, tuple[AbstractShape, ...]]
     collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
@@ -64,7 +74,7 @@ class _Builder:
         self.frames: list[Any] = []
         self.coordinates: dict[str, tuple[str | None, float]] = {}
         self.controls: dict[str, str] = {}
-        self.inertias: list[tuple[bool, str, float]] = []
+        self.scalars: list[Scalar] = []
         self.names: set[str] = {GROUND}
         self.tendons: dict[str, tuple[str, float]] = {}
 
@@ -92,7 +102,7 @@ class _Builder:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
         collisions = self._of_bodies(machine.collisions)
         shapes = collisions | self._of_bodies(machine.shapes)
-        return Built(scene, self.coordinates, self.controls, self.fused, self.inertias, shapes, collisions)
+        return Built(scene, self.coordinates, self.controls, self.fused, self.scalars, shapes, collisions)
 
     def _named(self, name, kind=""):
         """A name that nothing in the scene has yet."""
@@ -193,7 +203,7 @@ class _Builder:
 
     def _inertia(self, name, coordinate, offset, armature, *, of_tendon=False):
         self.joints.append(JointInertia(self._named(f"{name} armature"), coordinate, inertia=armature))
-        self.inertias.append((of_tendon, name, offset))
+        self.scalars.append(Scalar(name, offset, of_tendon))
 
     def _friction(self, name, coordinate, force):
         self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
@@ -288,8 +298,9 @@ class _Builder:
                 if any(coordinate is None for (coordinate, _), _ in found):
                     continue
                 name = self._named(tendon.name, "tendon")
-                for joint, _ in tendon.joints:
-                    self._seen_up_to_half_a_turn(joint, tendon.name)
+                for (_, own), (joint, _) in zip((each for each, _ in found), tendon.joints, strict=True):
+                    if self.of_name[joint].kind == "hinge":
+                        self.scalars.append(Scalar(joint, own, moves=False))
                 along, coefficients = [own for (own, _), _ in found], [c for _, c in found]
                 offset = sum(c * own for (_, own), c in found)
                 self.joints.append(FixedTendon(name, along, coefficients=coefficients))
@@ -356,7 +367,7 @@ class _Builder:
         """Note that something sees the angle of a joint up to half a turn from a zero, if it may leave this range."""
         joint = self.of_name[name]
         if joint.kind == "hinge" and (_range(joint) is None or not _near(joint, zero)):
-            self.notes.say("Tendons and couplings see angles of hinges up to half a turn from their zeros: {}.", of)
+            self.notes.say("Couplings see angles of hinges up to half a turn from their zeros: {}.", of)
 
     # Frames, weights and pictures
 

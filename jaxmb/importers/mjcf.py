@@ -273,9 +273,7 @@ class _Locate:
         self._bodies = [(numbers[body.name], np.asarray(body.centre)) for body in bodies]
         joints = {names.joint(k): k for k in range(model.njnt)}
         tendons = {names("tendon", k): k for k in range(model.ntendon)}
-        self._inertias = [
-            (of_tendon, (tendons if of_tendon else joints)[name], offset) for of_tendon, name, offset in built.inertias
-        ]
+        self._scalars = [((tendons if own.of_tendon else joints)[own.name], own) for own in built.scalars]
 
     def __call__(self, qpos: np.ndarray, qvel: np.ndarray) -> State:
         mujoco, model = self._mujoco, self.model
@@ -294,8 +292,9 @@ class _Locate:
             arm = turn @ centre
             q += [*(data.xpos[k] + arm), *data.xquat[k]]
             u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
-        for of_tendon, k, offset in self._inertias:
-            value = data.ten_length[k] if of_tendon else data.qpos[model.jnt_qposadr[k]]
-            q.append(value - offset)
-            u.append(data.ten_velocity[k] if of_tendon else data.qvel[model.jnt_dofadr[k]])
+        for k, own in self._scalars:
+            value = data.ten_length[k] if own.of_tendon else data.qpos[model.jnt_qposadr[k]]
+            q.append(value - own.offset)
+            if own.moves:
+                u.append(data.ten_velocity[k] if own.of_tendon else data.qvel[model.jnt_dofadr[k]])
         return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from . import fields
-from .base import AbstractInertialConstraint
+from .base import AbstractInertialConstraint, ScalarCoordinate
 from .combinations import AbstractCombination
 from .joint_parts import shortest
 
@@ -33,9 +33,10 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     def combined(self):
         return (self.coordinate,)
 
-    @property
-    def is_length(self):
-        return self.coordinate.partition(".")[2] in ("displacement", "length")
+    def scalar_coordinates(self, parts):
+        is_length = self.coordinate.partition(".")[2] in ("displacement", "length")
+        name = f"{self.name}.{'displacement' if is_length else 'angle'}"
+        return (ScalarCoordinate(name, is_length=is_length, moves=True),)
 
     def residual(self, space, poses, t):
         (value,) = self.values(space, poses[:-1])

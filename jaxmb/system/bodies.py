@@ -88,7 +88,8 @@ class AbstractBodySystem(AbstractBodies):
 
     @property
     def coordinate_rows(self) -> int:
-        return self.position_rows + (sum(self.layout.rotates) if self.spatial else 0)
+        counts = sum(len(g.group.names) * g.rows for g in self.turn_counts)
+        return self.position_rows + counts + (sum(self.layout.rotates) if self.spatial else 0)
 
     @property
     def velocity_rows(self) -> int:
@@ -140,9 +141,14 @@ class AbstractBodySystem(AbstractBodies):
         """The groups of parts that have scalar coordinates."""
         return tuple(g for g in self.constraints if _is_inertial(g))
 
+    @property
+    def turn_counts(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of tendons that have scalar coordinates; their residuals vanish as coordinates are normalised."""
+        return tuple(ConstraintGroup(g.group) for g in self.tendons if g.group.part.rows)
+
     def with_initial_scalars(self) -> Self:
         """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
-        if not self._inertial:
+        if not self.layout.scalars:
             return self
         return dataclasses.replace(self, guess=_with_scalars(self, self.guess))
 
@@ -375,7 +381,7 @@ def _is_inertial(group):
 
 @eqx.filter_jit
 def _with_scalars(system, guess):
-    t, q, u = jnp.zeros((), guess.q.dtype), guess.q, guess.u
+    t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
     layout = system.layout
     for g in system._inertial:
         scalars = g.group.body_index[:, -1]

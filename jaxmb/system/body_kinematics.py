@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import normalize
+from .constraint_groups import ConstraintGroup
 from .coordinates import coordinate_names, rate_names
 from .equation import AbstractSystem
 from .groups import BodyGroup
@@ -23,10 +24,12 @@ else:
 class AbstractBodies(AbstractSystem):
     """The coordinates and velocities of stacked bodies.
 
-    **Fields:** the groups of `bodies`, their names, and where their coordinates and velocities stand, `layout`.
+    **Fields:** the groups of `bodies`, their names, where their coordinates and velocities stand, `layout`, and the
+    groups of parts that have `turn_counts`.
     """
 
     bodies: AbstractVar[tuple[BodyGroup, ...]]
+    turn_counts: AbstractVar[tuple[ConstraintGroup, ...]]
     layout: AbstractVar[Layout]
     body_names: AbstractVar[tuple[str, ...]]
 
@@ -109,12 +112,25 @@ class AbstractBodies(AbstractSystem):
     def rates(self, t, q, u):
         if self.rates_are_velocities:
             return u
-        return self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
+        rates = self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
+        for g in self.turn_counts:
+            own = g.velocity(jnp.asarray(t, q.dtype), self.prepared_poses(q), self.all_velocities(u))
+            rates = rates.at[self._counts(g)].set(-own)
+        return rates
 
     def normalize(self, q):
         if self.rates_are_velocities:
             return q
-        return self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
+        q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
+        for g in self.turn_counts:
+            # A count of turns does not depend on the time.
+            own = g.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
+            q = q.at[self._counts(g)].add(-own)
+        return q
+
+    def _counts(self, group):
+        """Where the counts of turns of stacked tendons stand in q, shape (parts, rows)."""
+        return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
 
     def normalize_fixed(self, q, fixed):
         rotating = np.flatnonzero(np.array(self.layout.rotates) & self.spatial)

@@ -40,9 +40,11 @@ def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]
 
 
 def scalar_quantities(layout: Layout) -> dict[str, Quantity]:
-    """Scalar coordinates, their rates and accelerations, `"rotor.angle"`, `"rotor.angle_rate"`."""
+    """Scalar coordinates that move, their rates and accelerations, `"rotor.angle"`, `"rotor.angle_rate"`."""
     out = {}
     for k, own in enumerate(layout.scalars, layout.bodies):
+        if not own.moves:
+            continue
         i, j = int(layout.pose_index[k][0]), int(layout.velocity_index[k][0])
         out[own.name] = Quantity((), lambda ts, ys, _, i=i: ys.q[:, i])
         out[f"{own.name}_rate"] = Quantity((), lambda ts, ys, _, j=j: ys.u[:, j])

@@ -14,7 +14,7 @@ from .layout import Layout
 
 def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`,
-    `position`, `orientation` of spatial ones; and of scalar coordinates.
+    `position`, `orientation` of spatial ones; and of scalar coordinates that move.
     """
     if layout.space.dimension == 3:
         fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
@@ -25,7 +25,7 @@ def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[
 
 def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`,
-    `angular_velocity` in space; scalar coordinates have the same name.
+    `angular_velocity` in space; scalar coordinates have their names.
     """
     if layout.space.dimension == 3:
         fields = ["x", "y", "z", "wx", "wy", "wz"]
@@ -44,7 +44,8 @@ def _names(layout, bodies, index, fields, groups):
         for group, where in groups.items():
             if where.stop <= own:
                 names[f"{body}.{group}"] = row[where]
-    return names | {own.name: [row[0]] for own, row in zip(layout.scalars, rows[layout.bodies :], strict=True)}
+    scalars = zip(layout.scalars, rows[layout.bodies :], strict=True)
+    return names | {own.name: [row[0]] for own, row in scalars if own.moves}
 
 
 def prescribe(

@@ -2,20 +2,12 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..parts.base import ScalarCoordinate
 from ..parts.space import AbstractSpace
-
-
-class ScalarCoordinate(NamedTuple):
-    """A coordinate with inertia that belongs to a part: its name, `"rotor.angle"`, and whether it is a length [m],
-    otherwise an angle [rad].
-    """
-
-    name: str
-    is_length: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +15,7 @@ class Layout:
     """Bodies in order, each with its pose and velocity contiguous; then scalar coordinates; the ground is the last.
 
     A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant. A scalar
-    coordinate is like a body that has only the first entries of pose and velocity.
+    coordinate is like a body that has only the first entry of the pose and, if it moves, of the velocity.
     """
 
     space: AbstractSpace
@@ -39,6 +31,11 @@ class Layout:
         """The number of the ground: that of bodies and scalar coordinates."""
         return len(self.rotates) + len(self.scalars)
 
+    def is_place(self, numbers: Sequence[int]) -> np.ndarray:
+        """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
+        own = np.array(numbers)
+        return (own < self.bodies) | (own == self.ground)
+
     @property
     def uniform(self) -> bool:
         """Whether there are only bodies that rotate, so that poses are a plain reshape of the coordinates."""
@@ -49,12 +46,12 @@ class Layout:
         """Index of every pose entry, shape (ground + 1, pose size), into the coordinates followed by the ground's
         pose.
         """
-        return self._index(self.space.pose_size, [*range(self.nq, self.nq + self.space.pose_size)])
+        return _index(self._pose_sizes, [*range(self.nq, self.nq + self.space.pose_size)])
 
     @functools.cached_property
     def velocity_index(self) -> np.ndarray:
         """Index of every velocity entry, shape (ground + 1, velocity size), into the velocities followed by a zero."""
-        return self._index(self.space.velocity_size, [self.nu] * self.space.velocity_size)
+        return _index(self._velocity_sizes, [self.nu] * self.space.velocity_size)
 
     @functools.cached_property
     def velocity_place(self) -> np.ndarray:
@@ -68,22 +65,21 @@ class Layout:
 
     @functools.cached_property
     def nq(self) -> int:
-        return sum(self._sizes(self.space.pose_size))
+        return sum(self._pose_sizes)
 
     @functools.cached_property
     def nu(self) -> int:
-        return sum(self._sizes(self.space.velocity_size))
+        return sum(self._velocity_sizes)
 
-    def _sizes(self, size: int) -> list[int]:
-        """The number of entries of each body, of which one that rotates has `size`, and of each scalar coordinate."""
-        return [*(size if rotates else self.space.dimension for rotates in self.rotates), *(1 for _ in self.scalars)]
+    @property
+    def _pose_sizes(self) -> list[int]:
+        size, d = self.space.pose_size, self.space.dimension
+        return [*(size if rotates else d for rotates in self.rotates), *(1 for _ in self.scalars)]
 
-    def _index(self, size: int, constant: list[int]) -> np.ndarray:
-        index, start = [], 0
-        for own in self._sizes(size):
-            index.append([*range(start, start + own), *constant[own:]])
-            start += own
-        return np.array([*index, constant], np.int32)
+    @property
+    def _velocity_sizes(self) -> list[int]:
+        size, d = self.space.velocity_size, self.space.dimension
+        return [*(size if rotates else d for rotates in self.rotates), *(int(own.moves) for own in self.scalars)]
 
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
         """Source of each entry of an assembled Jacobian.
@@ -127,3 +123,12 @@ class Layout:
         width = max(map(len, found.values()))
         fill = lambda blocks: [*blocks, *[np.full_like(blocks[0], start)] * (width - len(blocks))]
         return np.array([fill(found[name]) for name in names])
+
+
+def _index(sizes: list[int], constant: list[int]) -> np.ndarray:
+    """The entries of bodies of these sizes, one after the other, and constants for what they lack and the ground."""
+    index, start = [], 0
+    for own in sizes:
+        index.append([*range(start, start + own), *constant[own:]])
+        start += own
+    return np.array([*index, constant], np.int32)

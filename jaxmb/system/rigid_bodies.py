@@ -39,7 +39,9 @@ class RigidBodySystem(AbstractBodySystem):
         if not self.spatial:
             return residual
         p = self.poses(q)[_rotating(self.layout), 3:]
-        return jnp.concatenate([residual, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
+        poses = self.prepared_poses(q)
+        counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
+        return jnp.concatenate([residual, *counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
 
     @eqx.filter_jit
     def coordinate_jacobian(self, t, q):
@@ -49,8 +51,9 @@ class RigidBodySystem(AbstractBodySystem):
         unit = jnp.eye(self.layout.space.pose_size, dtype=q.dtype)
         along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(unit)
         moves = jax.vmap(along)(poses[:, : self.layout.space.pose_size])
-        blocks = [g.along(t, poses, moves) for g in self.constraints]
-        jacobian = self._assemble(blocks, self.constraints, q.dtype, of_poses=True)
+        groups = (*self.constraints, *self.turn_counts)
+        blocks = [g.along(t, poses, moves) for g in groups]
+        jacobian = self._assemble(blocks, groups, q.dtype, of_poses=True)
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
         rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
@@ -131,12 +134,16 @@ class RigidBodySystem(AbstractBodySystem):
 
     @property
     def _masses_of_coordinates(self):
-        """What counts as the mass of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]."""
-        own = self._inertial
-        if not own:
+        """What counts as the mass of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]; one, which
+        has no effect, of those that do not move.
+        """
+        if not self.layout.scalars:
             return self.mass
-        order = np.argsort(np.concatenate([g.group.body_index[:, -1] for g in own]))
-        inertias = unchecked_take(jnp.concatenate([g.group.part.inertia for g in own]), order)
+        found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self._inertial]
+        still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
+        order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
+        ones = jnp.ones(len(still), self.mass.dtype)
+        inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in found), ones]), order)
         return jnp.concatenate([self.mass, inertias])
 
     @eqx.filter_jit
@@ -232,7 +239,8 @@ class RigidBodySystem(AbstractBodySystem):
             for k in body[: self.layout.space.dimension]:
                 translation[k] = True
         for own, row in zip(self.layout.scalars, index[self.layout.bodies : -1], strict=True):
-            translation[row[0]] = own.is_length
+            if row[0] < size:
+                translation[row[0]] = own.is_length
         return jnp.where(np.array(translation), length, 1.0)
 
 
