@@ -9,7 +9,7 @@ from test_formulations import FORMULATIONS
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.formulations import accelerations
 from jaxmb.solvers import Hermite
 
 X, Y, Z = np.eye(3)
@@ -82,15 +82,10 @@ def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
     expected = rates_of(plain, state.q[:n], state.u[:m])
     np.testing.assert_allclose(state.u[m:], expected, rtol=0, atol=1e-13)
     own = by_mass_matrix(plain, state.q[:n], state.u[:m])
-    found = jax.jit(lambda q, u: [accelerations(system, f, 0.0, q, u)[0] for f in FORMULATIONS.values()])(
-        *_parts(state)
-    )
+    solve = jax.jit(lambda q, u: [accelerations(system, f, 0.0, q, u)[0] for f in FORMULATIONS.values()])
+    found = solve(state.q, state.u)
     for name, udot in zip(FORMULATIONS, found, strict=True):
         np.testing.assert_allclose(udot[:m], own, rtol=0, atol=1e-11 * np.max(np.abs(own)), err_msg=name)
-
-
-def _parts(state):
-    return state.q, state.u
 
 
 def test_they_have_energy_but_neither_mass_nor_momentum():
@@ -101,10 +96,10 @@ def test_they_have_energy_but_neither_mass_nor_momentum():
     assert system.body_names == plain.body_names and "spatial, 3 bodies" in str(system)
     more = sum(0.5 * size * rate**2 for (_, size), rate in zip(SIZES.values(), state.u[plain.nu :], strict=True))
     kinetic = plain.kinetic_energy(0.0, q, u) + more
-    assert float(system.kinetic_energy(0.0, *_parts(state))) == pytest.approx(float(kinetic), rel=1e-14)
+    assert float(system.kinetic_energy(0.0, state.q, state.u)) == pytest.approx(float(kinetic), rel=1e-14)
     assert float(system.potential_energy(0.0, state.q)) == float(plain.potential_energy(0.0, q))
     for name in ("linear_momentum", "angular_momentum"):
-        np.testing.assert_array_equal(getattr(system, name)(*_parts(state)), getattr(plain, name)(q, u))
+        np.testing.assert_array_equal(getattr(system, name)(state.q, state.u), getattr(plain, name)(q, u))
 
 
 @pytest.mark.long
@@ -113,46 +108,84 @@ def test_a_machine_that_floats_conserves_energy_and_momentum():
     motion = mb.simulate(system, moving(system), t1=2.0, rtol=1e-10, saveat=np.linspace(0.0, 2.0, 9))
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-9)
     for name in ("linear_momentum", "angular_momentum"):
-        values = jax.vmap(getattr(system, name))(*_parts(motion.ys))
+        values = jax.vmap(getattr(system, name))(motion.ys.q, motion.ys.u)
         np.testing.assert_allclose(values, jnp.broadcast_to(values[0], values.shape), rtol=0, atol=1e-9)
     assert np.max(motion.constraint_violation) < 1e-12
 
 
-TORQUE, TIME, INERTIA = 6.0, 5.0, 0.3
+INERTIA, STIFFNESS, WINDING, START, RATE = 0.3, 2.0, 0.3, 0.4, 8.0
+TS = np.linspace(0.0, 5.0, 6)
 
 
-def wheel(**place):
-    body = spatial.Body("wheel", mass=1.0, inertia=J, **place)
-    hinge = spatial.Revolute("axle", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=Y)
-    parts = [hinge, mb.JointInertia("rotor", "axle.angle", inertia=INERTIA)]
-    return mb.Scene([body], joints=parts, forces=[mb.JointForce("motor", "axle.angle", force=TORQUE)]).compile()
+def wheel():
+    """A wheel in space with a rotor, and with a spring on a cord that it winds up."""
+    cord = mb.FixedTendon("cord", "axle.angle", coefficients=(WINDING,))
+    joints = [
+        spatial.Revolute("axle", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=Y),
+        mb.JointInertia("rotor", "axle.angle", inertia=INERTIA),
+        cord,
+    ]
+    spring = mb.JointSpring("spring", "cord.length", stiffness=STIFFNESS, free=0.0)
+    return mb.Scene([spatial.Body("wheel", mass=1.0, inertia=J)], joints=joints, forces=[spring]).compile()
 
 
-def test_many_turns_with_derivatives():
-    """A constant torque accelerates a wheel and its rotor, `ω = τ t / (J + inertia)`."""
-    system, total = wheel(), J[1, 1] + INERTIA
-    start = mb.assemble(system, fix={"axle.angle": 0.4})
-    ts = jnp.linspace(0.0, TIME, 6)
+def angle_of_wheel(inertia, t):
+    """It vibrates by more than a full turn to either side."""
+    omega = WINDING * jnp.sqrt(STIFFNESS / (J[1, 1] + inertia))
+    return START * jnp.cos(omega * t) + RATE / omega * jnp.sin(omega * t)
 
-    def motion(inertia, adjoint=None):
-        changed = mb.with_parameters(system, {"rotor.inertia": inertia})
-        return mb.simulate(changed, start, t1=TIME, rtol=1e-9, saveat=ts, adjoint=adjoint)
 
-    once = motion(jnp.asarray(INERTIA))
-    np.testing.assert_allclose(once["rotor"].angle, 0.4 + TORQUE / total * ts**2 / 2, rtol=1e-9)
-    np.testing.assert_allclose(once["rotor"].angle_rate, TORQUE / total * ts, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(once["rotor"].angle_acceleration, TORQUE / total, rtol=1e-9)
-    np.testing.assert_allclose(once["axle"].angle, once["rotor"].angle, rtol=0, atol=1e-9)
+def motion_of_wheel(system, start, inertia=INERTIA, **options):
+    changed = mb.with_parameters(system, {"rotor.inertia": inertia})
+    return mb.simulate(changed, start, t1=5.0, rtol=1e-9, saveat=TS, **options)
+
+
+def start_of_wheel(system):
+    return mb.assemble(system, fix={"axle.angle": START}, rates={"axle.angle": RATE})
+
+
+def check_wheel(motion):
+    expected = angle_of_wheel(INERTIA, TS)
+    assert np.max(expected) > 2 * np.pi
+    np.testing.assert_allclose(motion["rotor"].angle, expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(motion["axle"].angle, motion["rotor"].angle, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion["cord"].length, WINDING * expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-8)
+    assert np.max(motion.constraint_violation) < 1e-11
+
+
+def test_a_wheel_with_a_rotor_winds_up_a_cord():
+    """Through full turns, which the angle of a hinge in space is known up to."""
+    system = wheel()
+    motion = motion_of_wheel(system, start_of_wheel(system))
+    check_wheel(motion)
+    pull = -STIFFNESS * WINDING * motion["cord"].length
+    acceleration = pull / (J[1, 1] + INERTIA)
+    np.testing.assert_allclose(motion["rotor"].angle_acceleration, acceleration, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.forces["spring"][:, -1, 4], pull, rtol=0, atol=1e-9)
     # On the wheel acts what accelerates it alone.
-    moment = TORQUE + once.reactions["rotor"].moment[:, 1]
-    np.testing.assert_allclose(moment, J[1, 1] * TORQUE / total, rtol=1e-9)
+    moment = pull + motion.reactions["rotor"].moment[:, 1]
+    np.testing.assert_allclose(moment, J[1, 1] * acceleration, rtol=0, atol=1e-9)
 
-    values = jnp.array([0.2, INERTIA])
-    end = lambda inertia, adjoint=None: motion(inertia, adjoint)["rotor"].angle[-1]
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "options", [{"manifold": mb.manifold.Projection()}, {"solver": Hermite()}, {"solver": diffrax.Dopri8()}]
+)
+def test_a_cord_is_wound_up_by_every_method(options):
+    system = wheel()
+    check_wheel(motion_of_wheel(system, start_of_wheel(system), **options))
+
+
+@pytest.mark.long
+def test_derivatives_of_a_wheel_with_a_rotor_and_a_cord():
+    system = wheel()
+    start, inertias = start_of_wheel(system), jnp.array([0.2, INERTIA])
+    end = lambda inertia, adjoint=None: motion_of_wheel(system, start, inertia, adjoint=adjoint)["rotor"].angle[-1]
     forward = lambda x: jax.jvp(lambda x: end(x, diffrax.ForwardMode()), (x,), (jnp.ones(()),))[1]
-    expected = -TORQUE * TIME**2 / 2 / (J[1, 1] + values) ** 2
-    np.testing.assert_allclose(jax.jit(jax.vmap(forward))(values), expected, rtol=1e-8)
-    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(end)))(values), expected, rtol=1e-8)
+    expected = jax.vmap(jax.grad(lambda x: angle_of_wheel(x, 5.0)))(inertias)
+    np.testing.assert_allclose(jax.jit(jax.vmap(forward))(inertias), expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(end)))(inertias), expected, rtol=1e-6)
 
 
 def geared(n):
@@ -177,7 +210,7 @@ def test_sparse_elimination():
     assert system.elimination is not None and system.implicit_in_blocks
     start = mb.assemble(system, rates={f"hinge{k}.angle": 0.5 for k in range(8)})
     sparse, dense = (
-        accelerations(system, FORMULATIONS[name], 0.0, *_parts(start))[0] for name in ("multipliers", "null_space")
+        accelerations(system, FORMULATIONS[name], 0.0, start.q, start.u)[0] for name in ("multipliers", "null_space")
     )
     np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-10 * np.max(np.abs(dense)))
     ts = np.linspace(0.0, 0.5, 3)
@@ -219,8 +252,8 @@ def test_linear_and_steady_motion():
     eigenvalues = np.asarray(mb.linearise(system, mb.assemble(system)).eigenvalues)
     np.testing.assert_allclose(np.abs(eigenvalues.imag), np.sqrt(8.0 / (0.1 + INERTIA)), rtol=1e-9)
 
-    turning = mb.with_parameters(wheel(), {"motor.force": 0.0})
-    state = mb.steady_motion(turning, mb.assemble(turning), rates={"axle.angle": 3.0})
+    free = mb.with_parameters(wheel(), {"spring.stiffness": 0.0})
+    state = mb.steady_motion(free, mb.assemble(free), rates={"axle.angle": 3.0})
     assert float(state.u[-1]) == pytest.approx(3.0, rel=1e-9)
 
 

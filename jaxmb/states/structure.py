@@ -228,10 +228,10 @@ def _check_locked(system, parts, blocks, scale, found):
             share = np.abs(left[:, len(columns) - 1])
             rows = [r for p in own for r in range(parts[p].first, parts[p].first + parts[p].rows)]
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
+            moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
             raise ValueError(
-                f"{', '.join(system.body_names[k] for k in bodies if k < system.layout.bodies)} cannot move: {', '.join(names)} leave no degree of "
-                "freedom, but with dimensions that differ only slightly from these they would (smallest singular value "
-                f"{sizes[-1]:.1e}). Make the points and lengths of redundant joints agree, or remove one of them."
+                f"{moving} cannot move: {', '.join(names)} leave no degree of freedom, but with dimensions that "
+                f"differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). Make the points and lengths of redundant joints agree, or remove one of them."
             )
 
 
