@@ -231,7 +231,8 @@ def _check_locked(system, parts, blocks, scale, found):
             moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
             raise ValueError(
                 f"{moving} cannot move: {', '.join(names)} leave no degree of freedom, but with dimensions that "
-                f"differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). Make the points and lengths of redundant joints agree, or remove one of them."
+                f"differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). "
+                "Make the points and lengths of redundant joints agree, or remove one of them."
             )
 
 
