@@ -75,6 +75,7 @@ class _Builder:
         self.coordinates: dict[str, tuple[str | None, float]] = {}
         self.controls: dict[str, str] = {}
         self.scalars: list[Scalar] = []
+        self.counted: dict[str, str] = {}
         self.names: set[str] = {GROUND}
         self.tendons: dict[str, tuple[str, float]] = {}
 
@@ -163,15 +164,13 @@ class _Builder:
             self.forces.append(
                 JointSpring(
                     self._named(f"{joint.name} spring"),
-                    coordinate,
+                    self._counted(joint.name) if "springs" in wanted else coordinate,
                     stiffness=joint.stiffness if "springs" in wanted else 0.0,
                     damping=joint.damping if "damping" in wanted else 0.0,
                     free=joint.free - offset,
                     middle=None if _near(joint, joint.free) else self._middle(joint.name) - offset,
                 )
             )
-        if "springs" in wanted:
-            self._shortest(joint)
         if "armature" in wanted:
             self._inertia(joint.name, coordinate, offset, joint.armature)
         if "friction" in wanted:
@@ -180,11 +179,20 @@ class _Builder:
             inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
             self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
 
-    def _shortest(self, joint):
-        if joint.kind == "hinge" and _range(joint) is None:
-            self.notes.say(
-                "Springs and servos of hinges without limits take the shortest way, up to half a turn: {}.", joint.name
-            )
+    def _counted(self, name):
+        """The coordinate of a joint for springs and servos: of a hinge that may turn as it likes, the length of a cord
+        that it winds up, which counts on through full turns.
+        """
+        coordinate, offset = self.coordinates[name]
+        joint = self.of_name[name]
+        if joint.kind != "hinge" or _range(joint) is not None:
+            return coordinate
+        if name not in self.counted:
+            cord = self._named(f"{name} turns")
+            self.joints.append(FixedTendon(cord, coordinate, coefficients=(1.0,)))
+            self.scalars.append(Scalar(name, offset, moves=False))
+            self.counted[name] = f"{cord}.length"
+        return self.counted[name]
 
     def _of_ball(self, joint, a, b, coordinate, wanted):
         if joint.kind == "free" and "damping" in wanted:
@@ -331,6 +339,8 @@ class _Builder:
             coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name, known)
             if coordinate is None:
                 continue
+            if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
+                coordinate = self._counted(actuator.of)
             gear, shift = actuator.gear, actuator.gear * offset
             shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
             ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
@@ -349,8 +359,6 @@ class _Builder:
                     **ranges,
                 )
             )
-            if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
-                self._shortest(self.of_name[actuator.of])
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
                     "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
