@@ -54,9 +54,9 @@ class Scene(eqx.Module):
     order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    including drivers, rolling and `Servo`; `forces`: force elements, joint friction, and at most one `Gravity`;
-    `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies. `"ground"` names the fixed
-    world.
+    including drivers, rolling and `Servo`, tendons, and inertias of joints; `forces`: force elements, joint friction,
+    and at most one `Gravity`; `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies.
+    `"ground"` names the fixed world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
