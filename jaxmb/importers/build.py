@@ -164,7 +164,7 @@ class _Builder:
             self.forces.append(
                 JointSpring(
                     self._named(f"{joint.name} spring"),
-                    self._counted(joint.name) if "springs" in wanted else coordinate,
+                    self._counted(joint.name, coordinate, offset) if "springs" in wanted else coordinate,
                     stiffness=joint.stiffness if "springs" in wanted else 0.0,
                     damping=joint.damping if "damping" in wanted else 0.0,
                     free=joint.free - offset,
@@ -179,11 +179,10 @@ class _Builder:
             inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
             self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
 
-    def _counted(self, name):
+    def _counted(self, name, coordinate, offset):
         """The coordinate of a joint for springs and servos: of a hinge that may turn as it likes, the length of a cord
         that it winds up, which counts on through full turns.
         """
-        coordinate, offset = self.coordinates[name]
         joint = self.of_name[name]
         if joint.kind != "hinge" or _range(joint) is not None:
             return coordinate
@@ -340,7 +339,7 @@ class _Builder:
             if coordinate is None:
                 continue
             if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
-                coordinate = self._counted(actuator.of)
+                coordinate = self._counted(actuator.of, coordinate, offset)
             gear, shift = actuator.gear, actuator.gear * offset
             shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
             ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
