@@ -78,6 +78,7 @@ def by_mass_matrix(system, q, u):
     return np.linalg.lstsq(both, np.concatenate([force, gamma]))[0][: system.nu]
 
 
+@pytest.mark.long
 def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
     """With redundant rows, and inertias of an angle, of a displacement and of a tendon along both."""
     plain, system = arm(), arm(*inertias())
@@ -92,6 +93,7 @@ def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
         np.testing.assert_allclose(udot[:m], own, rtol=0, atol=1e-11 * np.max(np.abs(own)), err_msg=name)
 
 
+@pytest.mark.long
 def test_they_have_energy_but_neither_mass_nor_momentum():
     plain, system = arm(floats=True), arm(*inertias(), floats=True)
     state = moving(system)
@@ -158,6 +160,7 @@ def check_wheel(motion):
     assert np.max(motion.constraint_violation) < 1e-11
 
 
+@pytest.mark.long
 def test_a_wheel_with_a_rotor_winds_up_a_cord():
     """Through full turns, which the angle of a hinge in space is known up to."""
     system = wheel()
