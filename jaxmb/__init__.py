@@ -27,6 +27,7 @@ from .parts.functions import (
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
 )
+from .parts.joint_inertia import JointInertia as JointInertia
 from .parts.joint_laws import (
     JointActuator as JointActuator,
     JointFriction as JointFriction,

@@ -1,5 +1,6 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from .parts.base import (
 )
 from .parts.boundary import check_kernels
 from .parts.contents import anonymous, inner_parts
-from .parts.fields import declarations, values_of
+from .parts.fields import as_parameter, declarations, values_of
 from .parts.forces import Gravity
 from .parts.frames import AbstractFrame, frames_by_name
 from .parts.joint_parts import AbstractCoordinatePart
@@ -53,9 +54,9 @@ class Scene(eqx.Module):
     order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    including drivers, rolling and `Servo`; `forces`: force elements, joint friction, and at most one `Gravity`;
-    `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies. `"ground"` names the fixed
-    world.
+    including drivers, rolling and `Servo`, tendons, and inertias of joints; `forces`: force elements, joint friction,
+    and at most one `Gravity`; `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies.
+    `"ground"` names the fixed world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
@@ -86,11 +87,17 @@ class Scene(eqx.Module):
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        layout = Layout(space, tuple(body.rotates for body in self.bodies))
-        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: len(self.bodies)}
+        joints = {part.name: part for part in self.joints}
+        scalars = {part.name: _call(part, "scalar_coordinates", joints) for part in self.joints}
+        layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
+        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
+        numbers = iter(range(layout.bodies, layout.ground))
+        of_parts = {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
+        zeros = as_parameter(np.zeros(len(layout.scalars)))
+        moving = [k for k, own in enumerate(layout.scalars) if own.moves]
         guess = State(
-            jax.device_put(np.concatenate([_call(body, "pose") for body in self.bodies])),
-            jax.device_put(np.concatenate([_call(body, "velocities") for body in self.bodies])),
+            jax.device_put(np.concatenate([*(_call(body, "pose") for body in self.bodies), zeros])),
+            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros[moving]])),
         )
         if is_traced(guess):
             raise ValueError(
@@ -101,7 +108,7 @@ class Scene(eqx.Module):
 
         frames = frames_by_name(self.frames, self.bodies)
         index |= {name: index[frame.of_body] for name, frame in frames.items()}
-        parts, laws, gravity = _resolved(self, layout, index, frames, given)
+        parts, laws, gravity = _resolved(self, layout, index, of_parts, frames, given)
 
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
@@ -128,13 +135,21 @@ class Scene(eqx.Module):
             implied=(),
             elimination=None,
         )
-        return with_structure(system.with_initial_states())
+        return with_structure(system.with_initial_states().with_initial_scalars())
 
 
-def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[str, AbstractFrame], given: Any):
+def _resolved(
+    scene: Scene,
+    layout: Layout,
+    index: dict[str, int],
+    scalars: dict[str, tuple[int, ...]],
+    frames: dict[str, AbstractFrame],
+    given: Any,
+):
     """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity.
 
-    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `given`: the poses of all bodies.
+    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `scalars`: those of the scalar
+    coordinates of parts by their names; `given`: the poses of all bodies and scalar coordinates.
     """
     space = layout.space
     gravity, parts, laws, joints = None, [], [], {}
@@ -153,6 +168,7 @@ def _resolved(scene: Scene, layout: Layout, index: dict[str, int], frames: dict[
             own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
             placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
             resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
+            own = (*own, *scalars.get(part.name, ()))
             joints[part.name] = resolved, own, (None,) * len(own)
             parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
@@ -305,6 +321,6 @@ def _length(parts, guess, layout):
     size = max(sizes, default=0.0)
     if size == 0.0:
         dimension = layout.space.dimension
-        position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[:-1]])
+        position = np.concatenate([np.asarray(guess.q)[row[:dimension]] for row in layout.pose_index[: layout.bodies]])
         size = float(np.max(np.abs(position)))
     return jax.device_put(np.asarray(size if size > 0 else 1.0, guess.q.dtype))

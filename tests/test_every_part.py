@@ -21,6 +21,7 @@ from jaxmb.parts import (
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
+    AbstractInertialConstraint,
     AbstractNonIdeal,
     AbstractVelocityConstraint,
     contact,
@@ -285,6 +286,7 @@ FUNCTIONS = [
     of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
+    of_joint(mb.JointInertia, "inertia", inertia=0.4),
     of_joint(
         mb.Actuator, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False
     ),
@@ -405,6 +407,11 @@ SPATIAL = [
         "JointFriction",
         lambda angles: [mb.JointFriction("JointFriction on a gimbal", angles[1], force=0.3, transition_speed=0.5)],
     ),
+    on_gimbal(
+        "inertia",
+        "JointInertia",
+        lambda angles: [mb.JointInertia("JointInertia on a gimbal", angles[1], inertia=0.2)],
+    ),
     tendon_3d(),
     of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
@@ -441,7 +448,12 @@ SPATIAL = [
 
 SPACES = {"planar": PLANAR, "functions": FUNCTIONS, "spatial": [*SPATIAL, rubbing_3d()]}
 EXAMPLES = {f"{space}: {example.part.name}": example for space, own in SPACES.items() for example in own}
-CONSTRAINED = [name for name, example in EXAMPLES.items() if isinstance(example.part, CONSTRAINTS)]
+# Inertias of one coordinate add up.
+CONSTRAINED = [
+    name
+    for name, example in EXAMPLES.items()
+    if isinstance(example.part, CONSTRAINTS) and not isinstance(example.part, AbstractInertialConstraint)
+]
 AT_REST = [name for name, example in EXAMPLES.items() if example.rests and example.ideal]
 # By a method that is compiled sooner than the default.
 METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "max_steps": 512}

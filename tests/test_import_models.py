@@ -28,6 +28,7 @@ TREES = {
     "reacher": ("playground", f"{SUITE}reacher.xml"),
     "walker": ("playground", f"{SUITE}walker.xml"),
     "ant": ("newton", "newton/examples/assets/nv_ant.xml"),
+    "gym's ant": ("gymnasium", "gymnasium/envs/mujoco/assets/ant.xml"),
     "go1": ("playground", f"{PLAYGROUND}locomotion/go1/xmls/go1_mjx_feetonly.xml"),
     "leap hand": ("playground", f"{PLAYGROUND}manipulation/leap_hand/xmls/leap_rh_mjx.xml"),
     "h1": ("playground", f"{PLAYGROUND}locomotion/h1/xmls/h1_mjx_feetonly.xml"),
@@ -47,7 +48,10 @@ def path_of(package, end):
 
 @pytest.mark.parametrize("name", TREES)
 def test_trees_move_as_in_mujoco(name):
-    check_dynamics(importers.mjcf(path_of(*TREES[name]), ignore=(*OFF, "meshes")), 100, scale=0.5)
+    model = importers.mjcf(path_of(*TREES[name]), ignore=(*OFF, "meshes"))
+    system = check_dynamics(model, 100, scale=0.5)
+    moving = model.locate.model.body_weldid > 0
+    assert float(np.sum(system.mass)) == pytest.approx(np.sum(model.locate.model.body_mass[moving]), rel=1e-12)
 
 
 def test_a_urdf_tree_moves_as_in_mujoco():

@@ -174,7 +174,7 @@ def test_a_mimic_with_an_offset_is_an_equality_of_mujoco():
     q = [own for name in system.body_names for k in [other.body(name).id] for own in (data.xipos[k], data.xquat[k])]
     residual = system.position_residual(0.0, jnp.concatenate([jnp.asarray(own) for own in q]))
     assert float(np.max(np.abs(residual))) == pytest.approx(abs(row), rel=1e-12) and abs(row) > 0.2
-    assert "Tendons and couplings see angles of hinges up to half a turn from their zeros: 'r mimic'." in found.notes
+    assert "Couplings see angles of hinges up to half a turn from their zeros: 'r mimic'." in found.notes
 
 
 def test_a_range_of_zero_is_none():

@@ -2,20 +2,21 @@
 
 import dataclasses
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, Tendon
 from ..parts.forces import Damper, Gravity, PointForce
+from ..parts.joint_inertia import JointInertia
 from ..parts.joint_laws import JointActuator, JointFriction, JointStop
 from ..parts.joint_parts import JointDriver, JointSpring
 from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body
 from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
-from ..parts.spatial.joints import Fixed, Revolute, Spherical
+from ..parts.spatial.joints import Fixed, Spherical
 from ..scene import Scene
 from . import chains
 from .description import Joint, Link, Machine, quaternion
@@ -28,20 +29,31 @@ STOP_TIME = 0.02
 _ROUNDING = 1e-3
 
 
+class Scalar(NamedTuple):
+    """A scalar coordinate of the scene: the name of the file's joint or, if it is `of_tendon`, tendon; what must be
+    added to it to give the coordinate of the file; and whether it `moves`, see `ScalarCoordinate` of `jaxmb.parts`.
+    """
+
+    name: str
+    offset: float
+    of_tendon: bool = False
+    moves: bool = True
+
+
 @dataclasses.dataclass
 class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
     **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `rotors`: for each
-    rotor its joint; `shapes` and `collision_shapes` of bodies by name.
+    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `scalars`: the
+    scalar coordinates of the scene in order; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
     coordinates: dict[str, tuple[str | None, float]]
     controls: dict[str, str]
     fused: Fused
-    rotors: dict[str, str]
+    scalars: list[Scalar]
     shapes: dict[str, tuple[AbstractShape, ...]]
     collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
@@ -62,7 +74,8 @@ class _Builder:
         self.frames: list[Any] = []
         self.coordinates: dict[str, tuple[str | None, float]] = {}
         self.controls: dict[str, str] = {}
-        self.rotors: dict[str, str] = {}
+        self.scalars: list[Scalar] = []
+        self.counted: dict[str, str] = {}
         self.names: set[str] = {GROUND}
         self.tendons: dict[str, tuple[str, float]] = {}
 
@@ -90,7 +103,7 @@ class _Builder:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
         collisions = self._of_bodies(machine.collisions)
         shapes = collisions | self._of_bodies(machine.shapes)
-        return Built(scene, self.coordinates, self.controls, self.fused, self.rotors, shapes, collisions)
+        return Built(scene, self.coordinates, self.controls, self.fused, self.scalars, shapes, collisions)
 
     def _named(self, name, kind=""):
         """A name that nothing in the scene has yet."""
@@ -151,28 +164,34 @@ class _Builder:
             self.forces.append(
                 JointSpring(
                     self._named(f"{joint.name} spring"),
-                    coordinate,
+                    self._counted(joint.name, coordinate, offset) if "springs" in wanted else coordinate,
                     stiffness=joint.stiffness if "springs" in wanted else 0.0,
                     damping=joint.damping if "damping" in wanted else 0.0,
                     free=joint.free - offset,
                     middle=None if _near(joint, joint.free) else self._middle(joint.name) - offset,
                 )
             )
-        if "springs" in wanted:
-            self._shortest(joint)
         if "armature" in wanted:
-            self._rotor(joint.name, coordinate, joint.armature)
+            self._inertia(joint.name, coordinate, offset, joint.armature)
         if "friction" in wanted:
             self._friction(joint.name, coordinate, joint.friction)
         if "limits" in wanted:
             inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
             self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
 
-    def _shortest(self, joint):
-        if joint.kind == "hinge" and _range(joint) is None:
-            self.notes.say(
-                "Springs and servos of hinges without limits take the shortest way, up to half a turn: {}.", joint.name
-            )
+    def _counted(self, name, coordinate, offset):
+        """The coordinate of a joint for springs and servos: of a hinge that may turn as it likes, the length of a cord
+        that it winds up, which counts on through full turns.
+        """
+        joint = self.of_name[name]
+        if joint.kind != "hinge" or _range(joint) is not None:
+            return coordinate
+        if name not in self.counted:
+            cord = self._named(f"{name} turns")
+            self.joints.append(FixedTendon(cord, coordinate, coefficients=(1.0,)))
+            self.scalars.append(Scalar(name, offset, moves=False))
+            self.counted[name] = f"{cord}.length"
+        return self.counted[name]
 
     def _of_ball(self, joint, a, b, coordinate, wanted):
         if joint.kind == "free" and "damping" in wanted:
@@ -189,16 +208,9 @@ class _Builder:
         for kind in sorted(left):
             self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of the {joint.kind} joint {joint.name!r}")
 
-    def _rotor(self, name, coordinate, armature):
-        """A flywheel at the origin of the world, geared to a joint: there weight does no work on it."""
-        rotor, bearing = self._named(f"{name} rotor"), self._named(f"{name} bearing")
-        zero = np.zeros(3)
-        self.bodies.append(Body(rotor, mass=armature, inertia=np.full(3, armature), centre=zero))
-        self.joints.append(Revolute(bearing, GROUND, rotor, point=zero, axis=(0.0, 0.0, 1.0)))
-        self.joints.append(
-            JointCoupling(self._named(f"{name} gear"), f"{bearing}.angle", coordinate, coefficients=(0.0, 1.0))
-        )
-        self.rotors[rotor] = name
+    def _inertia(self, name, coordinate, offset, armature, *, of_tendon=False):
+        self.joints.append(JointInertia(self._named(f"{name} armature"), coordinate, inertia=armature))
+        self.scalars.append(Scalar(name, offset, of_tendon))
 
     def _friction(self, name, coordinate, force):
         self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
@@ -293,8 +305,9 @@ class _Builder:
                 if any(coordinate is None for (coordinate, _), _ in found):
                     continue
                 name = self._named(tendon.name, "tendon")
-                for joint, _ in tendon.joints:
-                    self._seen_up_to_half_a_turn(joint, tendon.name)
+                for (_, own), (joint, _) in zip((each for each, _ in found), tendon.joints, strict=True):
+                    if self.of_name[joint].kind == "hinge":
+                        self.scalars.append(Scalar(joint, own, moves=False))
                 along, coefficients = [own for (own, _), _ in found], [c for _, c in found]
                 offset = sum(c * own for (_, own), c in found)
                 self.joints.append(FixedTendon(name, along, coefficients=coefficients))
@@ -309,6 +322,8 @@ class _Builder:
                 "free": tendon.free - offset,
             }
             self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
+        if tendon.armature and not self.notes.leaves_out("armature", tendon.name):
+            self._inertia(tendon.name, coordinate, offset, tendon.armature, of_tendon=True)
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
             self._friction(tendon.name, coordinate, tendon.friction)
         if tendon.limits is not None and not self.notes.leaves_out("limits", tendon.name):
@@ -323,6 +338,8 @@ class _Builder:
             coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name, known)
             if coordinate is None:
                 continue
+            if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
+                coordinate = self._counted(actuator.of, coordinate, offset)
             gear, shift = actuator.gear, actuator.gear * offset
             shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
             ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
@@ -341,8 +358,6 @@ class _Builder:
                     **ranges,
                 )
             )
-            if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
-                self._shortest(self.of_name[actuator.of])
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
                     "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
@@ -359,7 +374,7 @@ class _Builder:
         """Note that something sees the angle of a joint up to half a turn from a zero, if it may leave this range."""
         joint = self.of_name[name]
         if joint.kind == "hinge" and (_range(joint) is None or not _near(joint, zero)):
-            self.notes.say("Tendons and couplings see angles of hinges up to half a turn from their zeros: {}.", of)
+            self.notes.say("Couplings see angles of hinges up to half a turn from their zeros: {}.", of)
 
     # Frames, weights and pictures
 

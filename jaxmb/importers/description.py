@@ -92,8 +92,8 @@ class Coupling:
 
 @dataclasses.dataclass
 class TendonPath:
-    """A tendon along joints, pairs of a name and a coefficient, or straight along points of links, with a spring and a
-    damper.
+    """A tendon along joints, pairs of a name and a coefficient, or straight along points of links, with a spring, a
+    damper and an inertia.
     """
 
     name: str
@@ -102,6 +102,7 @@ class TendonPath:
     stiffness: float = 0.0
     free: float = 0.0
     damping: float = 0.0
+    armature: float = 0.0
     friction: float = 0.0
     limits: tuple[float, float] | None = None
     stop: tuple[float, float] | None = None

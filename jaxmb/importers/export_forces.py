@@ -5,6 +5,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..parts.base import AbstractInertialConstraint
 from ..parts.spatial.kinematics import SPACE
 from ..system import RigidBodySystem
 from .description import matrix, quaternion
@@ -15,7 +16,7 @@ from .notes import Notes
 def write_forces(
     system: RigidBodySystem, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes
 ) -> None:
-    """Write the forces, tendons and frames of a system."""
+    """Write the forces, inertias of joints, tendons and frames of a system."""
     writer = _Writer(tree, elements, sections, notes)
     for part in parts_of(system, system.tendons, tree.poses):
         writer.tendon(part)
@@ -25,6 +26,9 @@ def write_forces(
         write = getattr(writer, f"write_{part.kind}", None)
         if write is None or write(part) is False:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
+    for part in parts_of(system, system.constraints, tree.poses):
+        if isinstance(part.part, AbstractInertialConstraint) and not notes.leaves_out("joints", part.name):
+            writer.inertia(part)
     for group in system.frames:
         for k, name in enumerate(group.group.names):
             writer.frame(name, group, k, system)
@@ -45,7 +49,8 @@ class _Writer:
             own.set("quat", numbers(quaternion(back @ rotation)))
 
     def frame(self, name, group, k, system):
-        body = (*system.body_names, "ground")[group.group.bodies[k][0]]
+        number = group.group.bodies[k][0]
+        body = system.body_names[number] if number < len(system.body_names) else "ground"
         pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.place(body)))
         self.site(name, body, pose[:3], matrix(pose[3:7]))
 
@@ -65,6 +70,15 @@ class _Writer:
                     return
                 ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
         self.tendons[f"{part.name}.length"] = element
+
+    def inertia(self, part):
+        (coordinate,) = part.acts_on
+        tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
+        element: Any = tendon if joint is None else self.tree.elements[joint.name]
+        if element is None:
+            self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
+            return
+        element.set("armature", numbers(float(element.get("armature", 0.0)) + float(part.part.inertia)))
 
     def write_JointSpring(self, part):
         own = part.part

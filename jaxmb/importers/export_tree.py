@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 
-from ..parts.base import GROUND
+from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.on_frames import framed
 from ..parts.spatial.kinematics import SPACE
 from ..system import RigidBodySystem
@@ -99,11 +99,12 @@ class Tree:
 
 def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[Part]:
     """The parts of some groups."""
-    names, out = (*system.body_names, GROUND), []
+    # Scalar coordinates are no bodies.
+    names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
             own = group.group.single(k, jnp.zeros(()))
-            bodies = tuple(names[body] for body in group.group.bodies[k])
+            bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
             places = np.stack([poses[body] for body in bodies])
             held = getattr(own, "frames", None)
             if isinstance(held, dict):
@@ -127,7 +128,11 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
     """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
     tree = Tree(places)
-    parts = [p for p in parts_of(system, system.constraints, places) if not notes.leaves_out("joints", p.name)]
+    parts = [
+        p
+        for p in parts_of(system, system.constraints, places)
+        if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
+    ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
     waiting = [p for p in parts if p.kind in _JOINTS and all(rotates.get(body, True) for body in p.bodies)]
     closing = [p for p in parts if p not in waiting]

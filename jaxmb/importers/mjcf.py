@@ -204,6 +204,7 @@ def _read_tendons(mujoco, model, names, machine, off):
             stiffness=0.0 if "SPRING" in off else float(model.tendon_stiffness[k]),
             free=float(model.tendon_lengthspring[k][0]),
             damping=0.0 if "DAMPER" in off else float(model.tendon_damping[k]),
+            armature=float(model.tendon_armature[k]),
             friction=0.0 if "FRICTIONLOSS" in off else float(model.tendon_frictionloss[k]),
             limits=tuple(model.tendon_range[k]) if model.tendon_limited[k] and "LIMIT" not in off else None,
         )
@@ -266,16 +267,13 @@ class _Locate:
 
     def __init__(self, mujoco: Any, model: Any, names: _Names, built: Any):
         self._mujoco, self.model = mujoco, model
-        self._bodies: list[tuple[str, int]] = []
         links = {names("body", k): k for k in range(model.nbody)}
         numbers = {own.name: links[link] for link, own in built.fused.carriers.items()}
+        bodies = () if built.scene is None else built.scene.bodies
+        self._bodies = [(numbers[body.name], np.asarray(body.centre)) for body in bodies]
         joints = {names.joint(k): k for k in range(model.njnt)}
-        for body in () if built.scene is None else built.scene.bodies:
-            if body.name in built.rotors:
-                self._bodies.append(("rotor", joints[built.rotors[body.name]]))
-            else:
-                self._bodies.append(("link", numbers[body.name]))
-        self._centres = [] if built.scene is None else [np.asarray(body.centre) for body in built.scene.bodies]
+        tendons = {names("tendon", k): k for k in range(model.ntendon)}
+        self._scalars = [((tendons if own.of_tendon else joints)[own.name], own) for own in built.scalars]
 
     def __call__(self, qpos: np.ndarray, qvel: np.ndarray) -> State:
         mujoco, model = self._mujoco, self.model
@@ -287,17 +285,16 @@ class _Locate:
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         q, u = [], []
-        for (kind, k), centre in zip(self._bodies, self._centres, strict=True):
-            if kind == "rotor":
-                angle, rate = data.qpos[model.jnt_qposadr[k]], data.qvel[model.jnt_dofadr[k]]
-                angle = angle - model.qpos0[model.jnt_qposadr[k]]
-                q += [0.0, 0.0, 0.0, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
-                u += [0.0, 0.0, 0.0, 0.0, 0.0, rate]
-                continue
+        for k, centre in self._bodies:
             turn = data.xmat[k].reshape(3, 3)
             velocity = np.zeros(6)
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, k, velocity, 0)
             arm = turn @ centre
             q += [*(data.xpos[k] + arm), *data.xquat[k]]
             u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
+        for k, own in self._scalars:
+            value = data.ten_length[k] if own.of_tendon else data.qpos[model.jnt_qposadr[k]]
+            q.append(value - own.offset)
+            if own.moves:
+                u.append(data.ten_velocity[k] if own.of_tendon else data.qvel[model.jnt_dofadr[k]])
         return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))

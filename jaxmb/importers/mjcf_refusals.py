@@ -14,7 +14,6 @@ _MUST_VANISH = {
     "tendon_stiffnesspoly": ("tendon", "nonlinear stiffness", "tendons"),
     "tendon_dampingpoly": ("tendon", "nonlinear damping", "tendons"),
     "tendon_springyield": ("tendon", "plastic springs", "tendons"),
-    "tendon_armature": ("tendon", "armature", "tendons"),
     "tendon_actfrclimited": ("tendon", "limits of the actuator force", "tendons"),
     "actuator_armature": ("actuator", "armature", "actuators"),
     "actuator_damping": ("actuator", "damping", "actuators"),

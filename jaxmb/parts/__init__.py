@@ -11,6 +11,7 @@ from .base import (
     AbstractConstraint as AbstractConstraint,
     AbstractDynamicForce as AbstractDynamicForce,
     AbstractForce as AbstractForce,
+    AbstractInertialConstraint as AbstractInertialConstraint,
     AbstractJoint as AbstractJoint,
     AbstractLaw as AbstractLaw,
     AbstractNonIdeal as AbstractNonIdeal,

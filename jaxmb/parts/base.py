@@ -12,8 +12,8 @@ A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes th
 import abc
 import functools
 import inspect
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -40,6 +40,17 @@ GROUND = "ground"
 
 # How a picture draws the line of a part.
 PathKind = Literal["rod", "coil", "belt"]
+
+
+class ScalarCoordinate(NamedTuple):
+    """A coordinate that a part adds to the scene, a number: its `name`, `"rotor.angle"`; whether it is a length [m],
+    otherwise an angle [rad]; and whether it has a velocity, and with it an inertia. One without only counts the turns
+    of an angle that is known up to full turns.
+    """
+
+    name: str
+    is_length: bool = False
+    moves: bool = False
 
 
 class AbstractPart(eqx.Module):
@@ -197,6 +208,15 @@ class AbstractLink(AbstractPart):
         del space, poses
         return self
 
+    def scalar_coordinates(self, parts: Mapping[str, "AbstractLink"]) -> tuple[ScalarCoordinate, ...]:
+        """Hook: the scalar coordinates that the part adds, from all parts of the scene by name.
+
+        Its kernel sees each as one body more than `bodies`, after these, of which the first entry of the pose is the
+        coordinate.
+        """
+        del parts
+        return ()
+
     def wrapped(self, wrap: Callable[["AbstractLink"], "AbstractLink"]) -> "AbstractLink":
         """Hook: what `wrap` makes of the part whose kernel sees the poses of the bodies, usually this one."""
         return wrap(self)
@@ -247,6 +267,14 @@ class AbstractConstraint(AbstractLink):
         """Φ(poses, t) of this part."""
 
 
+class AbstractInertialConstraint(AbstractConstraint):
+    """A position constraint that binds a scalar coordinate of its own, which has an `inertia` [kg m² of an angle, kg of
+    a length] and nothing else.
+    """
+
+    inertia: AbstractVar[Float[Array, ""]]
+
+
 class AbstractJoint(AbstractPair, AbstractConstraint):
     """A constraint between a point of `body_a` and one of `body_b`.
 
@@ -263,12 +291,23 @@ class AbstractJoint(AbstractPair, AbstractConstraint):
 class AbstractTendon(AbstractLink):
     """A length along joints or bodies, for parts of coordinates to act on; by itself it exerts no force.
 
-    Its coordinate is `length`.
+    Its coordinate is `length`. It may have scalar coordinates that count turns of angles; `rows` is their number.
     """
+
+    rheonomic: ClassVar[bool] = False
+
+    @property
+    def rows(self) -> int:
+        return 0
 
     @abc.abstractmethod
     def length(self, space: AbstractSpace, poses: Poses) -> Float[Array, ""]:
         """The length at these poses of its bodies."""
+
+    def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
+        """Hook: what its scalar coordinates differ from their angles by, less full turns; zero along a motion."""
+        del space, t
+        return jnp.zeros(0, poses.dtype)
 
     def coordinates(self, space, poses):
         return {"length": self.length(space, poses)}

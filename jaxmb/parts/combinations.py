@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractConstraint, AbstractTendon
-from .joint_parts import given_coordinate, shortest
+from .base import AbstractConstraint, AbstractTendon, ScalarCoordinate
+from .joint_parts import given_coordinate, shortest, turns
 from .sources import AbstractOfSources
 
 
@@ -121,8 +121,11 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`.
 
+    Angles of hinges in space are in (−π, π] at the given poses, and counted from there on through full turns, like a
+    cord that winds up: for each the scene has a coordinate more, which no force acts on.
+
     **Arguments:** `along`: the names of the coordinates, such as `("left.angle", "right.angle")`; `coefficients` [m/rad
-    of an angle], one for each. Angles count in (−π, π].
+    of an angle], one for each.
     """
 
     along: fields.Names = fields.names()
@@ -139,8 +142,29 @@ class FixedTendon(AbstractCombination, AbstractTendon):
                 f"{self.coefficients.shape}."
             )
 
+    @property
+    def _periodic(self):
+        return [k for k in range(len(self.along)) if self.is_periodic(k)]
+
+    @property
+    def rows(self):
+        return len(self._periodic)
+
+    def scalar_coordinates(self, parts):
+        split = [name.partition(".") for name in self.along]
+        periodic = (own in parts[joint].periodic if joint in parts else False for joint, _, own in split)
+        return tuple(ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, own in enumerate(periodic) if own)
+
+    def residual(self, space, poses, t):
+        values = self.values(space, poses)
+        counts = poses[poses.shape[0] - self.rows :, 0]
+        return shortest(counts - jnp.stack([values[k] for k in self._periodic]))
+
     def length(self, space, poses):
-        return jnp.dot(self.coefficients, jnp.stack(self.values(space, poses)))
+        values = self.values(space, poses)
+        for count, k in enumerate(self._periodic, poses.shape[0] - self.rows):
+            values[k] = values[k] + turns(poses[count, 0] - values[k])
+        return jnp.dot(self.coefficients, jnp.stack(values))
 
 
 class Tendon(AbstractTendon):

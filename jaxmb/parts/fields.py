@@ -58,6 +58,7 @@ class Declaration:
     - `gives`: the body-fixed fields that a world point or direction determines; `needed`: whether one or the other must
         be given.
     - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
+    - `constant`: whether a number cannot be a function of time.
     """
 
     kind: str
@@ -75,6 +76,7 @@ class Declaration:
     needed: bool = True
     of: Any = None
     what: str = ""
+    constant: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -208,15 +210,18 @@ def parameter(
     sizes: bool = False,
     kw_only: bool = True,
     converter: Callable[[Any], Any] | None = None,
+    constant: bool = False,
 ) -> Any:
     """A number or an array of numbers.
 
     **Arguments:** `shape`, in which `"d"` is the dimension of the space, None for any; `unit`, for information; `sign`
     of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`;
     `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from
-    this length; `converter`, applied before the checks.
+    this length; `converter`, applied before the checks; `constant`: whether it cannot be a function of time.
     """
-    declaration = Declaration("number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes)
+    declaration = Declaration(
+        "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
+    )
     default = None if optional else default
     convert = _NUMBER if converter is None else _lenient(converter)
     return _field(declaration, converter=_optional(convert), default=default, kw_only=kw_only)

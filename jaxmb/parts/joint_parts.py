@@ -101,7 +101,12 @@ def given_coordinate(part: AbstractLink, joint: Any, coordinate: str, space: Any
 
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The angle [rad] less full turns, in [−π, π]."""
-    return angle - 2 * np.pi * lax.stop_gradient(jnp.round(angle / (2 * np.pi)))
+    return angle - turns(angle)
+
+
+def turns(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The full turns [rad] that are nearest to an angle."""
+    return 2 * np.pi * lax.stop_gradient(jnp.round(angle / (2 * np.pi)))
 
 
 class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):

@@ -136,7 +136,7 @@ def with_damper(system: Any, state: State) -> AbstractSystem:
     layout = system.layout
     origin = np.zeros(layout.space.dimension)
     part = Damper("a damper of zero", "ground", system.body_names[0], damping=0.0, point_a=origin, point_b=origin)
-    own = stack([(part, (layout.bodies, 0))], layout)
+    own = stack([(part, (layout.ground, 0))], layout)
     return _compiled(system, state, forces=(*system.forces, *map(ForceGroup, own)))
 
 

@@ -92,7 +92,7 @@ def subsets(
     first; `absolute`: parts that do not depend on relative motions alone; `dense`: components of more rows than this
         are eliminated as sparse matrices.
     """
-    ground = layout.bodies
+    ground = layout.ground
     vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(parts)]
     found = components(vertices, ground)
     alone = {own.joints[0]: own.top for own in found if len(own.joints) == 1}
@@ -140,7 +140,8 @@ def absolute_parts(
     """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
     world.
 
-    **Arguments:** `motions`: velocities of all bodies, and zeros of the ground, in some motions as one.
+    **Arguments:** `motions`: velocities of all bodies, and zeros of scalar coordinates and the ground, in some motions
+        as one.
     """
     ground = motions.shape[1] - 1
     out = set()
@@ -168,7 +169,7 @@ def _regular_parts(parts, blocks, layout, scale, held):
     """
     out = set()
     of_bodies = np.append(scale, 0.0)[np.minimum(layout.velocity_index, layout.nu)]
-    of_bodies[layout.bodies] = 0.0
+    of_bodies[layout.ground] = 0.0
     for numbers, bodies, own in _alike(parts, blocks, held):
         top = np.array([held[p] for p in numbers])
         free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])

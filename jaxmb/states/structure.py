@@ -168,7 +168,9 @@ def _motions_as_one(system, q):
     else:
         turn = lambda axis: jax.vmap(lambda x: jnp.concatenate([cross(axis, x[:3]), unrotate(x[3:], axis)]))(poses)
         turned = jax.vmap(turn)(jnp.eye(3, dtype=q.dtype))
-    return jnp.pad(jnp.concatenate([moved, turned]), ((0, 0), (0, 1), (0, 0)))
+    # Scalar coordinates and the ground stay.
+    still = system.layout.ground + 1 - system.layout.bodies
+    return jnp.pad(jnp.concatenate([moved, turned]), ((0, 0), (0, still), (0, 0)))
 
 
 @eqx.filter_jit
@@ -226,10 +228,11 @@ def _check_locked(system, parts, blocks, scale, found):
             share = np.abs(left[:, len(columns) - 1])
             rows = [r for p in own for r in range(parts[p].first, parts[p].first + parts[p].rows)]
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
+            moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
             raise ValueError(
-                f"{', '.join(system.body_names[k] for k in bodies)} cannot move: {', '.join(names)} leave no degree of "
-                "freedom, but with dimensions that differ only slightly from these they would (smallest singular value "
-                f"{sizes[-1]:.1e}). Make the points and lengths of redundant joints agree, or remove one of them."
+                f"{moving} cannot move: {', '.join(names)} leave no degree of freedom, but with dimensions that "
+                f"differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). "
+                "Make the points and lengths of redundant joints agree, or remove one of them."
             )
 
 
@@ -237,7 +240,7 @@ def _connected(system, parts):
     """Sets of bodies that position constraints connect without the ground, with these parts, except sets with a
     driver.
     """
-    ground = system.layout.bodies
+    ground = system.layout.ground
     # A union-find forest: the root of a tree represents all bodies connected to it.
     parent = list(range(ground))
 
@@ -264,8 +267,8 @@ def _connected(system, parts):
 
 def _bodies_of_joints(system):
     """Names of the bodies of each joint, without the ground."""
-    known, ground = system.body_names, system.layout.bodies
-    bodies = lambda own: tuple(known[k] for k in own if k < ground)
+    known = system.body_names
+    bodies = lambda own: tuple(known[k] for k in own if k < len(known))
     groups = [g.group for g in system.joints]
     return {name: bodies(own) for g in groups for name, own in zip(g.names, g.bodies, strict=True)}
 

@@ -14,9 +14,10 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.block_jacobian import JointOrder
+from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from .body_kinematics import AbstractBodies
-from .body_motion import attachments, body_motion, body_quantities, outline
+from .body_motion import attachments, body_motion, body_quantities, outline, scalar_quantities
 from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
 from .describe import describe_scene
 from .design_variables import DesignVariables, description_rows, in_range
@@ -87,7 +88,8 @@ class AbstractBodySystem(AbstractBodies):
 
     @property
     def coordinate_rows(self) -> int:
-        return self.position_rows + (sum(self.layout.rotates) if self.spatial else 0)
+        counts = sum(len(g.group.names) * g.rows for g in self.turn_counts)
+        return self.position_rows + counts + (sum(self.layout.rotates) if self.spatial else 0)
 
     @property
     def velocity_rows(self) -> int:
@@ -131,6 +133,24 @@ class AbstractBodySystem(AbstractBodies):
         """Name and number within its part of every row of A."""
         groups = [(g.group.names, range(g.rows)) for g in self.joints]
         return tuple((name, k) for names, rows in groups for name in names for k in rows)
+
+    # Scalar coordinates
+
+    @property
+    def _inertial(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of parts that have scalar coordinates."""
+        return tuple(g for g in self.constraints if _is_inertial(g))
+
+    @property
+    def turn_counts(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of tendons that have scalar coordinates; their residuals vanish as coordinates are normalised."""
+        return tuple(ConstraintGroup(g.group) for g in self.tendons if g.group.part.rows)
+
+    def with_initial_scalars(self) -> Self:
+        """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
+        if not self.layout.scalars:
+            return self
+        return dataclasses.replace(self, guess=_with_scalars(self, self.guess))
 
     # Internal states
 
@@ -224,12 +244,14 @@ class AbstractBodySystem(AbstractBodies):
         kinds: dict[str, list[str]] = {}
         for g in self.bodies:
             kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
+        plain = [g for g in self.constraints if not _is_inertial(g)]
         return describe_scene(
             self,
             spatial=self.spatial,
             bodies=kinds,
             joints=[
-                (self.constraints, ""),
+                (plain, ""),
+                (self._inertial, ", each with a velocity of its own"),
                 (self.velocity_constraints, ", between velocities"),
                 (self.servos, ", a program of a Servo"),
             ],
@@ -259,7 +281,7 @@ class AbstractBodySystem(AbstractBodies):
                     self.reaction(name, ts, ys, solved.multipliers), field
                 )
                 out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
-        out |= joint_quantities(self, self.joint_coordinates())
+        out |= scalar_quantities(self.layout) | joint_quantities(self, self.joint_coordinates())
         return out | frame_quantities(self, self.frames, self.layout)
 
     def joint_coordinates(self):
@@ -351,3 +373,20 @@ class AbstractBodySystem(AbstractBodies):
             [g.acceleration(t, poses, velocities, jnp.zeros_like(velocities)) for g in self.joints],
             [g.wrenches(t, poses, velocities) for g in self.forces],
         )
+
+
+def _is_inertial(group):
+    return isinstance(group.group.part, AbstractInertialConstraint)
+
+
+@eqx.filter_jit
+def _with_scalars(system, guess):
+    t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
+    layout = system.layout
+    for g in system._inertial:
+        scalars = g.group.body_index[:, -1]
+        unmet = g.residual(t, system.prepared_poses(q))[:, 0]
+        q = q.at[layout.pose_index[scalars, 0]].add(-unmet)
+        unmet = g.velocity(t, system.prepared_poses(q), system.all_velocities(u))[:, 0]
+        u = u.at[layout.velocity_index[scalars, 0]].add(-unmet)
+    return dataclasses.replace(guess, q=q, u=u)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import normalize
+from .constraint_groups import ConstraintGroup
 from .coordinates import coordinate_names, rate_names
 from .equation import AbstractSystem
 from .groups import BodyGroup
@@ -23,10 +24,12 @@ else:
 class AbstractBodies(AbstractSystem):
     """The coordinates and velocities of stacked bodies.
 
-    **Fields:** the groups of `bodies`, their names, and where their coordinates and velocities stand, `layout`.
+    **Fields:** the groups of `bodies`, their names, where their coordinates and velocities stand, `layout`, and the
+    groups of parts that have `turn_counts`.
     """
 
     bodies: AbstractVar[tuple[BodyGroup, ...]]
+    turn_counts: AbstractVar[tuple[ConstraintGroup, ...]]
     layout: AbstractVar[Layout]
     body_names: AbstractVar[tuple[str, ...]]
 
@@ -76,24 +79,32 @@ class AbstractBodies(AbstractSystem):
     # Kinematics
 
     def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
-        """Prepared poses of the bodies and of the ground, the arguments of kernels."""
+        """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        return jnp.concatenate([jax.vmap(prepare)(self.poses(q)), ground[None]])
+        return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
 
     def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
-        """Velocities of the bodies and of the ground."""
-        return jnp.pad(self.velocities(u), ((0, 1), (0, 0)))
+        """Velocities of the bodies, of scalar coordinates and of the ground."""
+        return jnp.pad(self._velocities(u), ((0, 1), (0, 0)))
 
     def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
         """Poses of the bodies."""
+        return self._poses(q)[: self.layout.bodies]
+
+    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+        """Velocities of the bodies."""
+        return self._velocities(u)[: self.layout.bodies]
+
+    def _poses(self, q):
+        """Poses of the bodies and of scalar coordinates."""
         if self.layout.uniform:
             return q.reshape(self.layout.bodies, -1)
         ground = jnp.asarray(self.layout.space.ground, q.dtype)
         return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
 
-    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
-        """Velocities of the bodies."""
+    def _velocities(self, u):
+        """Velocities of the bodies and of scalar coordinates."""
         if self.layout.uniform:
             return u.reshape(self.layout.bodies, -1)
         return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
@@ -101,15 +112,28 @@ class AbstractBodies(AbstractSystem):
     def rates(self, t, q, u):
         if self.rates_are_velocities:
             return u
-        return self._pack(jax.vmap(self.layout.space.rates)(self.poses(q), self.velocities(u)))
+        rates = self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
+        for g in self.turn_counts:
+            own = g.velocity(jnp.asarray(t, q.dtype), self.prepared_poses(q), self.all_velocities(u))
+            rates = rates.at[self._counts(g)].set(-own)
+        return rates
 
     def normalize(self, q):
         if self.rates_are_velocities:
             return q
-        return self._pack(jax.vmap(self.layout.space.normalize)(self.poses(q)))
+        q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
+        for g in self.turn_counts:
+            # A count of turns does not depend on the time.
+            own = g.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
+            q = q.at[self._counts(g)].add(-own)
+        return q
+
+    def _counts(self, group):
+        """Where the counts of turns of stacked tendons stand in q, shape (parts, rows)."""
+        return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
 
     def normalize_fixed(self, q, fixed):
-        rotating = np.array(self.layout.rotates) & self.spatial
+        rotating = np.flatnonzero(np.array(self.layout.rotates) & self.spatial)
         turns = self.layout.pose_index[:-1][rotating, 3:]
         whole = turns[np.all(fixed[turns], axis=1)]
         for index in whole:
@@ -128,7 +152,5 @@ class AbstractBodies(AbstractSystem):
         return of_bodies.reshape(-1)[self.layout.velocity_place]
 
     def _pack(self, poses):
-        if self.layout.uniform:
-            return poses.reshape(-1)
-        sizes = [poses.shape[1] if r else self.layout.space.dimension for r in self.layout.rotates]
-        return jnp.concatenate([pose[:n] for pose, n in zip(poses, sizes, strict=True)])
+        raveled = poses.reshape(-1)
+        return raveled if self.layout.uniform else unchecked_take(raveled, self.layout.coordinate_place)

@@ -39,6 +39,20 @@ def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]
     return out
 
 
+def scalar_quantities(layout: Layout) -> dict[str, Quantity]:
+    """Scalar coordinates that move, their rates and accelerations, `"rotor.angle"`, `"rotor.angle_rate"`."""
+    out = {}
+    for k, own in enumerate(layout.scalars, layout.bodies):
+        if not own.moves:
+            continue
+        i, j = int(layout.pose_index[k][0]), int(layout.velocity_index[k][0])
+        out[own.name] = Quantity((), lambda ts, ys, _, i=i: ys.q[:, i])
+        out[f"{own.name}_rate"] = Quantity((), lambda ts, ys, _, j=j: ys.u[:, j])
+        acceleration = lambda ts, ys, solved, j=j: solved.accelerations[:, j]
+        out[f"{own.name}_acceleration"] = Quantity((), acceleration, of_forces=True)
+    return out
+
+
 def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
     """For every body, the distinct body-fixed points [m] at which parts of some groups act on it, shape (points, d)."""
     points: list[dict[tuple, np.ndarray]] = [{} for _ in range(bodies)]

@@ -14,7 +14,7 @@ from .layout import Layout
 
 def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`,
-    `position`, `orientation` of spatial ones.
+    `position`, `orientation` of spatial ones; and of scalar coordinates that move.
     """
     if layout.space.dimension == 3:
         fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
@@ -25,7 +25,7 @@ def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[
 
 def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
     """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`,
-    `angular_velocity` in space.
+    `angular_velocity` in space; scalar coordinates have their names.
     """
     if layout.space.dimension == 3:
         fields = ["x", "y", "z", "wx", "wy", "wz"]
@@ -36,14 +36,16 @@ def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
 
 def _names(layout, bodies, index, fields, groups):
     names = {}
-    for body, row, rotates in zip(bodies, index[:-1].tolist(), layout.rotates, strict=True):
+    rows = index[:-1].tolist()
+    for body, row, rotates in zip(bodies, rows[: layout.bodies], layout.rotates, strict=True):
         own = len(fields) if rotates else layout.space.dimension
         for k in range(own):
             names[f"{body}.{fields[k]}"] = [row[k]]
         for group, where in groups.items():
             if where.stop <= own:
                 names[f"{body}.{group}"] = row[where]
-    return names
+    scalars = zip(layout.scalars, rows[layout.bodies :], strict=True)
+    return names | {own.name: [row[0]] for own, row in scalars if own.moves}
 
 
 def prescribe(

@@ -67,7 +67,8 @@ def describe_scene(
     """
     count = sum(map(len, bodies.values()))
     grubler = system.nu - system.velocity_rows
-    normalizations = system.coordinate_rows - system.position_rows
+    counts = sum(len(g.group.names) * g.group.rows for g in tendons)
+    normalizations = system.coordinate_rows - system.position_rows - counts
     facts = [
         ("scene", f"{'spatial' if spatial else 'planar'}, {count} bodies"),
         ("velocities", str(system.nu)),
@@ -76,7 +77,9 @@ def describe_scene(
         ("independent", count_independent(system)),
     ]
     if normalizations:
-        with_them = f"{system.nq}, with {normalizations} normalisations; rank of all {system.coordinate_rows} rows"
+        with_them = f"{system.nq}, with {normalizations} normalisations"
+        with_them += f" and {counts} counts of turns" * (counts > 0)
+        with_them += f"; rank of all {system.coordinate_rows} rows"
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
     if system.nz:
         facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))

@@ -37,7 +37,8 @@ def with_signals(
     varying, of_frames = set(), {number.name for number in stacked_numbers({"frames": groups["frames"]})}
     for number in stacked_numbers(groups):
         signal = signals.get(number.name)
-        if signal is None or number.kind in ("bodies", "frames") or number.name in of_frames:
+        constant = number.declared.constant or number.kind in ("bodies", "frames") or number.name in of_frames
+        if signal is None or constant:
             continue
         if number.kind in _BIND_POSITIONS and not signal.continuous:
             raise ValueError(

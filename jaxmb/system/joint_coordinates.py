@@ -41,7 +41,7 @@ def joint_coordinates(
     """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
     space, out = layout.space, {}
     ground: Any = np.asarray(space.ground, jnp.result_type(float))
-    poses = jnp.tile(space.prepare(ground), (layout.bodies + 1, 1))
+    poses = jnp.tile(space.prepare(ground), (layout.ground + 1, 1))
     for g, own in enumerate(groups):
         single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[batch:], x.dtype), own)
         found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), single, jnp.zeros(()), poses)

@@ -75,7 +75,7 @@ def joint_order_with_more(system: RigidBodySystem, before: RigidBodySystem, orde
 def _joint_order(
     layout: Layout, groups: tuple[Any, ...], left_out: tuple[int, ...], absolute: frozenset[int]
 ) -> JointOrder:
-    ground, size = layout.bodies, layout.space.velocity_size
+    ground, size = layout.ground, layout.space.velocity_size
     parts = [(own, rows) for bodies, rows in groups for own in bodies]
     joints = _merged(parts, ground)
     rows, bodies_of, blocks = _indices(parts, joints, ground, size)

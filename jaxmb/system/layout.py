@@ -2,42 +2,56 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..parts.base import ScalarCoordinate
 from ..parts.space import AbstractSpace
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Bodies in order, each with its pose and velocity contiguous; the ground is the body after the last.
+    """Bodies in order, each with its pose and velocity contiguous; then scalar coordinates; the ground is the last.
 
-    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant.
+    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant. A scalar
+    coordinate is like a body that has only the first entry of the pose and, if it moves, of the velocity.
     """
 
     space: AbstractSpace
     rotates: tuple[bool, ...]
+    scalars: tuple[ScalarCoordinate, ...] = ()
 
     @property
     def bodies(self) -> int:
         return len(self.rotates)
 
     @property
+    def ground(self) -> int:
+        """The number of the ground: that of bodies and scalar coordinates."""
+        return len(self.rotates) + len(self.scalars)
+
+    def is_place(self, numbers: Sequence[int]) -> np.ndarray:
+        """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
+        own = np.array(numbers)
+        return (own < self.bodies) | (own == self.ground)
+
+    @property
     def uniform(self) -> bool:
-        """Whether every body rotates, so that poses are a plain reshape of the coordinates."""
-        return all(self.rotates)
+        """Whether there are only bodies that rotate, so that poses are a plain reshape of the coordinates."""
+        return all(self.rotates) and not self.scalars
 
     @functools.cached_property
     def pose_index(self) -> np.ndarray:
-        """Index of every pose entry, shape (bodies + 1, pose size), into the coordinates followed by the ground's
+        """Index of every pose entry, shape (ground + 1, pose size), into the coordinates followed by the ground's
         pose.
         """
-        return self._index(self.space.pose_size, [*range(self.nq, self.nq + self.space.pose_size)])
+        return _index(self._pose_sizes, [*range(self.nq, self.nq + self.space.pose_size)])
 
     @functools.cached_property
     def velocity_index(self) -> np.ndarray:
-        """Index of every velocity entry, shape (bodies + 1, velocity size), into the velocities followed by a zero."""
-        return self._index(self.space.velocity_size, [self.nu] * self.space.velocity_size)
+        """Index of every velocity entry, shape (ground + 1, velocity size), into the velocities followed by a zero."""
+        return _index(self._velocity_sizes, [self.nu] * self.space.velocity_size)
 
     @functools.cached_property
     def velocity_place(self) -> np.ndarray:
@@ -51,19 +65,21 @@ class Layout:
 
     @functools.cached_property
     def nq(self) -> int:
-        return sum(self.space.pose_size if r else self.space.dimension for r in self.rotates)
+        return sum(self._pose_sizes)
 
     @functools.cached_property
     def nu(self) -> int:
-        return sum(self.space.velocity_size if r else self.space.dimension for r in self.rotates)
+        return sum(self._velocity_sizes)
 
-    def _index(self, size: int, constant: list[int]) -> np.ndarray:
-        index, start = [], 0
-        for rotates in self.rotates:
-            own = size if rotates else self.space.dimension
-            index.append([*range(start, start + own), *constant[own:]])
-            start += own
-        return np.array([*index, constant], np.int32)
+    @property
+    def _pose_sizes(self) -> list[int]:
+        size, d = self.space.pose_size, self.space.dimension
+        return [*(size if rotates else d for rotates in self.rotates), *(1 for _ in self.scalars)]
+
+    @property
+    def _velocity_sizes(self) -> list[int]:
+        size, d = self.space.velocity_size, self.space.dimension
+        return [*(size if rotates else d for rotates in self.rotates), *(int(own.moves) for own in self.scalars)]
 
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
         """Source of each entry of an assembled Jacobian.
@@ -107,3 +123,12 @@ class Layout:
         width = max(map(len, found.values()))
         fill = lambda blocks: [*blocks, *[np.full_like(blocks[0], start)] * (width - len(blocks))]
         return np.array([fill(found[name]) for name in names])
+
+
+def _index(sizes: list[int], constant: list[int]) -> np.ndarray:
+    """The entries of bodies of these sizes, one after the other, and constants for what they lack and the ground."""
+    index, start = [], 0
+    for own in sizes:
+        index.append([*range(start, start + own), *constant[own:]])
+        start += own
+    return np.array([*index, constant], np.int32)

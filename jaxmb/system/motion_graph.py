@@ -73,7 +73,7 @@ def motion_order(system: RigidBodySystem) -> MotionOrder:
 def _motion_order(
     layout: Layout, acting: tuple[tuple[tuple[int, ...], ...], ...], joints: JointOrder | None
 ) -> MotionOrder:
-    ground, size = layout.bodies, layout.space.velocity_size
+    ground, size = layout.ground, layout.space.velocity_size
     # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.system.stiffness` lists them.
     rows = [own[i] for group in acting for own in group for i in range(len(own)) for _ in own]
     columns = [own[j] for group in acting for own in group for _ in own for j in range(len(own))]

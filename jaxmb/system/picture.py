@@ -58,9 +58,11 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
     """The picture of a system of bodies and of these stacked parts."""
     layout, names = system.layout, (*system.body_names, GROUND)
     space = layout.space
-    position, orientation = map(np.asarray, _placements(system, ys))
+    # Scalar coordinates are at no place.
+    known = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
+    position, orientation = (np.asarray(own)[list(known)] for own in _placements(system, ys))
     single = [
-        (name, tuple(names[body] for body in bodies), part)
+        (name, tuple(known[body] for body in bodies if body in known), part)
         for group in groups
         for name, bodies, part in zip(group.names, group.bodies, _unstacked(group), strict=True)
     ]

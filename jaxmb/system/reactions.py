@@ -53,8 +53,12 @@ def applied_wrenches(
     groups: Sequence[ForceGroup | NonIdealGroup], name: str, wrenches: Sequence[Float[Array, "parts k v"]]
 ) -> Float[Array, "bodies v"]:
     """Wrenches of one force element on its bodies, summed over its components, from those of all parts by groups."""
-    of_groups = zip(groups, wrenches, strict=True)
-    own = [values[k] for g, values in of_groups for k, other in enumerate(g.group.names) if other == name]
+    own = [
+        values[k, g.group.layout.is_place(g.group.bodies[k])]
+        for g, values in zip(groups, wrenches, strict=True)
+        for k, other in enumerate(g.group.names)
+        if other == name
+    ]
     return sum(own[1:], start=own[0])
 
 
@@ -83,6 +87,7 @@ def reaction(
 def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Array, Array]:
     layout = group.layout
     bodies = group.bodies[k]
+    # Scalar coordinates and the ground are no bodies.
     last = max(i for i, body in enumerate(bodies) if body < layout.bodies)
     pose, wrench = group.gather(poses)[k, last], wrenches[last]
     part = jax.tree.map(lambda leaf: leaf[k], group.part)

@@ -39,7 +39,9 @@ class RigidBodySystem(AbstractBodySystem):
         if not self.spatial:
             return residual
         p = self.poses(q)[_rotating(self.layout), 3:]
-        return jnp.concatenate([residual, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
+        poses = self.prepared_poses(q)
+        counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
+        return jnp.concatenate([residual, *counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
 
     @eqx.filter_jit
     def coordinate_jacobian(self, t, q):
@@ -49,8 +51,9 @@ class RigidBodySystem(AbstractBodySystem):
         unit = jnp.eye(self.layout.space.pose_size, dtype=q.dtype)
         along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(unit)
         moves = jax.vmap(along)(poses[:, : self.layout.space.pose_size])
-        blocks = [g.along(t, poses, moves) for g in self.constraints]
-        jacobian = self._assemble(blocks, self.constraints, q.dtype, of_poses=True)
+        groups = (*self.constraints, *self.turn_counts)
+        blocks = [g.along(t, poses, moves) for g in groups]
+        jacobian = self._assemble(blocks, groups, q.dtype, of_poses=True)
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
         rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
@@ -112,17 +115,36 @@ class RigidBodySystem(AbstractBodySystem):
     def inertia(self, t, q, u) -> AbstractInertia:
         if self.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
+        mass = self._masses_of_coordinates
         if self.spatial:
-            points = jnp.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular.
+            points = np.array([not rotates for rotates in self.layout.rotates])[:, None, None]
+            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular; a scalar
+            # coordinate as well.
             moments = self.moments_of_inertia
-            moments = jnp.where(points, jnp.eye(3, dtype=moments.dtype), moments)
-            return _MixedInertia(BlockInertia(self.mass, moments), self.layout)
-        columns = [jnp.repeat(self.mass[:, None], 2, axis=1), self.moments_of_inertia[:, None]]
+            unit = jnp.eye(3, dtype=moments.dtype)
+            of_scalars = jnp.tile(unit, (len(self.layout.scalars), 1, 1))
+            moments = jnp.concatenate([jnp.where(points, unit, moments), of_scalars])
+            return _MixedInertia(BlockInertia(mass, moments), self.layout)
+        moments = jnp.pad(self.moments_of_inertia, (0, len(self.layout.scalars)))
+        columns = [jnp.repeat(mass[:, None], 2, axis=1), moments[:, None]]
         bodies = jnp.concatenate(columns, axis=1)
         if self.layout.uniform:
             return DiagonalInertia(bodies.reshape(-1))
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
+
+    @property
+    def _masses_of_coordinates(self):
+        """What counts as the mass of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]; one, which
+        has no effect, of those that do not move.
+        """
+        if not self.layout.scalars:
+            return self.mass
+        found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self._inertial]
+        still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
+        order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
+        ones = jnp.ones(len(still), self.mass.dtype)
+        inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in found), ones]), order)
+        return jnp.concatenate([self.mass, inertias])
 
     @eqx.filter_jit
     def force(self, t, q, u):
@@ -141,7 +163,7 @@ class RigidBodySystem(AbstractBodySystem):
             return jnp.zeros(self.nu, dtype)
         size = self.layout.space.velocity_size
         entries = jnp.concatenate([own.reshape(-1, size) for own in wrenches])
-        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.bodies)(entries).reshape(
+        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.ground)(entries).reshape(
             -1
         )
         return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
@@ -158,14 +180,16 @@ class RigidBodySystem(AbstractBodySystem):
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         return sum(parts[1:], start=parts[0]) if parts else None
 
-    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "b v v"]:
-        """The derivative of each body's gyroscopic moment with respect to its own velocity."""
+    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "ground v v"]:
+        """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
+        coordinates.
+        """
         size = self.layout.space.velocity_size
         if not self.spatial:
-            return jnp.zeros((self.layout.bodies, size, size), u.dtype)
+            return jnp.zeros((self.layout.ground, size, size), u.dtype)
         moment = lambda J, w: -cross(w, J @ w)
         own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
-        return jnp.pad(own, ((0, 0), (3, 0), (3, 0)))
+        return jnp.pad(own, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
 
     # Energy and momentum
 
@@ -211,14 +235,19 @@ class RigidBodySystem(AbstractBodySystem):
     def _scale(self, index, size):
         length = lax.stop_gradient(self.length)
         translation = [False] * size
-        for body in index[:-1]:
+        for body in index[: self.layout.bodies]:
             for k in body[: self.layout.space.dimension]:
                 translation[k] = True
+        for own, row in zip(self.layout.scalars, index[self.layout.bodies : -1], strict=True):
+            if row[0] < size:
+                translation[row[0]] = own.is_length
         return jnp.where(np.array(translation), length, 1.0)
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies and point masses together. `blocks` has unit blocks for the rotations of point masses."""
+    """Spatial bodies, point masses and scalar coordinates together. `blocks` has unit blocks for the rotations of
+    those that do not rotate.
+    """
 
     blocks: BlockInertia
     layout: Layout = eqx.field(static=True)

@@ -95,13 +95,15 @@ class Advance(AbstractCarrier):
 
 
 class BodyIndex(eqx.Module):
-    """Where the entries of bodies stand in q and u; static."""
+    """Where the entries of bodies stand in q and u, and those of scalar coordinates; static."""
 
     position: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     velocity: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     attitude: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     spin: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     rotates: tuple[bool, ...] = eqx.field(static=True)
+    scalars: tuple[int, ...] = eqx.field(static=True)
+    scalar_rates: tuple[int, ...] = eqx.field(static=True)
 
 
 def body_index(system: AbstractSystem) -> BodyIndex:
@@ -111,18 +113,23 @@ def body_index(system: AbstractSystem) -> BodyIndex:
     spatial = [f"{name}.orientation" in q for name in names]
     rotates = tuple(s or f"{name}.angle" in q for name, s in zip(names, spatial, strict=True))
     turning = [(name, s) for name, s, r in zip(names, spatial, rotates, strict=True) if r]
+    known = set(names)
+    scalars = [name for name in q if name.split(".")[0] not in known]
     return BodyIndex(
         tuple(tuple(q[f"{name}.position"]) for name in names),
         tuple(tuple(u[f"{name}.velocity"]) for name in names),
         tuple(tuple(q[f"{name}.orientation" if s else f"{name}.angle"]) for name, s in turning),
         tuple(tuple(u[f"{name}.angular_velocity" if s else f"{name}.angle"]) for name, s in turning),
         rotates,
+        tuple(q[name][0] for name in scalars),
+        tuple(u[name][0] for name in scalars),
     )
 
 
 class Bodies(AbstractCarrier):
     """Bodies turn with `turning` Ω [rad/s] about the world's origin and travel with `travel` [m/s], both in world axes,
-    (3,) and (bodies, 3), and spin in addition with `spins` [rad/s], in body axes, (bodies that rotate, 3).
+    (3,) and (bodies, 3), and spin in addition with `spins` [rad/s], in body axes, (bodies that rotate, 3). Scalar
+    coordinates `advance` at constant rates.
 
     `ṙ = travel + Ω × r`, `ṗ = ½ (Ω p + p s)`, `v̇ = Ω × v`, `ω̇ = ω × s`.
     """
@@ -130,6 +137,7 @@ class Bodies(AbstractCarrier):
     turning: Float[Array, "3"]
     travel: Float[Array, "b 3"]
     spins: Float[Array, "r 3"]
+    advance: Float[Array, "s"]
     index: BodyIndex
 
     def field(self, state):
@@ -138,6 +146,7 @@ class Bodies(AbstractCarrier):
         d = position.shape[1]
         turned = jax.vmap(lambda x: cross(self.turning, _spatial(x))[:d])
         dq = jnp.zeros_like(state.q).at[position].set(self.travel[:, :d] + turned(state.q[position]))
+        dq = dq.at[np.array(index.scalars, int)].set(self.advance) if index.scalars else dq
         du = jnp.zeros_like(state.u).at[velocity].set(turned(state.u[velocity]))
         if not index.attitude:
             return State(dq, du)
@@ -163,7 +172,8 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
     place, speed, change = (jax.vmap(_spatial)(values[np.array(where)]) for where, values in vectors)
     attitude, spin, spin_change = _attitudes(index, state, rates)
     none = jnp.zeros(3, state.q.dtype)
-    own = Bodies(none, speed, spin, index)
+    advance = state.u[np.array(index.scalar_rates, int)]
+    own = Bodies(none, speed, spin, advance, index)
     # Rows of ṙ = V + Ω × r, v̇ = Ω × v and ω̇ = Ω × ω (all in world axes) for (Ω, V / length), in units of their sizes.
     fastest = jnp.maximum(jnp.max(jnp.abs(speed)) / length, jnp.max(jnp.abs(spin), initial=0.0))
     fastest = lax.stop_gradient(jnp.where(fastest > 0, fastest, 1.0))
@@ -187,7 +197,7 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
 
     def of_twist(w):
         travel = jnp.broadcast_to(length * w[None, 3:], speed.shape)
-        return Bodies(w[:3], travel, spin - jax.vmap(lambda p: unrotate(p, w[:3]))(attitude), index)
+        return Bodies(w[:3], travel, spin - jax.vmap(lambda p: unrotate(p, w[:3]))(attitude), advance, index)
 
     return jax.tree.map(lambda *x: jnp.stack(x), own, of_twist(slow), of_twist(together))
 

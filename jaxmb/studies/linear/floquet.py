@@ -179,7 +179,7 @@ def _return(system, state, end, pushed, free):
 def _open(system, period, distance, far):
     labels = {index[0]: name for name, index in system.coordinate_names().items() if len(index) == 1}
     rates = {index[0]: f"the rate of {name}" for name, index in system.rate_names().items() if len(index) == 1}
-    name = lambda k: labels[k] if k < system.nq else rates[k - system.nq]
+    name = lambda k: labels.get(k, "a count of turns") if k < system.nq else rates[k - system.nq]
     worst = [k for k in np.argsort(-np.abs(distance)) if far[k]][:4]
     listed = ", ".join(f"{name(k)} ({distance[k]:.3g})" for k in worst)
     return (

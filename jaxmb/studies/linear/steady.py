@@ -200,16 +200,17 @@ def _bodies(system, unknowns):
     index = body_index(system)
     travel = jnp.broadcast_to(unknowns.travel[None, :], (len(index.rotates), 3))
     still = jnp.zeros((len(index.spin), 3), travel.dtype)
-    without = Bodies(unknowns.turning, travel, still, index)
+    advance = unknowns.state.u[np.array(index.scalar_rates, int)]
+    without = Bodies(unknowns.turning, travel, still, advance, index)
     if not index.spin:
         return without
     spins = unknowns.state.u[np.array(index.spin)]
     if spins.shape[1] == 1:
         spins = jnp.pad(spins - unknowns.turning[2], ((0, 0), (2, 0)))
-        return Bodies(unknowns.turning, travel, spins, index)
+        return Bodies(unknowns.turning, travel, spins, advance, index)
     attitude = unknowns.state.q[np.array(index.attitude)]
     own = jax.vmap(lambda p: unrotate(p, unknowns.turning))(attitude)
-    return Bodies(unknowns.turning, travel, spins - own, index)
+    return Bodies(unknowns.turning, travel, spins - own, advance, index)
 
 
 def _residual(system, t, values, chosen, advancing, unknowns, units, later):
