@@ -191,21 +191,28 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
     """All times of an experiment in order, and for each measured name which of them are its own."""
-    names = tuple(experiment.measured or ())
-    if not isinstance(experiment.ts, Mapping):
-        ts = checked_times(experiment.ts, experiment.t0)
+    names = tuple(_by_name(experiment) or ())
+    given: Any = experiment.ts
+    if not isinstance(given, Mapping):
+        ts = checked_times(given, experiment.t0)
         return ts, dict.fromkeys(names, np.arange(ts.size))
     if not names:
         raise ValueError("Times by name belong to measured quantities; a residual function needs one vector ts.")
-    for name in experiment.ts:
+    for name in given:
         if name not in names:
             raise unknown("measured name with times", name, names)
-    missing = [name for name in names if name not in experiment.ts]
+    missing = [name for name in names if name not in given]
     if missing:
         raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all that was measured.")
-    each = {name: np.asarray(checked_times(experiment.ts[name], experiment.t0, name)) for name in names}
+    each = {name: np.asarray(checked_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
     return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
+
+
+def _by_name(experiment: Experiment) -> Mapping[str, VectorLike] | None:
+    """What was measured, of an experiment as `with_times` returns it."""
+    assert not isinstance(experiment.measured, Measurements)
+    return experiment.measured
 
 
 def checked_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
@@ -243,7 +250,7 @@ def channels_of(
 
     **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
     """
-    measured, residual = experiment.measured, experiment.residual
+    measured, residual = _by_name(experiment), experiment.residual
     if (measured is None) == (residual is None):
         raise ValueError("Give either measured quantities by name or a residual function.")
     if measured is None:

@@ -42,7 +42,7 @@ class Problem(eqx.Module):
         """The loss, which all experiments have in common."""
         return self.trials[0].loss
 
-    def own(self, number: int, values: Mapping[str, Array]) -> dict[str, Array]:
+    def own(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """The unknowns of one experiment, by their names in it."""
         names = self.trials[number].unknowns
         return {name: values[source] for (name, _), source in zip(names, self.sources[number], strict=True)}

@@ -111,12 +111,14 @@ def _of_user(experiment: str, trial: Trial, residuals: np.ndarray) -> Iterator[S
     """Columns of one row for each time, or else one series."""
     rows = trial.ts.size if residuals.ndim and residuals.shape[0] == trial.ts.size else residuals.size
     label = " ".join(filter(None, (experiment, "what residual returns")))
-    for k, column in enumerate(residuals.reshape(rows, -1).T):
+    columns = residuals.reshape(rows, -1).T
+    components = list(np.ndindex(residuals.shape[1:])) if residuals.ndim > 1 and rows == len(residuals) else []
+    for k, column in enumerate(columns):
         yield Series(
             label=label,
             experiment=experiment,
             sensor=RESIDUAL,
-            component=np.unravel_index(k, residuals.shape[1:]) if residuals.ndim > 1 and rows == len(residuals) else (),
+            component=components[k] if len(components) == columns.shape[0] else (),
             residuals=column,
             sigma=np.ones_like(column),
             known=True,
