@@ -40,7 +40,7 @@ from .system.constraint_groups import ConstraintGroup, VelocityConstraintGroup, 
 from .system.description import Description
 from .system.equation import Ranks
 from .system.force_groups import ForceGroup, NonIdealGroup
-from .system.groups import BodyGroup, FrameGroup, TendonGroup, stack
+from .system.groups import BodyGroup, CoordinateGroup, FrameGroup, stack
 from .system.layout import Layout
 
 # Parts that act on other parts, given by their names.
@@ -113,18 +113,19 @@ class Scene(eqx.Module):
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
 
-        of_joint = {law.name: law.joint for law, _ in laws}
+        constraints, of_joint = kind(AbstractConstraint), {law.name: law.joint for law, _ in laws}
         system = RigidBodySystem(
             bodies=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),
-            constraints=tuple(map(ConstraintGroup, kind(AbstractConstraint))),
+            constraints=tuple(ConstraintGroup(own) for own in constraints if own.rows),
             velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
             servos=tuple(map(servo_group, kind(Servo, _check_program))),
             nonideal=tuple(
                 NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
             ),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
-            tendons=tuple(map(TendonGroup, kind(AbstractTendon, None))),
+            tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
+            free_joints=tuple(CoordinateGroup(own) for own in constraints if not own.rows),
             frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
             guess=guess,
             length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),

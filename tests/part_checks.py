@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 # A joint is given in one of these ways in the world, which `resolve` turns into numbers fixed in its bodies.
-IN_THE_WORLD = ("point", "axis", "axis_a_W", "axis_b_W", "axis_1_W", "axis_2_W", "axis_3_W")
+IN_THE_WORLD = ("point", "axes_W", "points_W", "axis", "axis_a_W", "axis_b_W", "axis_1_W", "axis_2_W", "axis_3_W")
 
 
 def rank(matrix):

@@ -395,12 +395,24 @@ SPATIAL = [
     of_ground_3d(
         spatial.Gimbal, "point_b", point=O, axis_1_W=AXIS, axis_2_W=(0.0, 1.0, 0.0), axis_3_W=(-0.8, 0.0, 0.6)
     ),
+    of_ground_3d(
+        spatial.Composite,
+        "points",
+        sequence=("slide", "hinge", "hinge"),
+        axes_W=[AXIS, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)],
+        points_W=[(0.1, 0.0, 0.0), (0.0, 0.1, 0.2)],
+        point=O,
+    ),
     on_gimbal("stiffness", "JointSpring", springs_on),
     on_gimbal("coefficients", "FixedTendon", tendon_on),
     on_gimbal(
         "coefficients",
         "JointCoupling",
-        lambda angles: [mb.JointCoupling("JointCoupling on a gimbal", *angles[:2], coefficients=(0.0, 0.5, 0.1))],
+        lambda angles: [
+            mb.JointCoupling(
+                "JointCoupling on a gimbal", angles[0], angles[1:], coefficients=((0.0, 0.5, 0.1), (0.0, -0.3, 0.0))
+            )
+        ],
     ),
     on_gimbal(
         "force",

@@ -83,6 +83,30 @@ def test_equalities_are_those_of_mujoco():
             assert np.linalg.norm(own) == pytest.approx(np.linalg.norm(theirs), rel=1e-10), name
 
 
+# Planar walkers, slides, humanoids and a dog whose shoulder blades turn about three skew axes that do not meet.
+IN_SUCCESSION = {
+    "hopper": ("gymnasium", "mujoco/assets/hopper.xml"),
+    "walker": ("gymnasium", "mujoco/assets/walker2d.xml"),
+    "cheetah": ("gymnasium", "mujoco/assets/half_cheetah.xml"),
+    "point mass": ("dm_control", "suite/point_mass.xml"),
+    "fetch": ("gymnasium-robotics", "assets/fetch/reach.xml"),
+    "humanoid": ("gymnasium", "mujoco/assets/humanoid.xml"),
+    "humanoid of the suite": ("dm_control", "suite/humanoid.xml"),
+    "dog": ("dm_control", "suite/dog.xml"),
+}
+
+
+@pytest.mark.parametrize("name", IN_SUCCESSION)
+def test_joints_in_succession_move_as_in_mujoco(name):
+    """All their motors act: there are as many controls as actuators. Loops are opened."""
+    imported = importers.mjcf(path_of(*IN_SUCCESSION[name]), ignore=(*OFF, "meshes", "loops", "couplings"))
+    model = imported.locate.model
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+    assert any(joint.kind == "Composite" for joint in imported.scene.joints)
+    assert len(imported.controls) == model.nu
+    check_dynamics(imported, scale=0.5)
+
+
 def gripper():
     """The gripper of the arm by itself, on the world."""
     whole = mujoco.MjSpec.from_file(str(path_of(*ROBOTIQ)))

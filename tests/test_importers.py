@@ -165,24 +165,108 @@ def test_armature_moves_as_in_mujoco():
     assert float(jnp.sum(system.mass)) == pytest.approx(float(np.sum(model.locate.model.body_mass)), rel=1e-14)
 
 
-@pytest.mark.long
+def joint(name, kind="hinge", axis="0 0 1", more=""):
+    return f'<joint name="{name}" type="{kind}" axis="{axis}" {more}/>'
+
+
+# Joints on one link, by what they are like.
+SUCCESSIONS = {
+    "three skew hinges apart": joint("k1", axis="0 0 1", more='pos=".1 .05 0" ref="9"')
+    + joint("k2", axis="1 0 .2", more='pos="0 -.05 .07" range="-50 50" stiffness="1"')
+    + joint("k3", axis=".3 1 0", more='damping=".1" ref="-4"'),
+    "a planar walker": joint("x", "slide", "1 0 0", 'damping=".3" ref=".2"')
+    + joint("z", "slide", "0 0 1", 'ref="1.2" stiffness="3"')
+    + joint("y", "hinge", "0 1 0", 'pos="0 0 .1" armature=".02"'),
+    "three slides": joint("s1", "slide", "1 0 0", 'damping=".1"')
+    + joint("s2", "slide", "0 1 0")
+    + joint("s3", "slide", "0 .2 1", 'stiffness="2" ref=".3"'),
+    "a slide and a hinge": joint("n1", "slide", "1 0 0", 'damping=".1"') + joint("n2", axis="0 1 .3", more='ref="20"'),
+    "a hinge and two slides": joint("o1", axis="1 1 0", more='ref="10"')
+    + joint("o2", "slide", "0 1 .3", 'ref=".1" stiffness="4"')
+    + joint("o3", "slide", "1 0 .3"),
+    "two skew hinges apart": joint("l1", axis="0 0 1", more='pos=".1 .05 0" damping=".1"')
+    + joint("l2", axis="1 0 .2", more='stiffness="1" ref="9"'),
+    "two hinges that meet": joint("u1", axis="1 0 0", more='damping=".1" armature=".01"')
+    + joint("u2", axis="0 1 0", more='stiffness="1" ref="9"'),
+    "three hinges that meet": joint("g1", axis="1 0 0", more='armature=".01"')
+    + joint("g2", axis="0 0 1", more='ref="5" stiffness="1" range="-60 70"')
+    + joint("g3", axis="0 1 0", more='damping=".2"'),
+    "a pin that turns and slides": joint("c1", axis="1 0 0", more='damping=".1"')
+    + joint("c2", "slide", "-1 0 0", 'stiffness="9" ref=".1"'),
+    "all six": joint("a1", "slide", "1 0 0", 'damping=".2"')
+    + joint("a2", "slide", "0 1 0")
+    + joint("a3", "slide", "0 0 1", 'armature=".1"')
+    + joint("a4", axis="1 0 0", more='stiffness="2"')
+    + joint("a5", axis="0 1 0", more='range="-60 60"')
+    + joint("a6", axis="0 0 1", more='damping=".1"'),
+    "slides and a ball": joint("b1", "slide", "1 0 0", 'damping=".2"')
+    + joint("b2", "slide", "0 0 1")
+    + joint("b3", "ball", more='damping=".1"'),
+}
+MOTORS = ("x", "y", "k2", "k3", "s3", "n1", "n2", "o1", "o3", "g2", "c2", "a1", "a5", "b1")
+
+
+def successions(names):
+    bodies = "".join(rod(f"body {k}", SUCCESSIONS[name], pos=f"0 {k} 0") for k, name in enumerate(names))
+    motors = "".join(f'<motor name="m {own}" joint="{own}" gear="2"/>' for own in MOTORS if f'name="{own}"' in bodies)
+    servo = '<position name="servo" joint="k1" kp="3" kv=".1"/>' if 'name="k1"' in bodies else ""
+    return importers.mjcf(file(bodies, f"<actuator>{motors}{servo}</actuator>"), ignore="limits")
+
+
 def test_joints_in_succession_move_as_in_mujoco():
-    two = '<joint name="u1" axis="1 0 0" damping=".1" armature=".01"/>'
-    two += '<joint name="u2" axis="0 1 0" stiffness="1" ref="9"/>'
-    three = '<joint name="g1" axis="1 0 0" armature=".01"/><joint name="g2" axis="0 0 1" ref="5" stiffness="1"/>'
-    three += '<joint name="g3" axis="0 1 0" damping=".2"/>'
-    both = '<joint name="c1" axis="1 0 0" damping=".1"/>'
-    both += '<joint name="c2" type="slide" axis="1 0 0" stiffness="9" ref=".1"/>'
-    plane = '<joint name="px" type="slide" axis="1 0 0"/><joint name="pz" type="slide" axis="0 0 1" ref=".2"/>'
-    plane += '<joint name="py" axis="0 1 0" damping=".1" armature=".1"/>'
-    ball = '<joint name="ball" type="ball" damping=".1" stiffness="1.5"/>'
-    inner = rod("wrist", three, pos="-.2 0 0") + rod("piston", both, pos=".2 0 0")
-    text = file(rod("shoulder", two, inner) + rod("sledge", plane, pos="0 2 0") + rod("bob", ball, pos="0 3 0"))
-    model = importers.mjcf(text)
-    check_dynamics(model, scale=0.5)
-    assert set(kinds(model).values()) >= {"Universal", "Gimbal", "Cylindrical", "Planar", "Spherical"}
-    assert "Joints 'u1', 'u2' in succession are the Universal 'u1 u2'." in model.notes
-    assert model.coordinates["g2"] == "g1 g2 g3.angle_2"
+    """With motors, a servo, a spring and a damper on their coordinates."""
+    model = successions(["three skew hinges apart"])
+    check_dynamics(model, 3, scale=0.5)
+    assert model.coordinates["k3"] == "k1 k2 k3.angle_3"
+    assert any("Joints 'k1', 'k2', 'k3' in succession are the Composite 'k1 k2 k3'" in note for note in model.notes)
+    assert not any("counts in half a turn" in note for note in model.notes)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("names", [list(SUCCESSIONS)[1:6], list(SUCCESSIONS)[6:]])
+def test_all_joints_in_succession_move_as_in_mujoco(names):
+    check_dynamics(successions(names), scale=0.5)
+
+
+def test_equalities_of_tendons_are_those_of_mujoco():
+    """Sums of coordinates, polynomials of one, and lengths where they are neither."""
+    bodies = rod("a", joint("i", axis="0 1 0", more='ref="20"')) + rod("b", joint("j", axis="0 1 0"), pos="0 1 0")
+    bodies += rod("c", joint("k", "slide", "1 0 0", 'ref=".1"'), '<site name="tip"/>', pos="0 2 0")
+    along = {"t1": {"i": 2, "j": 3, "k": -0.5}, "t2": {"k": 2}, "t3": {"i": 2}, "t4": {"k": 2, "j": -1}}
+    on_joints = lambda own: "".join(f'<joint joint="{name}" coef="{c}"/>' for name, c in own.items())
+    tendons = "".join(f'<fixed name="{name}">{on_joints(own)}</fixed>' for name, own in along.items())
+    tendons += '<spatial name="s"><site site="o"/><site site="tip"/></spatial>'
+    ties = {
+        "e1": ('tendon1="t1" polycoef=".3 0 0 0 0"', "JointCoupling", 2.0),
+        "e2": ('tendon1="t3" tendon2="t2" polycoef=".1 .2 .3 .4 .5"', "JointCoupling", 2.0),
+        "e3": ('tendon1="t1" tendon2="t4" polycoef=".1 .7 0 0 0"', "JointCoupling", 2.0),
+        "e4": ('tendon1="t3" tendon2="t4" polycoef=".1 .7 .2 0 0"', "JointCoupling", 1.0),
+        "e5": ('tendon1="s" polycoef=".1 0 0 0 0"', "JointDriver", 1.0),
+        "e6": ('tendon1="t2" polycoef=".1 0 0 0 0"', "JointDriver", 2.0),
+    }
+    equalities = "".join(f'<tendon name="{name}" {own}/>' for name, (own, *_) in ties.items())
+    more = f"<tendon>{tendons}</tendon><equality>{equalities}</equality>"
+    imported = importers.mjcf(file(f'<site name="o" pos="0 1 1"/>{bodies}', more))
+    model = imported.locate.model
+    data = mujoco.MjData(model)
+    for q, v in random_states(model, 3, scale=0.4):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(model, data)
+        values = {own: q[k] for k, own in enumerate("ijk")}
+        values = {imported.coordinates[own]: value for own, value in values.items()}
+        values |= {f"{model.tendon(k).name}.length": data.ten_length[k] for k in range(model.ntendon)}
+        for name, (_, kind, scale) in ties.items():
+            own = part(imported, name)
+            assert own.kind == kind
+            if kind == "JointDriver":
+                found = values[own.coordinate] - own.value
+            else:
+                found, powers = values[own.coordinate] - own.zero, own.coefficients.reshape(len(own.other), -1)
+                for other, zero, row in zip(own.other, own.other_zero.reshape(-1), powers, strict=True):
+                    found = found - np.polyval(row[::-1], values[other] - zero)
+            theirs = data.efc_pos[(data.efc_type == 0) & (data.efc_id == model.equality(name).id)]
+            np.testing.assert_allclose(scale * found, theirs, rtol=1e-12, atol=1e-14)
+    assert part(imported, "e1").other == ("j.angle", "k.displacement")
 
 
 # The rows of the table
@@ -221,6 +305,12 @@ HINGE = '<joint name="hip" axis="0 1 0"/>'
         ),
         (HINGE, '<actuator><motor name="m" joint="hip" gear="3"/></actuator>', "m", {"gear": 3, "gain": [1, 0, 0]}),
         (
+            joint("hip", "slide", "1 0 0", 'stiffness="2" springref=".3"') + joint("turn", axis="0 1 0"),
+            '<actuator><motor name="m" joint="hip" gear="3"/></actuator>',
+            "hip spring",
+            {"stiffness": 2, "free": 0.3},
+        ),
+        (
             HINGE,
             '<actuator><position name="m" joint="hip" kp="5" kv="2"/></actuator>',
             "m",
@@ -245,7 +335,8 @@ def test_what_is_exact(joints, more, name, fields):
     own = part(model, name)
     for field, value in fields.items():
         np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
-    assert all(re.search("Equalities hold exactly|up to half a turn", note) for note in model.notes)
+    said = "Equalities hold exactly|up to half a turn|in succession are the Composite"
+    assert all(re.search(said, note) for note in model.notes)
 
 
 def test_inertia_names_and_frames():
@@ -280,6 +371,13 @@ def test_inertia_names_and_frames():
             "Spherical",
             "their solref and solimp have no effect",
         ),
+        (
+            joint("hip", axis="1 0 0") + joint("h2", axis="0 1 0") + joint("h3"),
+            "",
+            "hip h2 h3",
+            "Composite",
+            "counts in half a turn, between the angles at which the three axes lie in one plane: 'h2'",
+        ),
     ],
 )
 def test_what_is_approximated_is_said(joints, more, name, kind, note):
@@ -296,17 +394,18 @@ def test_mocap_bodies_move_as_prescribed():
     assert any("Mocap bodies are held by a joint" in note and "'hand'" in note for note in model.notes)
 
 
-PLANE = (
-    '<joint name="px" type="slide" axis="1 0 0" {}/><joint name="pz" type="slide" axis="0 0 1"/>'
-    '<joint name="py" axis="0 1 0"/>'
-)
-SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0"/>'
+TWICE = joint("p1", axis="0 1 0") + joint("p2", "slide", "1 0 0") + joint("p3", axis="0 1 0", more='pos="1 0 0"')
+FOUR = "".join(joint(f"h{k}", axis=axis) for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1", "1 1 0")))
+FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis="0 0 1")
 
 
 @pytest.mark.parametrize(
     "joints, more, head, message",
     [
-        (SLIDES, "", "", "'a' has several joints in succession, slide 'x', hinge 'y'"),
+        (TWICE, "", "", "Joints in succession to 'a' are degenerate, hinge 'p1', hinge 'p3' are parallel hinges"),
+        (joint("s1", "slide") + joint("s2", "slide"), "", "", "slide 's1', slide 's2' slide in directions that depend"),
+        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' turn in more ways than the three"),
+        (FLAT, "", "", "the axes of the hinges 'f1', 'f2', 'f3' lie in one plane in the middle of the range of 'f2'"),
         (
             HINGE,
             '<tendon><spatial name="t"><site site="o"/><geom geom="drum"/><site site="s"/></spatial></tendon>',
@@ -334,13 +433,6 @@ SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0
         (HINGE, "", '<option density="1"/>', "A fluid is not modelled"),
         ('<joint name="hip" type="ball" armature=".1"/>', "", "", "armature of the ball joint 'hip'"),
         ('<joint name="hip" type="ball" limited="true" range="0 30"/>', "", "", "limits of the ball joint 'hip'"),
-        (
-            HINGE,
-            '<equality><tendon name="e" tendon1="t"/></equality>'
-            '<tendon><fixed name="t"><joint joint="hip" coef="1"/></fixed></tendon>',
-            "",
-            "The equality 'e' is of type tendon",
-        ),
         ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
         ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
         (HINGE, '<actuator><motor name="m" joint="hip" delay=".1" nsample="2"/></actuator>', "", "'m' has delays"),
@@ -356,17 +448,6 @@ SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" axis="0 1 0
             '<actuator><plugin joint="hip" plugin="mujoco.pid"><config key="kp" value="1"/></plugin></actuator>',
             '<extension><plugin plugin="mujoco.pid"/></extension>',
             "Plugins are not known; remove them from the file",
-        ),
-        (PLANE.format('stiffness="2"'), "", "", "springs of 'px', a slide of a planar joint"),
-        (PLANE.format('damping="2"'), "", "", "damping of 'px', a slide of a planar joint"),
-        (PLANE.format('limited="true" range="-1 1"'), "", "", "limits of 'px', a slide of a planar joint"),
-        (PLANE.format('armature=".1"'), "", "", "armature of 'px', a slide of a planar joint"),
-        (PLANE.format('frictionloss=".1"'), "", "", "friction of 'px', a slide of a planar joint"),
-        (
-            PLANE.format(""),
-            '<actuator><motor name="m" joint="px"/></actuator>',
-            "",
-            "'m' acts on 'px', which has no coordinate of its own",
         ),
     ],
 )

@@ -80,7 +80,7 @@ def test_a_free_base_and_a_mimic():
     model = importers.urdf(text, base="free")
     assert [body.name for body in model.scene.bodies] == ["base", "left", "right"]
     coupling = part(model, "r mimic")
-    assert (coupling.coordinate, coupling.other) == ("r.displacement", "l.displacement")
+    assert coupling.combined == ("r.displacement", "l.displacement")
     np.testing.assert_array_equal(coupling.coefficients, [0.1, 2.0])
 
 
@@ -108,7 +108,7 @@ def test_three_joints_between_links_without_mass():
         "<joint name='c' type='continuous'><parent link='w2'/><child link='hand'/><axis xyz='0 0 1'/></joint>",
     )
     model = importers.urdf(text)
-    assert kinds(model)["a b c"] == "Gimbal" and model.coordinates["b"] == "a b c.angle_2"
+    assert kinds(model)["a b c"] == "Composite" and model.coordinates["b"] == "a b c.angle_2"
 
 
 PLANAR = robot(link("base"), link("sled"), joint("table", "base", "sled", "planar", "<axis xyz='0 0 1'/>"))
@@ -117,7 +117,7 @@ PLANAR = robot(link("base"), link("sled"), joint("table", "base", "sled", "plana
 def test_a_planar_joint():
     model = importers.urdf(PLANAR)
     (own,) = (joint for joint in model.scene.joints)
-    assert own.kind == "Planar"
+    assert own.kind == "Composite" and own.sequence == ("slide", "slide", "hinge")
 
 
 @pytest.mark.parametrize(

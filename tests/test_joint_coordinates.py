@@ -110,6 +110,34 @@ def test_the_position_that_the_coordinates_of_each_joint_give(kind, options, val
     np.testing.assert_allclose(jnp.abs(jnp.asarray(attitude) @ state.q[3:]), 1.0, rtol=0, atol=1e-13)
 
 
+def floating(*forces):
+    sequence, axes = ("slide",) * 3 + ("hinge",) * 3, np.tile(np.eye(3), (2, 1))
+    joint = spatial.Composite("root", "ground", "body", sequence=sequence, axes_W=axes, point=(0.0, 0.0, 0.0))
+    return mb.Scene([spatial.Body("body", mass=1.0, inertia=J)], joints=[joint], forces=forces).compile()
+
+
+def test_a_joint_that_leaves_all_motions_free_has_coordinates_and_no_reaction():
+    system = floating()
+    assert system.rows == () and system.velocity_rank == 0
+    assert {"root.displacement_3", "root.angle_1"} < set(system.joint_coordinates())
+    assert "Composite  root  0 rows each, which have coordinates only" in str(system)
+    rubs = spatial.Friction("rub", "root", coefficient=0.1, radius=0.1, transition_speed=0.1)
+    with pytest.raises(ValueError, match="'rub' acts in Composite 'root', which leaves all motions free"):
+        floating(rubs)
+
+
+@pytest.mark.long
+def test_a_state_from_the_coordinates_of_a_joint_that_leaves_all_motions_free():
+    system = floating()
+    place = {"root.displacement_2": 0.4, "root.angle_1": 0.3, "root.angle_2": -0.5, "root.angle_3": 2.0}
+    state = mb.assemble(system, fix=place, rates={"root.displacement_3": 0.7})
+    np.testing.assert_allclose(state.q[:3], [0.0, 0.4, 0.0], rtol=0, atol=1e-13)
+    turns = [turn(axis, place[f"root.angle_{k}"]) for k, axis in enumerate(np.eye(3), 1)]
+    attitude = rotations.multiply(turns[0], rotations.multiply(turns[1], turns[2]))
+    np.testing.assert_allclose(jnp.abs(attitude @ state.q[3:]), 1.0, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(state.u[:3], [0.0, 0.0, 0.7], rtol=0, atol=1e-13)
+
+
 def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
     def entries(angle):
         state = mb.assemble(arm, fix={"hip.angle": angle}, rates={"hip.angle": 2.0}, throw=False)

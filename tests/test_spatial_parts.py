@@ -92,6 +92,30 @@ def gimbal(q, point, axis, second):
     return spatial.Gimbal("J", "a", "b", point=point, axis_1_W=axis, axis_2_W=second, **third)
 
 
+# Directions that are neither parallel nor perpendicular, and points of hinges that do not meet.
+AXES = np.array([[0.6, 0.0, 0.8], [0.36, 0.8, -0.48], [-0.48, 0.36, 0.8], [0.8, 0.6, 0.0], [0.0, 1.0, 0.0]])
+POINTS = np.array([[0.1, 0.2, -0.1], [-0.2, 0.1, 0.3], [0.3, -0.1, 0.1]])
+
+
+def composite(*sequence, apart=False):
+    """A joint, and the motion of B that its hinges and slides make, one after the other from the last to the first."""
+    hinges, axes = sequence.count("hinge"), AXES[: len(sequence)]
+    points = POINTS[:hinges] if apart else None
+
+    def build(q, point, axis, second):
+        return spatial.Composite("J", "a", "b", sequence=sequence, axes_W=axes, points_W=points, point=point)
+
+    def motion(q, point, axis, second, x):
+        pose, k = q[1], hinges
+        for word, own, value in reversed([*zip(sequence, jnp.asarray(axes), x, strict=False)]):
+            k -= word == "hinge"
+            center = jnp.asarray(POINTS[k]) if apart else point
+            pose = move(pose, turn(own, value), center, STILL) if word == "hinge" else pose.at[:3].add(value * own)
+        return pose
+
+    return Case(6 - len(sequence), build, of_b(motion))
+
+
 def link(q, point, axis, second):
     return spatial.Distance("J", "a", "b", point_a=POINT_A, point_b=POINT_B)
 
@@ -142,6 +166,8 @@ CASES = {
         3, world(spatial.Planar), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[2]), point, in_plane(a, x)))
     ),
     "Fixed": Case(6, ball(spatial.Fixed), of_b(lambda q, point, a, b, x: q[1])),
+    "Composite of two hinges apart": composite("hinge", "hinge", apart=True),
+    "Composite of all kinds": composite("hinge", "slide", "hinge", "slide", "hinge", apart=True),
     "Distance": Case(1, link, of_b(on_link)),
     "PointOnPlane": Case(
         1, world(spatial.PointOnPlane), of_b(lambda q, point, a, b, x: move(q[1], turn_3(x[2:]), point, in_plane(a, x)))
@@ -193,6 +219,34 @@ def test_joint_resolves_to_body_fixed_form(setup):
 
 def test_joint_parameter_derivatives(setup):
     check_parameter_derivatives(lambda part: setup.residual(part, setup.elsewhere), setup.part, setup.rng)
+
+
+@pytest.mark.parametrize(
+    "sequence, options",
+    [
+        (("slide", "hinge", "slide", "hinge"), {}),
+        (("slide", "slide", "ball"), {}),
+        # Zero is no value of the second angle here: the first and the third axis are parallel.
+        (("hinge", "hinge", "hinge"), {"middle": 1.0, "axes": AXES[[0, 2, 0]], "orientation": NO_TURN}),
+    ],
+)
+def test_coordinates_of_joints_in_succession(sequence, options):
+    ground = jnp.array(SPACE.ground)
+    axes = options.pop("axes", AXES[: len(sequence)])
+    own = {"point_a": POINT_A, "point_b": POINT_B, "orientation": turn(jnp.asarray(AXES[0]), jnp.array(0.5))}
+    part = spatial.Composite("J", "a", "b", sequence=sequence, axes=axes, **(own | options))
+    part = part.resolve(SPACE, jnp.stack([ground, ground]))
+    values = [np.array([0.3, -0.5, 0.2]) if word == "ball" else 0.7 + 0.1 * k for k, word in enumerate(sequence)]
+    pose = jnp.concatenate([part.point_a - rot.rotate(part.orientation, part.point_b), part.orientation])
+    for word, axis, value in reversed([*zip(sequence, jnp.asarray(axes), values, strict=True)]):
+        if word == "slide":
+            pose = pose.at[:3].add(value * axis)
+        else:
+            pose = move(pose, turn_3(value if word == "ball" else value * axis), part.point_a, STILL)
+    poses = jnp.stack([ground, pose])
+    np.testing.assert_allclose(part.residual(SPACE, poses, 0.0), 0.0, atol=1e-15)
+    for found, expected in zip(part.coordinates(SPACE, poses).values(), values, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
 def test_joint_stacks(setup):
@@ -705,6 +759,20 @@ TWO = ("J", "a", "b")
         (spatial.Revolute(*TWO, point=O, axis=Z, axis_a=Z, axis_b=Z), "not both"),
         (spatial.Universal(*TWO, point=O, axis_a=Z), "give axis_b .fixed in 'b'. or axis_b_W"),
         (spatial.Universal(*TWO, point=O, axis_a_W=Z, axis_b_W=Z), "must be perpendicular"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"]), "give axes .fixed in 'a'. or axes_W"),
+        (spatial.Composite(*TWO, point=O, sequence=["pin"], axes=[Z]), "sequence must hold words of"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=[Z, Z]), "axes must have 1 rows"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=Z), r"axes must have shape \(any, 3\)"),
+        (spatial.Composite(*TWO, point=O, sequence=["slide"], axes=[(0.0, 0.0, 2.0)]), "axes must be a unit vector"),
+        (
+            spatial.Composite(*TWO, point=O, sequence=["hinge", "slide", "hinge"], axes=[Z, (1.0, 0.0, 0.0), Z]),
+            "hinge 1, hinge 3 are parallel hinges",
+        ),
+        (spatial.Composite(*TWO, point=O, sequence=["slide"] * 2, axes=[Z, Z]), "slide 1, slide 2 slide in directions"),
+        (spatial.Composite(*TWO, point=O, sequence=["ball", "hinge"], axes=[Z, Z]), "turn in more ways than"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=[Z], points=[Z, Z]), "points must have 1 rows"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=[Z], middle=1.0), "leave it out"),
+        (spatial.Composite(*TWO, point=O, sequence=["hinge"] * 3, axes=[Z, (1.0, 0.0, 0.0), Z]), "give another middle"),
         (spatial.Prismatic(*TWO, point=O), "give axis_a .fixed in 'a'. or axis"),
         (spatial.Prismatic(*TWO, point=O, axis=Z, axis_a=Z), "only one of them"),
         (spatial.Prismatic(*TWO, point=O, axis=Z, orientation=(2.0, 0.0, 0.0, 0.0)), "normalise"),

@@ -89,7 +89,7 @@ class _Builder:
         # Names of joints come before those of other elements.
         for chain in self.fused.chains:
             self._chain(chain)
-        for step in (self._loops, self._couplings, self._tendons, self._actuators, self._marks):
+        for step in (self._loops, self._tendons, self._couplings, self._actuators, self._marks):
             step()
         for name, share in machine.buoyancy.items():
             self._buoyancy(name, share)
@@ -121,19 +121,25 @@ class _Builder:
         joints = chain.joints
         a, b = self.fused.placed(chain.parent), self.fused.placed(chain.child)
         name = self._named(" ".join(joint.name for joint in joints), "joint")
-        found = chains.joint_of(joints, a, b, name)
-        if found is None:
-            kinds = ", ".join(f"{joint.kind} {joint.name!r}" for joint in joints)
+        try:
+            found = chains.joint_of(joints, a, b, name)
+        except ValueError as why:
             self.notes.refused.append(
-                f"{joints[0].where}{b.name!r} has several joints in succession, {kinds}, that make no universal, "
-                "gimbal, cylindrical or planar joint: put a link with mass between them."
+                f"{joints[0].where}Joints in succession to {b.name!r} are degenerate, {why}: put a link with mass "
+                "between them."
             )
             return
-        if len(joints) > 1 and found.parts:
+        if len(joints) > 1:
             listed = ", ".join(f"{joint.name!r}" for joint in joints)
             self.notes.say(f"Joints {listed} in succession are the {found.parts[0].kind} {name!r}.")
+        if found.half_turn:
+            self.notes.say(
+                "The second of three hinges in succession counts in half a turn, between the angles at which the three "
+                "axes lie in one plane: {}.",
+                found.half_turn,
+            )
         self.joints += found.parts
-        self.coordinates |= found.coordinates
+        self.coordinates |= {joint: (coordinate, 0.0) for joint, coordinate in found.coordinates.items()}
         for joint in joints:
             self._passive(joint, a.name, b)
 
@@ -153,12 +159,8 @@ class _Builder:
             "limits": joint.limits is not None,
         }
         wanted = {kind for kind, value in values.items() if value and not self.notes.leaves_out(kind, joint.name)}
-        if joint.kind in ("ball", "free"):
+        if coordinate is None or joint.kind == "ball":
             self._of_ball(joint, a, b, coordinate, wanted)
-            return
-        if coordinate is None:
-            for kind in sorted(wanted):
-                self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of {joint.name!r}, a slide of a planar joint")
             return
         if wanted & {"springs", "damping"}:
             self.forces.append(
@@ -263,26 +265,36 @@ class _Builder:
         for coupling in self.machine.couplings:
             if self.notes.leaves_out("couplings", coupling.name):
                 continue
-            name, offset = self._coordinate(coupling.joint, "couplings", coupling.name)
-            if name is None:
+            known = self.tendons if coupling.of_tendons else self.coordinates
+            ends = [(coupling.joint, coupling.zero), *((other, zero) for other, _, zero in coupling.others)]
+            names: list[str] = []
+            zeros: list[float] = []
+            for joint, zero in ends:
+                name, offset = self._coordinate(joint, "couplings", coupling.name, known)
+                names += [] if name is None else [name]
+                zeros.append(zero - offset)
+            if len(names) < len(ends):
                 continue
-            zero = coupling.zero - offset
-            if coupling.other is None:
-                value = zero + coupling.coefficients[0]
-                self.joints.append(JointDriver(self._named(coupling.name, "coupling"), name, value=value))
+            name = self._named(coupling.name, "coupling")
+            if len(ends) == 1:
+                self.joints.append(JointDriver(name, names[0], value=zeros[0] + coupling.constant))
                 continue
-            other, other_offset = self._coordinate(coupling.other, "couplings", coupling.name)
-            if other is not None:
-                own: dict[str, Any] = {"zero": zero, "other_zero": coupling.other_zero - other_offset}
-                powers = np.trim_zeros(coupling.coefficients, "b")
-                own["coefficients"] = powers if powers.size else np.zeros(1)
-                if not self._turns_without_end(coupling, powers):
-                    self._seen_up_to_half_a_turn(coupling.other, coupling.name, coupling.other_zero)
-                self.joints.append(JointCoupling(self._named(coupling.name, "coupling"), name, other, **own))
+            size = max(len(np.trim_zeros(powers, "b")) for _, powers, _ in coupling.others)
+            coefficients = np.zeros((len(coupling.others), 1 + size))
+            coefficients[0, 0] = coupling.constant
+            for row, (_, powers, _) in zip(coefficients, coupling.others, strict=True):
+                row[1 : 1 + len(powers)] = powers[:size]
+            own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros[1:]}
+            if len(ends) == 2:
+                own = {field: values[0] for field, values in own.items()}
+            self.joints.append(JointCoupling(name, names[0], tuple(names[1:]), zero=zeros[0], **own))
+            for other, powers, zero in coupling.others:
+                if not coupling.of_tendons and not self._turns_without_end(coupling.joint, powers):
+                    self._seen_up_to_half_a_turn(other, coupling.name, zero)
 
-    def _turns_without_end(self, coupling, powers):
-        """Whether full turns of the other hinge are full turns of this one."""
-        return self.of_name[coupling.joint].kind == "hinge" and len(powers) <= 2 and float(sum(powers[1:])).is_integer()
+    def _turns_without_end(self, joint, powers):
+        """Whether full turns of another hinge are full turns of this one."""
+        return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
     def _coordinate(self, what, kind, of, known=None):
         """The coordinate of a joint, or of something else that is known, and what must be added to it."""

@@ -1,4 +1,4 @@
-"""Which joint of the library several elementary joints in succession make, from one link with mass to the next."""
+"""Which joint of the library the elementary joints make that lead from one link with mass to the next."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from ..parts.joint_parts import JointDriver
-from ..parts.spatial.joints import Cylindrical, Gimbal, Planar, Prismatic, Revolute, Spherical, Universal
-from .description import Joint
+from ..parts.spatial.composite import Composite, coordinate_names, degenerate, flat_angle
+from ..parts.spatial.joints import Prismatic, Revolute, Spherical
+from .description import Joint, quaternion, turned
 
-# Axes that miss each other by less [rad, m] are parallel, perpendicular, or meet.
-_CLOSE = 1e-7
+# Axes that miss each other by less [m] meet.
+_CLOSE = 1e-12
+# The sine of the angle from which on three axes do not lie in one plane.
+_FLAT = 1e-6
 
 
 @dataclasses.dataclass
@@ -31,124 +33,114 @@ class Body:
 
 @dataclasses.dataclass
 class Found:
-    """The parts that some joints make, and for each joint its coordinate, `"hip.angle"` or None if it has none, and
-    what must be added to it to give that of the file.
+    """The part that some joints make, if any, and for each joint its coordinate, `"hip.angle"` or None if it has none.
+
+    `half_turn`: the joint whose angle counts in half a turn, though its range is larger.
     """
 
     parts: list[Any]
-    coordinates: dict[str, tuple[str | None, float]]
+    coordinates: dict[str, str | None]
+    half_turn: str = ""
 
 
-def joint_of(joints: Sequence[Joint], a: Body, b: Body, name: str) -> Found | None:
-    """The parts that joints in succession from body A to body B make; None if the library has none.
+def joint_of(joints: Sequence[Joint], a: Body, b: Body, name: str) -> Found:
+    """The part that joints in succession from body A to body B make.
 
     **Arguments:** `name` of the part.
+
+    **Raises:** `ValueError` that says why the placement of the bodies does not determine the coordinates of the joints.
     """
-    kinds = "".join(joint.kind[0] for joint in joints)
-    axes = [joint.axis for joint in joints]
-    if kinds == "f":
-        return Found([], {joints[0].name: (None, 0.0)})
-    if kinds == "b":
-        point = joints[0].point
-        return Found([Spherical(name, a.name, b.name, point=point)], {joints[0].name: (f"{name}.rotation", 0.0)})
-    if kinds in ("h", "s"):
-        make = _hinge if kinds == "h" else _slide
-        return make(joints[0], a, b, name)
-    if kinds in ("hs", "sh") and _parallel(*axes):
-        return _cylindrical(joints, a, b, name)
-    if kinds in ("hh", "hhh") and _perpendicular(axes):
-        return _cardan(joints, a, b, name)
-    if kinds in ("ss", "ssh") and _perpendicular(axes):
-        return _planar(joints, a, b, name)
-    if kinds in ("ssshhh", "sssb") and _perpendicular(axes[:3]) and (kinds == "sssb" or _perpendicular(axes[3:])):
-        return Found([], {joint.name: (None, 0.0) for joint in joints})
-    return None
-
-
-def _perpendicular(axes):
-    triad = np.stack(axes)
-    return bool(np.max(np.abs(triad @ triad.T - np.eye(len(axes)))) < _CLOSE)
-
-
-def _parallel(u, v):
-    return bool(np.linalg.norm(np.cross(u, v)) < _CLOSE)
-
-
-def _across(axis):
-    u = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    return u / np.linalg.norm(u)
-
-
-def _turning(joint, a, b, x=None):
-    """Axes, and the directions that the angle is measured between, from x, so that it is the file's."""
-    x = _across(joint.axis) if x is None else x
-    back = np.cos(joint.reference) * x + np.sin(joint.reference) * np.cross(joint.axis, x)
-    return {
-        "axis_a": a.direction(joint.axis),
-        "axis_b": b.direction(joint.axis),
-        "x_a": a.direction(x),
-        "x_b": b.direction(back),
-    }
+    joint = joints[0]
+    if len(joints) > 1:
+        return _composite(joints, a, b, name)
+    if joint.kind == "free":
+        return Found([], {joint.name: None})
+    if joint.kind == "ball":
+        return Found([Spherical(name, a.name, b.name, point=joint.point)], {joint.name: f"{name}.rotation"})
+    return _hinge(joint, a, b, name) if joint.kind == "hinge" else _slide(joint, a, b, name)
 
 
 def _hinge(joint, a, b, name):
     points = {"point_a": a.point(joint.point), "point_b": b.point(joint.point)}
-    part = Revolute(name, a.name, b.name, **points, **_turning(joint, a, b))
-    return Found([part], {joint.name: (f"{name}.angle", 0.0)})
-
-
-def _shifted(joint, a, b):
-    """Points whose distance along the axis is the displacement of the file."""
-    return {"point_a": a.point(joint.point - joint.reference * joint.axis), "point_b": b.point(joint.point)}
+    axes = {"axis_a": a.direction(joint.axis), "axis_b": b.direction(joint.axis)}
+    # The angle between these directions is the file's.
+    x = np.cross(joint.axis, np.eye(3)[int(np.argmin(np.abs(joint.axis)))])
+    x /= np.linalg.norm(x)
+    back = np.cos(joint.reference) * x + np.sin(joint.reference) * np.cross(joint.axis, x)
+    part = Revolute(name, a.name, b.name, **points, **axes, x_a=a.direction(x), x_b=b.direction(back))
+    return Found([part], {joint.name: f"{name}.angle"})
 
 
 def _slide(joint, a, b, name):
-    part = Prismatic(name, a.name, b.name, axis_a=a.direction(joint.axis), **_shifted(joint, a, b))
-    return Found([part], {joint.name: (f"{name}.displacement", 0.0)})
+    # The distance of these points along the axis is the displacement of the file.
+    points = {"point_a": a.point(joint.point - joint.reference * joint.axis), "point_b": b.point(joint.point)}
+    part = Prismatic(name, a.name, b.name, axis_a=a.direction(joint.axis), **points)
+    return Found([part], {joint.name: f"{name}.displacement"})
 
 
-def _cylindrical(joints, a, b, name):
-    hinge, slide = sorted(joints, key=lambda joint: joint.kind)
-    along = float(np.sign(hinge.axis @ slide.axis))
-    if along < 0:
-        # The slide's displacement along the other direction of the axis.
-        return None
-    on_axis = dataclasses.replace(slide, point=hinge.point)
-    part = Cylindrical(name, a.name, b.name, **_shifted(on_axis, a, b), **_turning(hinge, a, b))
-    return Found([part], {hinge.name: (f"{name}.angle", 0.0), slide.name: (f"{name}.displacement", 0.0)})
+def _composite(joints, a, b, name):
+    # From where all coordinates are zero to the reference pose, a turn and a shift of what follows each joint.
+    turn, shift = np.eye(3), np.zeros(3)
+    axes, points = [], []
+    for joint in joints:
+        axis, point = turn.T @ joint.axis, turn.T @ (joint.point - shift)
+        axes.append(axis)
+        points.append(point)
+        if joint.kind == "hinge":
+            own = turned(axis, joint.reference)
+            turn, shift = turn @ own, turn @ (point - own @ point) + shift
+        elif joint.kind == "slide":
+            shift = turn @ (joint.reference * axis) + shift
+    sequence = [joint.kind for joint in joints]
+    why = degenerate(sequence, np.array(axes), [f"{joint.kind} {joint.name!r}" for joint in joints])
+    if why:
+        raise ValueError(why)
+    b_at_zero = Body(b.name, turn.T @ (b.position - shift), turn.T @ b.rotation)
+    options, half_turn = _second_of_three(joints, axes)
+    turning = [k for k, kind in enumerate(sequence) if kind != "slide"] or [0]
+    point = _meeting([points[k] for k in turning], [axes[k] for k in turning])
+    if point is None:
+        point = points[turning[0]]
+        options["points"] = [a.point(points[k]) for k in turning]
+    part = Composite(
+        name,
+        a.name,
+        b.name,
+        sequence=sequence,
+        axes=[a.direction(axis) for axis in axes],
+        point_a=a.point(point),
+        point_b=b_at_zero.point(point),
+        orientation=quaternion(a.rotation.T @ b_at_zero.rotation),
+        **options,
+    )
+    fields = zip(joints, coordinate_names(sequence), strict=True)
+    return Found([part], {joint.name: f"{name}.{field}" for joint, field in fields}, half_turn)
 
 
-def _cardan(joints, a, b, name):
-    """Two or three hinges whose axes meet in a point."""
-    rows = [np.eye(3) - np.outer(joint.axis, joint.axis) for joint in joints]
-    target = np.concatenate([row @ joint.point for row, joint in zip(rows, joints, strict=True)])
-    point, *_ = np.linalg.lstsq(np.concatenate(rows), target, rcond=None)
-    if np.max(np.abs(np.concatenate(rows) @ point - target)) > _CLOSE:
-        return None
-    if len(joints) == 2:
-        part = Universal(name, a.name, b.name, point=point, axis_a_W=joints[0].axis, axis_b_W=joints[1].axis)
-        fields = ("angle_a", "angle_b")
-    else:
-        axes = {f"axis_{k}_W": joint.axis for k, joint in enumerate(joints, 1)}
-        part = Gimbal(name, a.name, b.name, point=point, **axes)
-        fields = ("angle_1", "angle_2", "angle_3")
-    own = zip(joints, fields, strict=True)
-    return Found([part], {joint.name: (f"{name}.{field}", joint.reference) for joint, field in own})
+def _meeting(points, axes):
+    """The point in which lines meet; None if they do not."""
+    rows = np.concatenate([np.eye(3) - np.outer(axis, axis) for axis in axes])
+    target = np.concatenate([rows[3 * k : 3 * k + 3] @ point for k, point in enumerate(points)])
+    # Near the first point, so that a common one is kept as it is.
+    step = np.linalg.lstsq(rows, target - rows @ points[0], rcond=None)[0]
+    point = points[0] + step
+    return point if np.max(np.abs(rows @ point - target)) <= _CLOSE else None
 
 
-def _planar(joints, a, b, name):
-    """Two slides, and perhaps a hinge across both of them."""
-    first, second = joints[:2]
-    normal = np.cross(first.axis, second.axis)
-    hinge = joints[2] if len(joints) == 3 else Joint("", "hinge", first.parent, first.child, first.point, normal)
-    start = hinge.point - first.reference * first.axis - second.reference * second.axis
-    # The second component of the displacement is that along `axis × x_a`.
-    x = first.axis if hinge.axis @ normal > 0 else second.axis
-    points = {"point_a": a.point(start), "point_b": b.point(hinge.point)}
-    parts: list[Any] = [Planar(name, a.name, b.name, **points, **_turning(hinge, a, b, x))]
-    coordinates: dict[str, tuple[str | None, float]] = {first.name: (None, 0.0), second.name: (None, 0.0)}
-    if len(joints) == 3:
-        coordinates[hinge.name] = (f"{name}.angle", 0.0)
-    else:
-        parts.append(JointDriver(f"{name} attitude", f"{name}.angle", value=0.0))
-    return Found(parts, coordinates)
+def _second_of_three(joints, axes):
+    """Of three hinges, options with about where the second angle stays, and the name of this hinge if its range
+    contains an angle at which the three axes lie in one plane.
+    """
+    hinges = [(joint, axis) for joint, axis in zip(joints, axes, strict=True) if joint.kind == "hinge"]
+    if len(hinges) < 3:
+        return {}, ""
+    second, flat = hinges[1][0], float(flat_angle(*(axis for _, axis in hinges)))
+    middle = second.reference if second.limits is None else 0.5 * (second.limits[0] + second.limits[1])
+    if abs(np.sin(middle - flat)) < _FLAT:
+        names = ", ".join(repr(joint.name) for joint, _ in hinges)
+        raise ValueError(
+            f"the axes of the hinges {names} lie in one plane in the middle of the range of {second.name!r}"
+        )
+    low = flat + np.pi * np.floor((middle - flat) / np.pi)
+    within = second.limits is not None and low < second.limits[0] and second.limits[1] < low + np.pi
+    return {"middle": middle}, "" if within else second.name

@@ -78,16 +78,18 @@ class Loop:
 
 @dataclasses.dataclass
 class Coupling:
-    """A joint's coordinate as a polynomial of another's, `x − zero = Σ coefficients[k] (y − other_zero)ᵏ`; without
-    another one, it is held at the constant.
+    """A joint's coordinate as a constant and a sum of polynomials of other joints' coordinates, `x − zero = constant +
+    Σᵢ Σₖ powersᵢ[k − 1] (yᵢ − zeroᵢ)ᵏ`; without others it is held.
+
+    `others`: names, powers and zeros; `of_tendons`: the coordinates are lengths of tendons.
     """
 
     name: str
     joint: str
-    other: str | None
-    coefficients: np.ndarray
+    constant: float = 0.0
+    others: list[tuple[str, np.ndarray, float]] = dataclasses.field(default_factory=list)
     zero: float = 0.0
-    other_zero: float = 0.0
+    of_tendons: bool = False
 
 
 @dataclasses.dataclass

@@ -10,9 +10,10 @@ import numpy as np
 
 from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.on_frames import framed
+from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
 from ..system import RigidBodySystem
-from .description import matrix
+from .description import matrix, turned
 from .notes import Notes
 
 
@@ -130,7 +131,7 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
     tree = Tree(places)
     parts = [
         p
-        for p in parts_of(system, system.constraints, places)
+        for p in parts_of(system, (*system.constraints, *system.free_joints), places)
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
@@ -223,6 +224,29 @@ def _gimbal(part):
     )
 
 
+def _composite(part):
+    """From the first joint on, which is fixed in A, each where the coordinates of those before it put it."""
+    own, values, out = part.part, part.coordinates(), []
+    start = np.asarray(own.point_a)
+    points = itertools.repeat(start) if own.points is None else iter(np.asarray(own.points))
+    place, turn = part.poses[0][:3], matrix(part.poses[0][3:7])
+    for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
+        value, point = values[field], next(points) if word == "hinge" else start
+        joint = TreeJoint(f"{part.name} {field}", word, place + turn @ point, turn @ axis)
+        if word == "ball":
+            size = float(np.linalg.norm(value))
+            axis, angle = (value / size, size) if size > 0 else (axis, 0.0)
+        else:
+            joint.value = angle = float(value)
+        if word == "slide":
+            place = place + turn @ (joint.value * axis)
+        else:
+            own_turn = turned(axis, angle)
+            place, turn = place + turn @ (point - own_turn @ point), turn @ own_turn
+        out.append((f"{part.name}.{field}", joint))
+    return out
+
+
 def _spherical(part):
     return [(f"{part.name}.rotation", TreeJoint(part.name, "ball", part.point(1), np.zeros(3)))]
 
@@ -242,6 +266,7 @@ _JOINTS = {
     "Cylindrical": _cylindrical,
     "Universal": _universal,
     "Gimbal": _gimbal,
+    "Composite": _composite,
     "Spherical": _spherical,
     "Planar": _planar,
     "Fixed": lambda part: [],
@@ -285,7 +310,7 @@ def _close_fixed(part, tree):
 def _close_coupling(part, tree):
     own = part.part
     joints = [tree.coordinates.get(name) for name in part.acts_on]
-    if None in joints or own.coefficients.shape[0] > 5:
+    if None in joints or own.coefficients.ndim > 1 or own.coefficients.size > 5:
         return None
     x, y = joints
     shift = np.polynomial.Polynomial([y.value - float(own.other_zero), 1.0])

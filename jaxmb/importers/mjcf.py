@@ -34,7 +34,8 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     """A machine from MJCF.
 
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
-    `connect`, `weld` and `joint` equalities hold exactly, whatever their `solref` and `solimp`.
+    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`. Several
+    joints of one body are one `spatial.Composite`, of which each is a coordinate.
 
     **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
     such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
@@ -170,15 +171,40 @@ def _read_equalities(mujoco, model, names, machine, notes):
             continue
         one, two, kind = model.eq_obj1id[k], model.eq_obj2id[k], kinds(int(model.eq_type[k]))
         if kind == kinds.mjEQ_JOINT:
-            other = names.joint(two) if two >= 0 else None
-            zeros = [float(model.qpos0[model.jnt_qposadr[j]]) if j >= 0 else 0.0 for j in (one, two)]
-            own = Coupling(name, names.joint(one), other, data[:5], zero=zeros[0], other_zero=zeros[1])
-            machine.couplings.append(own)
+            zero = lambda j: float(model.qpos0[model.jnt_qposadr[j]])
+            others = [(names.joint(two), data[1:5], zero(two))] if two >= 0 else []
+            machine.couplings.append(Coupling(name, names.joint(one), data[0], others, zero(one)))
+        elif kind == kinds.mjEQ_TENDON:
+            machine.couplings.append(_tendon_coupling(mujoco, model, names, name, one, two, data))
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
             machine.loops.append(_loop(mujoco, model, names, name, k, data))
         else:
             what = str(kind).rpartition("mjEQ_")[2].lower()
             notes.refuse("loops", name, f"The equality {name!r} is of type {what}")
+
+
+def _tendon_coupling(mujoco, model, names, name, one, two, data):
+    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose; between the joints
+    along them where it is a sum of polynomials of their coordinates, which may then turn without end.
+    """
+    on_joints = lambda k: model.wrap_type[model.tendon_adr[k]] == mujoco.mjtWrap.mjWRAP_JOINT
+    tendons = [one] if two < 0 else [one, two]
+    terms: dict[int, np.ndarray] = {}
+    for k in tendons if all(map(on_joints, tendons)) else ():
+        powers = -data[1:5] if k == two else np.array([1.0, 0, 0, 0])
+        for w in range(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k]):
+            joint, scale = int(model.wrap_objid[w]), model.wrap_prm[w] ** np.arange(1, 5)
+            terms[joint] = terms.get(joint, np.zeros(4)) + powers * scale
+    terms = {joint: powers for joint, powers in terms.items() if np.any(powers)}
+    first = next((joint for joint, powers in terms.items() if powers[0] and not np.any(powers[1:])), None)
+    is_sum = two < 0 or model.tendon_num[two] == 1 or not np.any(data[2:5])
+    if first is None or not is_sum:
+        length = lambda k: float(model.tendon_length0[k])
+        others = [(names("tendon", k), data[1:5], length(k)) for k in tendons[1:]]
+        return Coupling(name, names("tendon", one), data[0], others, length(one), of_tendons=True)
+    scale, zero = terms.pop(first)[0], lambda j: float(model.qpos0[model.jnt_qposadr[j]])
+    others = [(names.joint(j), -powers / scale, zero(j)) for j, powers in terms.items()]
+    return Coupling(name, names.joint(first), data[0] / scale, others, zero(first))
 
 
 def _loop(mujoco, model, names, name, k, data):

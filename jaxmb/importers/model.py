@@ -19,7 +19,8 @@ class ImportedModel:
 
     - `scene`: its bodies, joints, forces and frames, a `Scene` to extend and compile. Bodies and joints have the names
         of the file, and bodies their frames; links that are fixed to others, sites and other marks are frames. An
-        angle or displacement of a joint is that of the file. The armature of a joint is a `JointInertia`.
+        angle or displacement of a joint is that of the file. Joints in succession, with no mass in between, are one
+        `Composite`. The armature of a joint is a `JointInertia`.
     - `notes`: sentences on what is approximated and what is left out.
     - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.
     - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for

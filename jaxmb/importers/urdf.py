@@ -197,8 +197,8 @@ def _read_mimic(joint, element, machine):
     mimic = element.first("mimic")
     if mimic is not None:
         factor, offset = mimic.attribute_number("multiplier", 1.0), mimic.attribute_number("offset")
-        coefficients = np.array([offset, factor])
-        machine.couplings.append(Coupling(f"{joint.name} mimic", joint.name, mimic.need("joint"), coefficients))
+        others = [(mimic.need("joint"), np.array([factor]), 0.0)]
+        machine.couplings.append(Coupling(f"{joint.name} mimic", joint.name, offset, others))
 
 
 def _say_unread(root, notes):

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ..linalg.arrays import namespace
 from . import checks, fields
 from .names import check_arguments
 from .shapes import AbstractShape
@@ -387,7 +388,12 @@ class AbstractNonIdeal(AbstractPart):
     joint: AbstractVar[str]
 
     def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
-        """A checked copy with every number filled in, from its joint and the poses of the joint's bodies."""
+        """A checked copy with every number filled in, from its joint and the poses of the joint's bodies.
+
+        **Raises:** `ValueError` also if the joint has no rows, and so no reaction.
+        """
+        if isinstance(joint, AbstractConstraint) and not joint.rows:
+            raise ValueError(f"{self.label} acts in {joint.label}, which leaves all motions free and has no reaction.")
         self.check(space.dimension)
         part = self.complete(space, joint, poses)
         part.check(space.dimension)
@@ -420,10 +426,18 @@ def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
             for fixed in own.gives:
                 pose = poses[declared[fixed].body]
                 convert = space.body_point if own.is_point else space.body_direction
-                values[fixed] = convert(pose, value if own.is_point else value / np.linalg.norm(value))
+                in_body = lambda row, own=own, pose=pose, convert=convert: convert(
+                    pose, row if own.is_point else _unit(row)
+                )
+                several = value.ndim > 1
+                values[fixed] = namespace(pose, value).stack([*map(in_body, value)]) if several else in_body(value)
         elif (own.is_direction or own.is_attitude) and value is not None:
-            values[name] = value / np.linalg.norm(value)
+            values[name] = _unit(value)
     return type(part).with_fields(part, **values) if values else part
+
+
+def _unit(value: Any) -> Any:
+    return value / np.linalg.norm(value, axis=-1, keepdims=True)
 
 
 def _check_given(part: Any, world: str, own: fields.Declaration) -> None:

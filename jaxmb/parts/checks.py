@@ -91,8 +91,10 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
     if declared.shape is not None:
         shape = tuple(dimension if size == "d" else size for size in declared.shape)
-        if value.shape != shape:
-            raise ValueError(f"{label}: {shown} must have shape {shape}, got {value.shape}.")
+        any_size = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
+        if not any_size:
+            wanted = str(shape).replace("None", "any")
+            raise ValueError(f"{label}: {shown} must have shape {wanted}, got {value.shape}.")
     if declared.kind == "internal":
         return  # In a compiled scene its values are in the state.
     if not np.isfinite(value).all():
@@ -102,14 +104,14 @@ def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarr
         raise ValueError(f"{label}: {shown} must not be zero.")
     if (sign == "positive" and (value <= 0).any()) or (sign == "non-negative" and (value < 0).any()):
         raise ValueError(f"{label}: {shown} must be {sign}, got {value.tolist()}.")
-    if declared.is_direction or declared.is_attitude:
-        size = float(np.linalg.norm(value))
+    for row in np.atleast_2d(value) if declared.is_direction or declared.is_attitude else ():
+        size = float(np.linalg.norm(row))
         if abs(size - 1.0) <= _UNIT:
-            return
+            continue
         if declared.is_attitude:
             raise ValueError(
-                f"{label}: {shown} must be unit Euler parameters (e0, e1, e2, e3), scalar first, got {value.tolist()} "
+                f"{label}: {shown} must be unit Euler parameters (e0, e1, e2, e3), scalar first, got {row.tolist()} "
                 f"of length {size:.6g}; normalise them, or make them with rotations.from_axis_angle."
             )
         cure = "divide it by its length" if size > 0 else "give a direction"
-        raise ValueError(f"{label}: {shown} must be a unit vector, got {value.tolist()} of length {size:.6g}; {cure}.")
+        raise ValueError(f"{label}: {shown} must be a unit vector, got {row.tolist()} of length {size:.6g}; {cure}.")

@@ -1,4 +1,4 @@
-"""Parts of several coordinates of joints: couplings between two of them, and tendons along many."""
+"""Parts of several coordinates of joints: couplings between them, and tendons along them."""
 
 import abc
 from collections.abc import Sequence
@@ -75,45 +75,57 @@ class AbstractCombination(AbstractOfSources):
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
-    """A coordinate that is a polynomial of another one. Rows 1: `(x − zero) − Σ coefficients[k] (y − other_zero)ᵏ`.
+    """A coordinate that is a polynomial of another one, or a sum of polynomials of several others. Rows 1:
+    `(x − zero) − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
 
-    Of angles known up to full turns, the row and `y − other_zero` are taken in [−π, π]. A gear whose ratio is a whole
-    number so turns without end, one with another ratio by half a turn to either side.
+    Of angles known up to full turns, the row and `yᵢ − other_zero[i]` are taken in [−π, π]. A gear whose ratios are
+    whole numbers so turns without end, one with other ratios by half a turn to either side.
 
-    **Arguments:** `coordinate` and `other`, the names of x and y, such as `"finger.angle"`; `coefficients`, of the
-    polynomial, the constant first; `zero` and `other_zero` [rad, m], default the coordinates at the given poses.
+    **Arguments:** `coordinate` and `other`, the names of x and of y, such as `"finger.angle"`, or of several others;
+    `coefficients`, of the polynomial, the constant first, or for several others one row each: of the carrier of a
+    differential `((0, 0.5), (0, 0.5))`; `zero` and `other_zero` [rad, m], for several others one each, default the
+    coordinates at the given poses.
     """
 
     coordinate: str = fields.name()
-    other: str = fields.name()
+    other: fields.Names = fields.names()
     coefficients: fields.Number = fields.parameter(shape=None)
     zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
-    other_zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
+    other_zero: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
     @property
     def combined(self):
-        return (self.coordinate, self.other)
+        return (self.coordinate, *self.other)
 
     def validate(self):
-        if self.coefficients.ndim != 1 or not self.coefficients.size:
-            raise ValueError(f"{self.label}: coefficients must be a vector, got shape {self.coefficients.shape}.")
-        if self.coordinate == self.other:
-            raise ValueError(f"{self.label} couples {self.coordinate!r} with itself.")
+        several = () if len(self.other) == 1 else (len(self.other),)
+        shape = self.coefficients.shape
+        if shape[:-1] != several or not self.coefficients.size:
+            wanted = "a vector" if not several else f"{several[0]} vectors of one length, one for each of {self.other}"
+            raise ValueError(f"{self.label}: coefficients must be {wanted}, got shape {shape}.")
+        if self.other_zero is not None and self.other_zero.shape != several:
+            raise ValueError(f"{self.label}: other_zero must have shape {several}, got {self.other_zero.shape}.")
+        twice = [name for name in self.combined if self.combined.count(name) > 1]
+        if twice:
+            raise ValueError(f"{self.label} couples {twice[0]!r} with itself.")
 
     def with_given(self, given):
-        return self.filled(zero=given[0], other_zero=given[1])
+        return self.filled(zero=given[0], other_zero=given[1] if len(given) == 2 else given[1:])
 
     def residual(self, space, poses, t):
-        x, y = self.values(space, poses)
-        y = y - self.other_zero
-        y = shortest(y) if self.is_periodic(1) else y
-        polynomial = jnp.zeros_like(y)
-        for k in reversed(range(self.coefficients.shape[0])):
-            polynomial = polynomial * y + self.coefficients[k]
-        out = (x - self.zero - polynomial)[None]
-        return shortest(out) if self.is_periodic(0) else out
+        x, *others = self.values(space, poses)
+        out = x - self.zero
+        rows, zeros = self.coefficients.reshape(len(others), -1), self.other_zero.reshape(-1)
+        for i, (y, powers) in enumerate(zip(others, rows, strict=True)):
+            y = y - zeros[i]
+            y = shortest(y) if self.is_periodic(i + 1) else y
+            polynomial = jnp.zeros_like(y)
+            for k in reversed(range(rows.shape[1])):
+                polynomial = polynomial * y + powers[k]
+            out = out - polynomial
+        return shortest(out[None]) if self.is_periodic(0) else out[None]
 
 
 class FixedTendon(AbstractCombination, AbstractTendon):

@@ -35,7 +35,7 @@ else:
     Number, Numbers, Names = Array, dict[str, Array], tuple[str, ...]
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
-Size = int | Literal["d"]
+Size = int | Literal["d"] | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +49,10 @@ class Declaration:
         with parameters, `"part"` for another part of the scene (`"parts"` for a dictionary of them), `"state"` for a
         number of the initial guess, and `"internal"` for an internal state (`"internals"` for a dictionary of them);
         these are not parameters.
-    - `shape`: of a number, None for any; `sign`; `unit`, `""` for a number without one.
+    - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
-    - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
+    - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
+        several points or unit vectors each row is one.
     - `sizes`: whether the scene's size is computed from this length.
     - `optional`: whether the field may be None, and is computed from the given poses; `at_origin`: whether a point that
         is left out is the origin of its frame.
@@ -214,10 +215,11 @@ def parameter(
 ) -> Any:
     """A number or an array of numbers.
 
-    **Arguments:** `shape`, in which `"d"` is the dimension of the space, None for any; `unit`, for information; `sign`
-    of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`;
-    `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from
-    this length; `converter`, applied before the checks; `constant`: whether it cannot be a function of time.
+    **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, for
+    information; `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a
+    matrix; `default`; `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size
+    is computed from this length; `converter`, applied before the checks; `constant`: whether it cannot be a function of
+    time.
     """
     declaration = Declaration(
         "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
@@ -235,26 +237,29 @@ def length(**options: Any) -> Any:
 def point(
     *,
     body: int | None,
+    shape: tuple[Size, ...] = ("d",),
     default: Any = dataclasses.MISSING,
     optional: bool = False,
     sizes: bool = True,
     gives: tuple[str, ...] = (),
+    needed: bool = True,
 ) -> Any:
     """A point [m], fixed in a body, or in the world with `body=None`.
 
     A point of a body is given in the frame of the body, or in that of the frame that the part names in its place. The
     origin of a body's frame is its mass centre, unless the body was given `centre=`.
 
-    **Arguments:** `body`: index among the part's bodies; `default`: `"origin"`, of that frame, or coordinates;
-    `optional`: default None; `sizes`: whether it contributes to the scene's size; `gives`: the body-fixed points that a
-    world point determines at the given poses.
+    **Arguments:** `body`: index among the part's bodies; `shape`: `(None, "d")` for any number of points, a row each;
+    `default`: `"origin"`, of that frame, or coordinates; `optional`: default None; `sizes`: whether it contributes to
+    the scene's size; `gives`: the body-fixed points that a world point determines at the given poses; `needed=False`:
+    both the world point and the one body-fixed point that it gives may be omitted.
     """
     at_origin = isinstance(default, str)
     if at_origin and default != "origin":
         raise ValueError(f"the default of a point must be 'origin' or coordinates, got {default!r}")
     declaration = Declaration(
         "number",
-        shape=("d",),
+        shape=shape,
         unit="m",
         body=body,
         is_point=True,
@@ -262,6 +267,7 @@ def point(
         optional=optional or at_origin or bool(gives),
         at_origin=at_origin,
         gives=gives,
+        needed=needed,
     )
     default = None if declaration.optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
@@ -270,6 +276,7 @@ def point(
 def axis(
     *,
     body: int | None,
+    shape: tuple[Size, ...] = ("d",),
     default: Any = dataclasses.MISSING,
     optional: bool = False,
     gives: tuple[str, ...] = (),
@@ -281,7 +288,7 @@ def axis(
     """
     declaration = Declaration(
         "number",
-        shape=("d",),
+        shape=shape,
         body=body,
         is_direction=True,
         optional=optional or bool(gives),

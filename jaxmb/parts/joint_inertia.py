@@ -34,7 +34,7 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
         return (self.coordinate,)
 
     def scalar_coordinates(self, parts):
-        is_length = self.coordinate.partition(".")[2] in ("displacement", "length")
+        is_length = self.coordinate.partition(".")[2].startswith(("displacement", "length"))
         name = f"{self.name}.{'displacement' if is_length else 'angle'}"
         return (ScalarCoordinate(name, is_length=is_length, moves=True),)
 

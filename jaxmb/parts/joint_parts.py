@@ -50,7 +50,7 @@ class AbstractCoordinatePart(AbstractLink):
     def unit(self, alternatives: str) -> str:
         """Of the units of an angle and of a displacement, `"N m or N"`, that of the coordinate."""
         of_angle, of_displacement = alternatives.split(" or ")
-        return of_displacement if self.within in ("displacement", "length") else of_angle
+        return of_displacement if self.within.startswith(("displacement", "length")) else of_angle
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:

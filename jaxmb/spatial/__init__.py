@@ -13,6 +13,7 @@ from ..parts.spatial.bodies import (
     rod as rod,
     sphere as sphere,
 )
+from ..parts.spatial.composite import Composite as Composite
 from ..parts.spatial.drivers import Driver as Driver
 from ..parts.spatial.forces import (
     Bushing as Bushing,

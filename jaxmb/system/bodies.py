@@ -25,7 +25,7 @@ from .equation import Ranks
 from .force_groups import ForceGroup, NonIdealGroup
 from .frame_motion import frame_quantities
 from .group_inputs import signals_of, with_signals
-from .groups import BodyGroup, FrameGroup, TendonGroup
+from .groups import BodyGroup, CoordinateGroup, FrameGroup
 from .internal_states import (
     StateField,
     initial_states,
@@ -56,9 +56,9 @@ class Implied(NamedTuple):
 class AbstractBodySystem(AbstractBodies):
     """The bodies, parts and names of a compiled scene, for a class that knows the equations of their motion.
 
-    **Fields:** the groups of bodies and of other parts; `gravity` [m/s²] or None; `guess`, the state given with the
-    bodies; `length` [m], the scene's size; `body_names`; `elimination`, the order in which the joints are
-    eliminated, or None; `design`.
+    **Fields:** the groups of bodies and of other parts, `free_joints` those of joints without rows; `gravity`
+    [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`;
+    `elimination`, the order in which the joints are eliminated, or None; `design`.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -78,7 +78,8 @@ class AbstractBodySystem(AbstractBodies):
     elimination: JointOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
     frames: tuple[FrameGroup, ...] = ()
-    tendons: tuple[TendonGroup, ...] = ()
+    tendons: tuple[CoordinateGroup, ...] = ()
+    free_joints: tuple[CoordinateGroup, ...] = ()
 
     # Sizes
 
@@ -228,7 +229,7 @@ class AbstractBodySystem(AbstractBodies):
     @property
     def _groups(self):
         kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
-        return {kind: getattr(self, kind) for kind in kinds}
+        return {kind: getattr(self, kind) for kind in (*kinds, "free_joints")}
 
     @property
     def _gravity_name(self):
@@ -252,6 +253,7 @@ class AbstractBodySystem(AbstractBodies):
             joints=[
                 (plain, ""),
                 (self._inertial, ", each with a velocity of its own"),
+                (self.free_joints, ", which have coordinates only"),
                 (self.velocity_constraints, ", between velocities"),
                 (self.servos, ", a program of a Servo"),
             ],
@@ -290,7 +292,7 @@ class AbstractBodySystem(AbstractBodies):
     @property
     def _measured(self):
         """The groups of parts that have coordinates."""
-        return (*self.constraints, *self.tendons)
+        return (*self.constraints, *self.tendons, *self.free_joints)
 
     def joint_coordinate(self, coordinate, t, q):
         values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))

@@ -135,13 +135,17 @@ class BodyGroup(eqx.Module):
         return jax.vmap(lambda body: body.inertia)(self.group.part)
 
 
-class TendonGroup(eqx.Module):
-    """Stacked tendons."""
+class CoordinateGroup(eqx.Module):
+    """Stacked parts that have coordinates and no rows: tendons, and joints that leave all motions free."""
 
     group: Group
 
+    @property
+    def rows(self) -> int:
+        return 0
+
     def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
-        """Their coordinates, by name within the tendon."""
+        """Their coordinates, by name within the part."""
         space = self.group.layout.space
         return self.group.map(lambda at, x: at(t).coordinates(space, x), self.group.gather(poses))
 

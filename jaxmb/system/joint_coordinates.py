@@ -15,7 +15,7 @@ from .._types import Scalar
 from ..parts.joint_parts import JointDriver
 from .constraint_groups import ConstraintGroup
 from .equation import AbstractSystem
-from .groups import Group, TendonGroup
+from .groups import CoordinateGroup, Group
 from .layout import Layout
 from .quantities import Quantity
 
@@ -36,7 +36,7 @@ class JointCoordinate(NamedTuple):
 
 
 def joint_coordinates(
-    groups: Sequence[ConstraintGroup | TendonGroup], layout: Layout, batch: int = 0
+    groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout, batch: int = 0
 ) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
     space, out = layout.space, {}
@@ -95,7 +95,7 @@ def _continued(ts, angles, rates):
 
 
 def held_groups(
-    groups: Sequence[ConstraintGroup | TendonGroup],
+    groups: Sequence[ConstraintGroup | CoordinateGroup],
     known: Mapping[str, JointCoordinate],
     values: Mapping[str, Array],
     rates: Mapping[str, Array],
