@@ -15,6 +15,7 @@ from . import (
 )
 from ._results import RESULTS as RESULTS
 from ._types import State as State
+from ._version import __version__ as __version__
 from .linalg import rotations as rotations
 from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.actuators import Actuator as Actuator

@@ -10,6 +10,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxmb as mb
 from jaxmb import spatial
@@ -142,7 +143,15 @@ def test_the_locus_follows_weave_capsize_and_castering():
     assert np.max(step) < 2.0
     from jaxmb import viz
 
-    assert len(viz.plot_root_locus(found).axes) == 3
+    # The stable speeds end where the published eigenvalues cross zero, to the square of the step.
+    np.testing.assert_allclose(found.boundaries(), [4.2924, 6.0243], atol=0.02)
+    real, _, _ = viz.plot_root_locus(found, labels=["weave", "capsize", "castering"]).axes
+    weave, _, capsize, castering, _ = real.lines
+    assert [line.get_label() for line in (weave, capsize, castering)] == ["weave", "capsize", "castering"]
+    last = np.sort(np.unique(published(found.values[-1]).real.round(9)))
+    np.testing.assert_allclose([line.get_ydata()[-1] for line in (castering, weave, capsize)], last, atol=1e-8)
+    with pytest.raises(ValueError, match="3 modes, got 1 labels"):
+        viz.plot_root_locus(found, labels=["weave"])
 
 
 def test_the_weave_speed_changes_with_the_trail():

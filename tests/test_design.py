@@ -211,3 +211,25 @@ def test_derivatives_through_design_assembly_and_motion(machine, plain):
     central = (8 * (tight(3 + h) - tight(3 - h)) - (tight(3 + 2 * h) - tight(3 - 2 * h))) / (12 * h)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     np.testing.assert_allclose(forward, central, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_derivatives_by_a_length_of_a_redundant_loop():
+    """As above for a loop in space, three rows of which follow from the others at every length."""
+    loop = mb.mechanisms.spatial_loop()
+    ends = lambda v: {"B.point_b": -v["rod"] * jnp.eye(3)[0] / 2, "C.point_a": v["rod"] * jnp.eye(3)[0] / 2}
+    machine = mb.design(loop.system, {"rod": mb.Variable(3.0, unit="m")}, ends)
+
+    def place(rod, adjoint=None, rtol=1e-8):
+        new = mb.with_parameters(machine, {"rod": rod})
+        start = mb.assemble(new, loop.state, fix={"A.angle": 0.0}, rates=loop.rates)
+        motion = mb.simulate(new, start, t1=0.2, rtol=rtol, adjoint=adjoint)
+        return jnp.sum(motion["rocker"].position[-1] * jnp.array([1.0, 0.5, 0.0]))
+
+    forward = jax.jit(jax.jacfwd(lambda rod: place(rod, diffrax.ForwardMode())))(3.0)
+    reverse = jax.jit(jax.grad(place))(3.0)
+    tight, h = jax.jit(lambda rod: place(rod, rtol=1e-12)), 1e-3
+    central = (8 * (tight(3 + h) - tight(3 - h)) - (tight(3 + 2 * h) - tight(3 - 2 * h))) / (12 * h)
+    assert abs(forward) > 0.01
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    np.testing.assert_allclose(forward, central, rtol=1e-6)

@@ -38,7 +38,7 @@ def test_a_constraint_and_its_multiplier(in_disk):
 
 def test_what_is_printed(in_disk):
     text = str(in_disk)
-    for word in ("parameter", "x[1]", "before", "after", "multiplier", "iteration", "failed", "terminated"):
+    for word in ("parameter", "x[1]", "before", "after", "multiplier", "iteration", "result", "failed", "terminated"):
         assert word in text
     assert in_disk.before["f"] == pytest.approx(24.2) and in_disk.iterations[0].objective == pytest.approx(24.2)
     assert in_disk.iterations[0].violation > 0 and in_disk.trials >= len(in_disk.iterations) - 1

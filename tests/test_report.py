@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxmb import mechanisms
 from jaxmb.formulations import Multipliers, Partitioned
@@ -54,7 +55,13 @@ def test_forms(precision, tmp_path):
     assert precision._repr_html_().count("<tr>") == 5
     assert json.loads(json.dumps(precision.to_dict()))["runs"][0]["solver"] == "Adams"
     precision.figure(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+    with Image.open(tmp_path / "figure.png") as image:
+        assert image.format == "PNG" and json.loads(image.text["Description"]) == json.loads(
+            json.dumps(precision.to_dict())
+        )
+    precision.figure(tmp_path / "figure.svg")
+    assert "&quot;disagreement&quot;" in (text := (tmp_path / "figure.svg").read_text()) or '"disagreement"' in text
+    precision.figure(tmp_path / "figure.pdf")
 
 
 def test_computed_reference(pendulum):

@@ -62,8 +62,9 @@ def tracked_vehicle(
     gravity: float = 9.81,
 ) -> Mechanism:
     """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
-    wheels on compliant ground, and the track as an elastic loop; 3 + 2 n_wheels degrees of freedom. With `units=2` it
-    tows another carrier by a hitch, which takes away two degrees of freedom.
+    wheels on compliant ground, and the track as an elastic loop around wheels, sprocket and idler, all of one radius;
+    3 + 2 n_wheels degrees of freedom. With `units=2` it tows another carrier by a hitch, which takes away two degrees
+    of freedom.
 
     It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
     right pair; x is forward, y up.
@@ -138,7 +139,9 @@ def tracked_vehicle(
             ]
         if shoes is None:
             path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]
-            forces.append(planar.Track(f"{p}track", path, pretension=pretension, stiffness=track_stiffness))
+            # Around circles of one radius a loop is longer by their circumference than the polygon of their centres.
+            loop = {"radii": np.full(len(path), radius), "pretension": pretension, "stiffness": track_stiffness}
+            forces.append(planar.Track(f"{p}track", path, **loop))
             driven = (hull, *(f"{p}wheel{k}" for k in wheels))
         else:
             own, pins, laws = shoe_track(

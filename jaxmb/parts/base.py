@@ -229,6 +229,14 @@ class AbstractLink(AbstractPart):
                 return getattr(self, name)
         return None
 
+    def pictured(self, space: AbstractSpace) -> Self:
+        """Hook: the part as a picture shows it: a copy that acts in the same way, with points where they are seen.
+
+        A slide acts along a whole line, of which a picture shows the point next to the middle of the body that slides.
+        """
+        del space
+        return self
+
     def shapes(self, space: AbstractSpace, size: float) -> tuple[tuple[int | None, AbstractShape], ...]:
         """Hook: the shapes by which a picture shows the part, each with the number of the body that it is fixed in,
         None for the world.

@@ -108,6 +108,9 @@ class AbstractOnFrames(AbstractFramedPart, AbstractLink):
         point, frame = self.part.anchor(k), self.frames.get(str(k))
         return point if frame is None or point is None else frame.point(point)
 
+    def pictured(self, space):
+        return self.with_fields(part=self.part.pictured(space))
+
     @property
     def path_kind(self):
         return self.part.path_kind

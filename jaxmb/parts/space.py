@@ -103,6 +103,11 @@ def both_points(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> 
     return jnp.stack([space.point(poses[0], part.point_a), space.point(poses[1], part.point_b)])
 
 
+def nearest_to_origin(point: Point, axis: Point) -> Point:
+    """The point nearest to the origin of the line through a point along a unit vector."""
+    return point - jnp.dot(point, axis) * axis
+
+
 def separation_rate(
     space: AbstractSpace, part: Any, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]
 ) -> Point:

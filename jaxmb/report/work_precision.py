@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from .._results import RESULTS
 from .._types import State
+from .._version import __version__
 from ..mechanisms import Mechanism, References
 from ..parts.names import names_arguments
 from ..simulate import simulate
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+# More labels of an axis would overlap.
+_MOST_TICKS = 7
 
 
 def default_solvers() -> dict[str, diffrax.AbstractSolver]:
@@ -69,12 +73,13 @@ class Run:
 class WorkPrecision:
     """The result of `work_precision`; `print` and notebooks show a table.
 
-    **Fields:** `mechanism`: its name; `t1` [s]; `runs`; `source` of the reference values, and `disagreement`, the
-    relative error up to which they can be trusted: as published, or the difference of the two methods that computed
-    them.
+    **Fields:** `mechanism`: its name; `title`: what it is, in words; `t1` [s]; `runs`; `source` of the reference
+    values, and `disagreement`, the relative error up to which they can be trusted: as published, or the difference of
+    the two methods that computed them.
     """
 
     mechanism: str
+    title: str
     t1: float
     runs: tuple[Run, ...]
     source: str
@@ -96,15 +101,19 @@ class WorkPrecision:
         return f"<table><caption>{caption}</caption><tr>{head}</tr>{body}</table>"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, for JSON."""
-        return dataclasses.asdict(self)
+        """Plain numbers, strings and lists, for JSON, with the version of jaxmb."""
+        return {"jaxmb": __version__, **dataclasses.asdict(self)}
 
     def figure(self, path: str | Path) -> None:
         """Write a picture (PNG, SVG or PDF by the path's ending): error against run time and against evaluations.
 
+        Its numbers stand in the file as well, those of `to_dict` as JSON, as the description of a PNG or SVG and the
+        subject of a PDF.
+
         **Raises:** `ImportError` that names the extra to install if matplotlib is missing.
         """
-        _plot(self).savefig(path, dpi=150)
+        key = "Subject" if Path(path).suffix.lower() == ".pdf" else "Description"
+        _plot(self).savefig(path, dpi=150, metadata={key: json.dumps(self.to_dict())})
 
 
 _HEADER = ("solver", "rtol", "error", "run [ms]", "median", "compile [s]", "steps", "rejected", "evaluations")
@@ -185,7 +194,8 @@ def work_precision(
                 message="" if ok else outcome(trajectory.result),
             )
         )
-    return WorkPrecision(mechanism.name, t1, tuple(runs), known.source, known.tolerance)
+    title = mechanism.description.rstrip(".") or mechanism.name
+    return WorkPrecision(mechanism.name, title, t1, tuple(runs), known.source, known.tolerance)
 
 
 def outcome(result: RESULTS) -> str:
@@ -205,7 +215,7 @@ def _error(mechanism: Mechanism, known: References, trajectory) -> float | None:
 
 def _plot(report: WorkPrecision) -> "Figure":
     """Error against run time and against evaluations, both axes logarithmic; failed runs are not shown."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+    from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2, sharey=True)
@@ -219,11 +229,23 @@ def _plot(report: WorkPrecision) -> "Figure":
         if report.disagreement > 0:
             axes.axhline(MARGIN * report.disagreement, color="0.5", linestyle=":", label="accuracy of the reference")
         axes.set_xlabel(label)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        low, high = axes.get_xlim()
+        axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(alpha=0.3, which="both")
+        axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
     panels[0].set_ylabel("relative error at the end")
-    figure.suptitle(f"{report.mechanism}, {report.t1:g} s")
+    figure.suptitle(f"{report.title}; {report.t1:g} s")
     return figure
+
+
+def _ticks(low, high):
+    """Round numbers between two limits, as many as have room for their labels."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    for digits in ((1, 2, 5), (1, 3), (1,)):
+        values = np.sort(np.outer(decades, digits).ravel())
+        values = values[(values >= low) & (values <= high)]
+        if len(values) <= _MOST_TICKS:
+            break
+    return values.tolist()

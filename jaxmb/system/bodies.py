@@ -17,7 +17,7 @@ from ..linalg.block_jacobian import JointOrder
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from .body_kinematics import AbstractBodies
-from .body_motion import attachments, body_motion, body_quantities, outline, scalar_quantities
+from .body_motion import body_motion, body_quantities, scalar_quantities
 from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
 from .describe import describe_scene
 from .design_variables import DesignVariables, description_rows, in_range
@@ -336,12 +336,6 @@ class AbstractBodySystem(AbstractBodies):
             return applied_wrenches(groups, name, [g.wrenches(t, poses, velocities) for g in groups])
 
         return jax.vmap(single)(ts, ys, multipliers)
-
-    def outline(self, ys):
-        groups = (*self.constraints, *self.velocity_constraints, *self.forces)
-        points = attachments(groups, self.layout.bodies)
-        poses = jax.vmap(self.poses)(ys.q)
-        return {name: outline(self.layout, poses[:, k], points[k]) for k, name in enumerate(self.body_names)}
 
     def picture(self, ts, ys):
         return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)

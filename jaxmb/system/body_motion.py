@@ -1,12 +1,6 @@
-"""Views of a motion by body name: the motion of bodies, measurable quantities, and outlines."""
+"""Views of a motion by body name: the motion of bodies, and measurable quantities."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any
-
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from collections.abc import Sequence
 
 from .._types import State
 from .layout import Layout
@@ -51,27 +45,3 @@ def scalar_quantities(layout: Layout) -> dict[str, Quantity]:
         acceleration = lambda ts, ys, solved, j=j: solved.accelerations[:, j]
         out[f"{own.name}_acceleration"] = Quantity((), acceleration, of_forces=True)
     return out
-
-
-def attachments(groups: Iterable[Any], bodies: int) -> list[np.ndarray]:
-    """For every body, the distinct body-fixed points [m] at which parts of some groups act on it, shape (points, d)."""
-    points: list[dict[tuple, np.ndarray]] = [{} for _ in range(bodies)]
-    for group in groups:
-        stacked = group.group
-        for k, of_parts in enumerate(stacked.body_index.T):
-            anchors = jax.vmap(lambda part, k=k: part.anchor(k))(stacked.part)
-            if anchors is None:
-                continue
-            for body, point in zip(of_parts, np.asarray(anchors), strict=True):
-                if body < bodies:
-                    points[body][tuple(np.round(point, 12))] = point
-    return [np.stack(list(own.values())) if own else np.zeros((0, 0)) for own in points]
-
-
-def outline(layout: Layout, poses: Float[Array, "times p"], points: np.ndarray) -> Float[Array, "times points d"]:
-    """The mass centre of a body and body-fixed points of it along a motion, world axes."""
-    centre = poses[:, None, : layout.space.dimension]
-    if not points.size:
-        return centre
-    world = jax.vmap(lambda pose: jax.vmap(lambda point: layout.space.point(pose, point))(jnp.asarray(points)))(poses)
-    return jnp.concatenate([centre, world], axis=1)

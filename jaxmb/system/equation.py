@@ -189,12 +189,6 @@ class AbstractSystem(eqx.Module):
         """Names of the quantities that determine the configuration up to the attitude of bodies."""
 
     @abc.abstractmethod
-    def outline(self, ys: State) -> dict[str, Float[Array, "times points d"]]:
-        """The points that a picture of each body shows along a motion, world axes [m]: its mass centre, and the points
-        where joints and forces act on it. Empty for a system without bodies.
-        """
-
-    @abc.abstractmethod
     def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
         """The bodies and parts that a picture shows along a motion.
 

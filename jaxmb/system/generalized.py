@@ -81,9 +81,6 @@ class AbstractGeneralizedSystem(AbstractSystem):
     def normalize_fixed(self, q, fixed):
         return q, 0
 
-    def outline(self, ys):
-        return {}
-
     def picture(self, ts, ys):
         raise ValueError(
             f"A picture shows bodies, and a {type(self).__name__} has none; viz.plot_motion shows its coordinates."

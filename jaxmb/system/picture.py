@@ -57,7 +57,7 @@ class Picture(NamedTuple):
 def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State) -> Picture:
     """The picture of a system of bodies and of these stacked parts."""
     layout, names = system.layout, (*system.body_names, GROUND)
-    space = layout.space
+    space, groups = layout.space, [_pictured(group) for group in groups]
     # Scalar coordinates are at no place.
     known = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
     position, orientation = (np.asarray(own)[list(known)] for own in _placements(system, ys))
@@ -93,6 +93,14 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         centres={name: np.asarray(space.in_space(own)) for g in system.bodies for name, own in _centres(g.group)},
         inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
     )
+
+
+def _pictured(group):
+    """The parts as a picture shows them; what acts on the ground keeps the place that it was given there."""
+    moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
+    on_ground = group.body_index[:, -1] == group.layout.ground
+    kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+    return eqx.tree_at(lambda own: own.part, group, jax.tree.map(kept, group.part, moved))
 
 
 def _centres(group):

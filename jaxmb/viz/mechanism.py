@@ -1,20 +1,34 @@
 """A mechanism drawn at several times of its motion."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..linalg.rotations import rotation_matrix
+from ..parts.base import GROUND
+from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
 from ..trajectory import Trajectory
 from .figure import new_figure
+from .meshes import heights
+from .silhouettes import area, edges, stroke
+from .solids import COLORS, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Beyond this many bodies a legend and paths hide more than they tell.
+_FEW = 8
+# Beyond this many times a title is too long.
+_TIMES = 6
+_EDGE: Color = (40, 40, 40)
 
 
 def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     """Draw the bodies at evenly spaced saved times, earlier ones fainter, with the paths of their mass centres.
 
-    A body is drawn as lines from its mass centre to the points where joints and forces act on it.
+    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars from their mass centre to
+    the points where parts act on them, in space as lines; springs, rods and tracks between their points; in the plane
+    with terrain. There are paths and a legend where there are at most 8 bodies.
 
     **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: how many poses to draw, at least 1.
 
@@ -24,30 +38,82 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}.")
-    bodies = trajectory.system.outline(trajectory.ys)
-    if not bodies:
+    if not trajectory.system.has_bodies:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "
             "coordinates."
         )
+    picture = trajectory.system.picture(trajectory.ts, trajectory.ys)
+    shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
-    figure = new_figure(6.0, 6.0)
-    outlines = {name: np.asarray(points) for name, points in bodies.items()}
-    spatial = next(iter(outlines.values())).shape[-1] == 3
-    axes = figure.add_subplot(projection="3d" if spatial else None)
-    for k, (name, points) in enumerate(outlines.items()):
-        color = f"C{k % 10}"
-        centre = points[:, 0]
-        axes.plot(*centre.T, color=color, linewidth=0.8, alpha=0.5)
-        for order, time in enumerate(shown):
-            fade = (order + 1) / len(shown)
-            for point in points[time, 1:]:
-                axes.plot(*np.stack([centre[time], point]).T, color=color, linewidth=2, alpha=fade)
-            last = order == len(shown) - 1
-            axes.plot(*centre[time], "o", color=color, markersize=4, alpha=fade, label=name if last else None)
+    figure = new_figure(8.0, 6.0)
+    axes: Any = figure.add_subplot(projection=None if picture.planar else "3d")
+    draw = _draw_areas if picture.planar else _draw_edges
+    # What stands on the ground is drawn once.
+    draw(axes, picture, [own for own in shapes if own[0] == GROUND and own[1].primitive != "ground"], 0, 1.0)
+    for order, time in enumerate(shown):
+        fade = (order + 1) / len(shown)
+        draw(axes, picture, [own for own in shapes if own[0] != GROUND], time, fade)
+        _draw_paths(axes, picture, time, fade)
+    bodies = [name for name in picture.positions if name != GROUND]
+    if len(bodies) <= _FEW:
+        for k, name in enumerate(bodies):
+            path, color = picture.positions[name][:, : 2 if picture.planar else 3], _faded(COLORS[k % len(COLORS)], 1.0)
+            axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
+            axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
+        figure.legend(loc="outside right upper", fontsize="small")
+    if picture.planar:
+        for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
+            _draw_ground(axes, ground)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.legend(fontsize="small")
+    if not picture.planar:
+        axes.set_zlabel("z [m]")
+    (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    if picture.planar:
+        figure.set_figheight(float(np.clip(6.5 * (top - bottom) / (high - low) + 1.0, 2.2, 6.5)))
+    if len(shown) <= _TIMES:
+        axes.set_title("t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s", fontsize="medium")
     return figure
+
+
+def _draw_areas(axes, picture, shapes, time, fade):
+    areas = [(_in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
+    for corners, color in sorted(areas, key=lambda own: float(np.mean(own[0][:, 2]))):
+        axes.fill(
+            *corners[:, :2].T, facecolor=_faded(color, fade), edgecolor=_faded(_EDGE, fade), linewidth=0.4, zorder=2
+        )
+
+
+def _draw_edges(axes, picture, shapes, time, fade):
+    for body, shape in shapes:
+        for line in edges(shape):
+            axes.plot(*_in_world(picture, body, line, time).T, color=_faded(shape.color, fade), linewidth=2)
+
+
+def _draw_paths(axes, picture, time, fade):
+    for line in picture.paths.values():
+        points = stroke(line, time, picture.width)[:, : 2 if picture.planar else 3]
+        axes.plot(*points.T, color=_faded(DARK, fade), linewidth=2.0 if line.kind == "belt" else 1.0, zorder=2)
+
+
+def _draw_ground(axes, ground):
+    """The ground as far as the picture reaches."""
+    low, high = axes.get_xlim()
+    x = np.linspace(low, high, 400)
+    profile = np.stack([x - ground.position[0], heights(ground, (x - ground.position[0])[:, None]), 0 * x], axis=1)
+    line = ground.position + profile @ rotation_matrix(ground.orientation).T
+    bottom = min(axes.get_ylim()[0], float(line[:, 1].min()) - 0.02 * (high - low))
+    axes.fill_between(line[:, 0], line[:, 1], bottom, color=_faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
+    axes.set(xlim=(low, high), ylim=(bottom, axes.get_ylim()[1]))
+
+
+def _in_world(picture, body, points, time):
+    return picture.positions[body][time] + points @ rotation_matrix(picture.orientations[body][time]).T
+
+
+def _faded(color, share):
+    """A colour as matplotlib takes it, mixed with white."""
+    return tuple(1 - share * (1 - np.array(color) / 255))

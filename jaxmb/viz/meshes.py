@@ -56,7 +56,7 @@ def _coil():
 def strip(ground: Ground, low: np.ndarray, high: np.ndarray, depth: float, width: float) -> Triangles:
     """The ground of a planar picture from x = low[0] to high[0] [m], as a slab with its profile on top."""
     x = np.linspace(low[0], high[0], 400)
-    y = _heights(ground, x[:, None])
+    y = heights(ground, x[:, None])
     bottom = np.full_like(y, y.min() - depth)
     corners = [np.stack([x, height, np.full_like(x, z)], axis=1) for z in (width, -width) for height in (y, bottom)]
     front_top, front_bottom, back_top, back_bottom = (400 * k + np.arange(400) for k in range(4))
@@ -71,10 +71,11 @@ def sheet(ground: Ground, low: np.ndarray, high: np.ndarray) -> Triangles:
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     rows = np.arange(n * n).reshape(n, n)
     faces = np.concatenate([_band(rows[k], rows[k + 1])[:, ::-1] for k in range(n - 1)])
-    return Triangles(np.concatenate([places, _heights(ground, places)[:, None]], axis=1), faces, smooth=True)
+    return Triangles(np.concatenate([places, heights(ground, places)[:, None]], axis=1), faces, smooth=True)
 
 
-def _heights(ground, places):
+def heights(ground: Ground, places: np.ndarray) -> np.ndarray:
+    """Heights [m] of the ground at places, shape (n, 1) in the plane or (n, 2)."""
     import jax
 
     return np.asarray(jax.vmap(ground.height)(places)) if ground.height is not None else np.zeros(len(places))

@@ -1,9 +1,10 @@
 """Time histories of a motion."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..parts.names import names_arguments, unknown
 from ..trajectory import Trajectory
@@ -17,71 +18,181 @@ if TYPE_CHECKING:
 _LEGEND = 8
 # A residual of exactly zero has no logarithm.
 _ROUNDING = 1e-17
+# A component that varies by less than this, relative to the largest value of its kind, is at rest.
+_STILL = 1e-9
+
+# The kinds of quantities in the order of their panels, with the panels' labels; the rate of a kind is the next one.
+_LABELS = {
+    "position": "position [m]",
+    "velocity": "velocity [m/s]",
+    "angle": "angle [rad]",
+    "angular_velocity": "angular velocity [rad/s]",
+    "displacement": "displacement [m]",
+    "displacement_rate": "rate of displacement [m/s]",
+    "coordinate": "coordinate",
+    "rate": "rate of the coordinate",
+    "acceleration": "acceleration [m/s²]",
+    "angular_acceleration": "angular acceleration [rad/s²]",
+    "specific_force": "specific force [m/s²]",
+    "force": "force [N]",
+    "moment": "moment [N m]",
+}
+_WITH_RATES = ("position", "angle", "displacement", "coordinate")
+_RATES = dict(zip(_LABELS, list(_LABELS)[1:], strict=False))
+_CHECKS = ("energy", "residuals")
+
+
+class _Line(NamedTuple):
+    """A component of a quantity along a motion: that of the part or coordinate `name`, numbered or the only one."""
+
+    name: str
+    component: int | None
+    values: Float[np.ndarray, "times"]
 
 
 @names_arguments
-def plot_motion(trajectory: Trajectory, names: Sequence[str] | None = None) -> "Figure":
-    """Plot positions or angles, velocities, energy and constraint residuals against time.
+def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None) -> "Figure":
+    """Plot a motion against time.
 
-    **Arguments:** `trajectory`: a motion saved at several times; `names` of the bodies to show, or of the coordinates
-    of a system without bodies, default all.
+    By default all that moves is shown: positions and velocities of the mass centres of the bodies; angles and angular
+    velocities, in the plane of the bodies, in space of the joints; displacements of sliding joints; the coordinates of
+    a system without bodies and their rates q̇; with the energy and the residuals of constraints. A component that stays
+    at one value, such as the height of a trolley on a level rail, is left out.
 
-    **Returns:** a matplotlib `Figure` [s; m or rad and their rates; J]: angles for rigid bodies of the plane, positions
-    of the mass centres for point masses and in space, or coordinates and their rates q̇. `figure.savefig(path)` writes
-    it; in a notebook, `%matplotlib inline` shows it.
+    **Arguments:**
+
+    - `trajectory`: a motion saved at several times.
+    - `names`: what to show instead. A body, joint, frame or part with internal states stands for all quantities of its
+        motion; single quantities have names such as `"piston.position"`, `"slide.displacement"`, `"hip.angle_rate"` and
+        `"A.force"`; there are also `"energy"` and `"residuals"`.
+
+    **Returns:** a matplotlib `Figure` with one panel for each kind of quantity [s; m, rad and their rates; N, N m; J].
+    Of the components along x, y and z in a panel the first is solid, then come dashed and dotted ones.
+    `figure.savefig(path)` writes it; in a notebook, `%matplotlib inline` shows it.
 
     **Raises:** `ValueError` for an unknown name or fewer than two times; `ImportError` without matplotlib.
     """
-    system = trajectory.system
-    known = system.motion_names()
-    names = tuple(names or known)
-    for name in names:
-        if name not in known:
-            raise unknown("body" if system.has_bodies else "coordinate", name, known)
     if trajectory.ts.shape[0] < 2:
         raise ValueError("plot_motion needs a motion saved at two times or more; give simulate saveat=…")
-    t = np.asarray(trajectory.ts)
-    figure = new_figure(9.0, 6.0)
-    (position, rate), (energy, residual) = figure.subplots(2, 2, sharex=True)
-    _draw(trajectory, names, position, rate)
-
-    energy.plot(t, trajectory.kinetic_energy, label="kinetic")
-    energy.plot(t, trajectory.potential_energy, label="potential")
-    energy.plot(t, trajectory.energy, "k", label="sum")
-    _finish(energy, "energy [J]")
-    if system.velocity_rows:
-        violation = trajectory.constraint_violation
-        residual.semilogy(t, np.maximum(violation.position, _ROUNDING), label="position")
-        residual.semilogy(t, np.maximum(violation.velocity, _ROUNDING), label="velocity [1/s]")
-        _finish(residual, "constraint residual, scaled")
+    if names is None:
+        panels = _moving(_panels(trajectory, _default(trajectory.system)))
+        checks = _CHECKS if trajectory.system.velocity_rows else _CHECKS[:1]
     else:
-        residual.text(0.5, 0.5, "no constraints", transform=residual.transAxes, horizontalalignment="center")
-    for axes in (energy, residual):
-        axes.set_xlabel("t [s]")
+        given = (names,) if isinstance(names, str) else tuple(names)
+        checks = [name for name in _CHECKS if name in given]
+        panels = _panels(trajectory, _quantities(trajectory.system, [name for name in given if name not in checks]))
+    figure, places = _places(len(panels) + len(checks))
+    t = np.asarray(trajectory.ts)
+    for axes, (kind, lines) in zip(places, panels.items(), strict=False):
+        _draw(axes, t, lines)
+        _finish(axes, _LABELS.get(kind, kind.replace("_", " ")))
+    for axes, name in zip(places[len(panels) :], checks, strict=True):
+        (_draw_energy if name == "energy" else _draw_residuals)(axes, t, trajectory)
     return figure
 
 
-# What is drawn of a body or coordinate, the first that its system measures: quantity, its rate, their names and units.
-_DRAWN = (
-    (".angle", ".angular_velocity", ("angle", "angular velocity"), ("[rad]", "[rad/s]")),
-    (".position", ".velocity", ("position", "velocity"), ("[m]", "[m/s]")),
-    ("", ".rate", ("coordinate", "rate of the coordinate"), ("", "")),
-)
+# Which quantities
 
 
-def _draw(trajectory: Trajectory, names: Sequence[str], position: "Axes", rate: "Axes") -> None:
-    t, known = np.asarray(trajectory.ts), trajectory.system.quantities()
-    kinds = []
+def _default(system) -> list[str]:
+    """The quantities that describe a motion."""
+    known = system.quantities()
+    # In space a body has no angle, so that those of joints are shown.
+    flat = any(f"{name}.angle" in known for name in system.motion_names())
+    kinds = ("displacement",) if flat else ("angle", "displacement")
+    of_bodies = [name for name in _quantities(system, system.motion_names()) if flat or _kind(name) != _RATES["angle"]]
+    of_joints = [name for name in system.joint_coordinates() if _kind(name) in kinds]
+    return [*of_bodies, *(x for name in of_joints for x in (name, f"{name}_rate"))]
+
+
+def _quantities(system, names: Iterable[str]) -> list[str]:
+    """The quantities that names stand for."""
+    known = system.quantities()
+    out: dict[str, None] = {}
     for name in names:
-        kinds.append(next(kind for kind in _DRAWN if name + kind[0] in known))
-        for axes, field in zip((position, rate), kinds[-1][:2], strict=True):
-            values = np.asarray(known[name + field].value(trajectory.ts, trajectory.ys, None))
-            for k, value in enumerate(values.reshape(t.size, -1).T):
-                axes.plot(t, value, label=name if values.ndim == 1 else f"{name} {'xyz'[k]}")
-    _, _, labels, _ = min(kinds, key=_DRAWN.index)
-    units = kinds[0][3] if len(set(kinds)) == 1 else ("", "")
-    for axes, label, unit in zip((position, rate), labels, units, strict=True):
-        _finish(axes, f"{label} {unit}".rstrip())
+        of_part = [own for own in known if own.startswith(f"{name}.") and not known[own].of_forces]
+        own = [name] if name in known else []
+        # The Euler parameters of a body say little to the eye.
+        found = own + [quantity for quantity in of_part if not quantity.endswith(".orientation")]
+        if not found:
+            what = "body, joint or quantity" if system.has_bodies else "coordinate"
+            parts = dict.fromkeys(quantity.split(".")[0] for quantity in known)
+            raise unknown(what, name, (*parts, *known, *_CHECKS))
+        out |= dict.fromkeys(found)
+    return list(out)
+
+
+def _kind(quantity: str) -> str:
+    """What a quantity measures; angles of bodies and joints, also of joints with several, are of one kind."""
+    field = quantity.partition(".")[2] or "coordinate"
+    of_joint, rate = field.removesuffix("_rate"), field.endswith("_rate")
+    if of_joint in ("angle", "angle_a", "angle_b", "angle_1", "angle_2", "angle_3"):
+        return _RATES["angle"] if rate else "angle"
+    return field
+
+
+def _panels(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[_Line]]:
+    """The components of quantities by kind, the kinds in the order of their panels."""
+    out: dict[str, list[_Line]] = {}
+    for quantity in quantities:
+        part, _, field = quantity.removesuffix("_rate").partition(".")
+        # One of several angles of a joint has its whole name.
+        name = f"{part}.{field}" if _kind(quantity.removesuffix("_rate")) != (field or "coordinate") else part
+        values = np.asarray(trajectory.quantity(quantity))
+        columns = values.reshape(values.shape[0], -1).T
+        lines = [_Line(name, None if values.ndim == 1 else k, column) for k, column in enumerate(columns)]
+        out.setdefault(_kind(quantity), []).extend(lines)
+    order = [*_LABELS, *out]
+    return dict(sorted(out.items(), key=lambda item: order.index(item[0])))
+
+
+def _moving(panels: dict[str, list[_Line]]) -> dict[str, list[_Line]]:
+    """Without the components that stay at one value, and their rates."""
+    out = dict(panels)
+    for kind in _WITH_RATES:
+        if kind in panels:
+            size = max(float(np.max(np.abs(line.values))) for line in panels[kind])
+            still = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
+            for own in (kind, _RATES[kind]):
+                out[own] = [line for line in panels[own] if line[:2] not in still]
+    return {kind: lines for kind, lines in out.items() if lines}
+
+
+# Drawing
+
+
+def _places(number: int) -> tuple["Figure", list["Axes"]]:
+    """A figure with axes in two columns; an odd one at the end is as wide as both."""
+    rows = (number + 1) // 2
+    figure = new_figure(9.0, max(3.0, 2.6 * rows) if number > 1 else 3.5)
+    layout: Any = [[str(2 * row), str(min(2 * row + 1, number - 1))] for row in range(rows)]
+    places = list(figure.subplot_mosaic(layout, sharex=True).values())
+    for axes in places[-2 + number % 2 :]:
+        axes.set_xlabel("t [s]")
+    return figure, places
+
+
+def _draw(axes: "Axes", t: np.ndarray, lines: Sequence[_Line]) -> None:
+    colors = {name: f"C{k % 10}" for k, name in enumerate(dict.fromkeys(line.name for line in lines))}
+    drawn = sorted({line.component or 0 for line in lines})
+    for name, k, values in lines:
+        style = ("-", "--", ":")[drawn.index(k or 0) % 3]
+        letter = "" if k is None else f" {'xyz'[k] if k < 3 else k + 1}"
+        axes.plot(t, values, color=colors[name], linestyle=style, label=name + letter)
+
+
+def _draw_energy(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None:
+    axes.plot(t, trajectory.kinetic_energy, label="kinetic")
+    axes.plot(t, trajectory.potential_energy, label="potential")
+    axes.plot(t, trajectory.energy, "k", label="sum")
+    _finish(axes, "energy [J]")
+
+
+def _draw_residuals(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None:
+    violation = trajectory.constraint_violation
+    axes.semilogy(t, np.maximum(violation.position, _ROUNDING), label="position")
+    axes.semilogy(t, np.maximum(violation.velocity, _ROUNDING), label="velocity [1/s]")
+    _finish(axes, "constraint residual, scaled")
 
 
 def _finish(axes: "Axes", label: str) -> None:

@@ -1,5 +1,7 @@
 """Eigenvalues drawn along a parameter."""
 
+import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,34 +12,61 @@ from .figure import new_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Below this, relative to the largest eigenvalue, one counts as zero.
+_ZERO = 1e-6
 
-def plot_root_locus(locus: RootLocus) -> "Figure":
+
+def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     """Draw real and imaginary parts of all eigenvalues against the parameter, and in the complex plane.
 
-    **Arguments:** `locus`: from `root_locus`.
+    A mode has one colour, a pair of conjugate eigenvalues is one mode, and modes that stay at zero are left out.
+    Circles are at the first value. Where the system is unstable the background is grey.
 
-    **Returns:** a matplotlib `Figure` [1/s, rad/s]; a mode has one colour, and values where it is unstable are grey.
+    **Arguments:** `locus`: from `root_locus`; `labels` of the modes in the order of their eigenvalues at the last
+    value, by falling imaginary and then by falling real part, default "mode 1", ….
 
-    **Raises:** `ImportError` without matplotlib.
+    **Returns:** a matplotlib `Figure` [1/s, rad/s].
+
+    **Raises:** `ValueError` for another number of labels than of modes; `ImportError` without matplotlib.
     """
-    figure = new_figure(9.0, 6.0)
-    (real, plane), (imaginary, empty) = figure.subplots(2, 2, gridspec_kw={"width_ratios": [3, 2]})
-    empty.remove()
-    for k, values in enumerate(np.asarray(locus.eigenvalues).T):
-        color = f"C{k % 10}"
-        real.plot(locus.values, values.real, color=color, linewidth=1.2)
-        imaginary.plot(locus.values, values.imag, color=color, linewidth=1.2)
-        plane.plot(values.real, values.imag, ".", color=color, markersize=3)
-        plane.plot(values.real[:1], values.imag[:1], "o", color=color, markersize=5, fillstyle="none")
+    modes = _modes(np.asarray(locus.eigenvalues))
+    if labels and len(labels) != len(modes):
+        raise ValueError(f"plot_root_locus: there are {len(modes)} modes, got {len(labels)} labels.")
+    labels = tuple(labels) or tuple(f"mode {k}" for k in range(1, len(modes) + 1))
+    figure = new_figure(9.0, 5.5)
+    places = figure.subplot_mosaic([["real", "plane"], ["imaginary", "plane"]], width_ratios=[3, 2])
+    real, imaginary, plane = (places[name] for name in ("real", "imaginary", "plane"))
+    for k, (label, mode) in enumerate(zip(labels, modes, strict=True)):
+        for order, values in enumerate(mode):
+            color, name = f"C{k % 10}", None if order else label
+            real.plot(locus.values, values.real, color=color, linewidth=1.5, label=name)
+            imaginary.plot(locus.values, values.imag, color=color, linewidth=1.5)
+            plane.plot(values.real, values.imag, ".", color=color, markersize=3)
+            plane.plot(values.real[:1], values.imag[:1], "o", color=color, markersize=6, fillstyle="none")
+    ends = np.concatenate([locus.values[:1], locus.boundaries(_ZERO), locus.values[-1:]])
     for axes in (real, imaginary):
-        low, high = axes.get_ylim()
-        axes.fill_between(locus.values, low, high, where=~locus.stable(), color="0.92", zorder=0)
-        axes.set_ylim(low, high)
+        for low, high in list(itertools.pairwise(ends))[int(locus.stable(_ZERO)[0]) :: 2]:
+            axes.axvspan(low, high, color="0.92", linewidth=0, zorder=0)
         axes.axhline(0.0, color="0.6", linewidth=0.8)
         axes.set_xlabel(locus.name)
+        axes.margins(x=0.0)
+    real.legend(fontsize="small")
     plane.axvline(0.0, color="0.6", linewidth=0.8)
+    plane.axhline(0.0, color="0.6", linewidth=0.8)
     real.set_ylabel("Re λ [1/s]")
     imaginary.set_ylabel("Im λ [rad/s]")
     plane.set_xlabel("Re λ [1/s]")
     plane.set_ylabel("Im λ [rad/s]")
     return figure
+
+
+def _modes(eigenvalues):
+    """The eigenvalues along the parameter of each mode that does not stay at zero, conjugate ones together."""
+    size, left, out = np.max(np.abs(eigenvalues)), list(eigenvalues.T), []
+    left = [values for values in left if np.max(np.abs(values)) > _ZERO * size]
+    while left:
+        first = left.pop(0)
+        mirrored = [k for k, values in enumerate(left) if np.allclose(values[-1], first[-1].conj(), rtol=1e-9)]
+        paired = abs(first[-1].imag) > _ZERO * size and mirrored
+        out.append([first, left.pop(mirrored[0])] if paired else [first])
+    return sorted(out, key=lambda mode: (-abs(mode[0][-1].imag), -mode[0][-1].real))

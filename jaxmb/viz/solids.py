@@ -72,7 +72,7 @@ def _linkage(points, planar, width):
     the mass centre.
     """
     if planar and len(points) > 2:
-        corners = _hull([np.zeros(3), *points])
+        corners = hull([np.zeros(3), *points])
         middle = np.mean(corners, axis=0)
         area = 0.5 * np.sum(_turn(corners, np.roll(corners, -1, axis=0), middle))
         if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
@@ -82,7 +82,7 @@ def _linkage(points, planar, width):
     return [*bars, Sphere(1.4 * width)] if bars else []
 
 
-def _hull(points):
+def hull(points):
     """The corners of the convex hull of points of the plane, counter-clockwise, by A. M. Andrew's monotone chain."""
     ascending = sorted(points, key=lambda p: (p[0], p[1]))
 

@@ -9,12 +9,14 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..contact import AbstractFrictionLaw, AbstractNormalLaw
+from ..shapes import wheel
 from ..smooth import ramp, step
 
 Number = Float[Array, ""]
@@ -79,6 +81,9 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         centre = space.point(poses[0], self.centre)
         own = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
         return jnp.sum(jax.vmap(own)(poses[1:], self.surfaces()))
+
+    def shapes(self, space, size):
+        return tuple((0, shape) for shape in wheel(self.radius, position=space.in_space(self.centre)))
 
     def _depth(self, place, surface):
         """Depth of the disc's deepest point, smoothed."""
@@ -287,6 +292,17 @@ class DiscContact(AbstractBodyContact):
 
     def validate(self):
         self._check_rows(radii=(), centres=(2,))
+
+    def shapes(self, space, size):
+        n = len(self.bodies) - 1
+        centres, radii = np.broadcast_to(self.centres, (n, 2)), np.broadcast_to(self.radii, n)
+        others = [
+            (k, shape)
+            for k, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1)
+            if radius > 0
+            for shape in wheel(radius, position=space.in_space(centre))
+        ]
+        return (*super().shapes(space, size), *others)
 
     def surfaces(self):
         return self._rows(self.radii, ()), self._rows(self.centres, (2,))

@@ -5,7 +5,8 @@ the body frames (`point_a`, `point_b`, `axis_a`), or all at once by a world poin
 `axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
 
 Their own coordinates are `angle` [rad], that of `body_b` less that of `body_a`, and `displacement` [m], the component
-of d along the axis.
+of d along the axis, zero where B is next to A. Points given by a world `point` coincide at the given poses, so that the
+displacement counts from there.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from ...linalg.rotations import norm, rotate_2d
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart
 from ..shapes import pin, sleeve, wheel
-from ..space import both_points, separation
+from ..space import both_points, nearest_to_origin, separation
 
 
 def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -29,6 +30,8 @@ def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
 
 class Revolute(AbstractPlanarPart, AbstractJoint):
     """A pin: two points coincide. Rows 2: `d = 0`.
+
+    Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
 
     **Arguments:** `point_a`, `point_b` [m], shape (2,), body-fixed; or `point` [m], shape (2,), world.
     """
@@ -65,6 +68,9 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
 class PointOnLine(AbstractPlanarPart, AbstractJoint):
     """A pin in a straight slot: point B stays on the line through A. Rows 1: `n·d = 0`.
 
+    Its coordinates are `displacement` [m], the distance of B from A along the slot, and `angle` as in `Revolute`. If
+    the points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+
     **Arguments:** points as in `Revolute`; `axis_a`, unit, shape (2,), direction of the slot fixed in `body_a`, or
     `axis` in the world at the given pose.
     """
@@ -91,6 +97,11 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a
     = angle`.
 
+    Its coordinate is `displacement` [m], the distance of B from A along the axis. If the points are given by a world
+    `point`, where they coincide, the displacement is zero at the given poses, wherever the body then is; give `point_a`
+    and `point_b` to count from a place of your own. Where B is along the axis has no effect on the motion, and a
+    picture shows the slide next to the mass centre of `body_b`.
+
     **Arguments:** as in `PointOnLine`; `angle` [rad], default that of the given poses.
     """
 
@@ -108,12 +119,18 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses)}
 
+    @property
+    def _axis_b(self):
+        return rotate_2d(-self.angle, self.axis_a)
+
+    def pictured(self, space):
+        return self.with_fields(point_b=nearest_to_origin(self.point_b, self._axis_b))
+
     def path(self, space, poses):
         return both_points(space, self, poses)
 
     def shapes(self, space, size):
-        axis_b = rotate_2d(-self.angle, self.axis_a)
-        return ((1, sleeve(space.in_space(self.point_b), size, space.in_space(axis_b))),)
+        return ((1, sleeve(space.in_space(self.point_b), size, space.in_space(self._axis_b))),)
 
 
 def _offset(space, part, poses):

@@ -11,7 +11,8 @@ agree, and not where they point against each other.
 
 Their own coordinates are `angle` [rad], the turn of `body_b` about the axis, and `displacement` [m], the component of d
 along it. An angle is zero at the given poses, or where the directions `x_a` and `x_b` that are given with the joint
-coincide.
+coincide. A displacement is zero where B is next to A; points given by a world `point` coincide at the given poses, so
+that it counts from there.
 """
 
 from typing import ClassVar
@@ -23,7 +24,7 @@ from ...linalg.rotations import conjugate, cross, multiply, rotate, unrotate
 from .. import fields
 from ..base import AbstractJoint, AbstractSpatialPart
 from ..shapes import ball, pin, sleeve
-from ..space import both_points, separation
+from ..space import both_points, nearest_to_origin, separation
 from .axes import (
     across,
     angle,
@@ -74,6 +75,9 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
 
 class Revolute(AbstractSpatialPart, AbstractJoint):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, and two of the tilt.
+
+    Its coordinate is `angle` [rad], the turn of `body_b` about the axis: from `x_a` to `x_b` if they are given, else
+    from the given poses.
 
     **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), direction of the hinge fixed in each
     body; or `axis`, unit, shape (3,), world; `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis:
@@ -200,6 +204,9 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
 class Cylindrical(AbstractSpatialPart, AbstractJoint):
     """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
 
+    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
+    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+
     **Arguments:** as in `Revolute`.
     """
 
@@ -221,6 +228,9 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
+    def pictured(self, space):
+        return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
+
     def path(self, space, poses):
         return both_points(space, self, poses)
 
@@ -234,6 +244,8 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     With the angle θ from `x_a` to `x_b` about the axis, the shift s = a·d and ψ = θ − 2π (s − offset)/pitch, the last
     row is `pitch/2π · 2 sin(ψ/2) = 0` with ψ in (−π, π], written with products of direction components: it is periodic
     in θ and in s, as the screw is, and so holds for any number of turns; near zero its value is the axial error [m].
+
+    Its coordinates are `angle` and `displacement` as in `Cylindrical`.
 
     **Arguments:** points and axes as in `Revolute`; `pitch` [m], advance of B along the axis per turn, positive for a
     right-handed screw, not zero; `offset` [m], the shift at θ = 0, default that of the given poses; `x_a`, `x_b`, unit,
@@ -268,6 +280,9 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
+    def pictured(self, space):
+        return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
+
     def path(self, space, poses):
         return both_points(space, self, poses)
 
@@ -280,6 +295,11 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
     The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
     rotation vector [rad] when small, and zero only where they agree, for either sign of the bodies' Euler parameters.
+
+    Its coordinate is `displacement` [m], the distance of B from A along the axis. If the points are given by a world
+    `point`, where they coincide, the displacement is zero at the given poses, wherever the body then is; give `point_a`
+    and `point_b` to count from a place of your own. Where B is along the axis has no effect on the motion, and a
+    picture shows the slide next to the mass centre of `body_b`.
 
     **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slide fixed in `body_a`, or
     `axis` in the world; `orientation`, shape (4,), unit Euler parameters of B relative to A, default those of the given
@@ -300,6 +320,9 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"displacement": displacement_along(space, self, poses)}
 
+    def pictured(self, space):
+        return self.with_fields(point_b=nearest_to_origin(self.point_b, unrotate(self.orientation, self.axis_a)))
+
     def path(self, space, poses):
         return both_points(space, self, poses)
 
@@ -310,7 +333,8 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 class Planar(AbstractSpatialPart, AbstractJoint):
     """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: two of the tilt, `a·d`.
 
-    Its displacement, shape (2,), has the components of d along `x_a` and along `a × x_a`.
+    Its coordinates are `angle` as in `Revolute`, and `displacement` [m], shape (2,), the components of d along `x_a`
+    and along `a × x_a`: zero where B is next to A, so at the given poses if both are given by a world `point`.
 
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """

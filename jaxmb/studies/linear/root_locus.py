@@ -34,6 +34,17 @@ class RootLocus(eqx.Module):
         sizes = np.max(np.abs(self.eigenvalues), axis=1)
         return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
 
+    def boundaries(self, least: float = 1e-6) -> np.ndarray:
+        """The values at which the system becomes stable or ceases to be, between those of `values` by a straight line
+        through the largest real parts; `least` as in `stable`.
+        """
+        sizes = np.max(np.abs(self.eigenvalues), axis=1)
+        # Modes that stay at zero neither grow nor decay.
+        moving = np.any(np.abs(self.eigenvalues) > least * sizes[:, None], axis=0)
+        growth = np.max(np.real(self.eigenvalues[:, moving]), axis=1, initial=-np.inf)
+        (k,) = np.nonzero(np.diff(self.stable(least)))
+        return self.values[k] - growth[k] * np.diff(self.values)[k] / np.diff(growth)[k]
+
 
 @names_arguments
 def root_locus(

@@ -130,6 +130,8 @@ class Optimum:
                 continue
             numbers = f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}"
             rows.append((str(i.number), *numbers, str(i.trials), str(i.failed)))
+        # The last iteration need not be the best trial, which is the result.
+        rows.append(("result", f"{self.objective:.8g}"))
         width = max(len(row[0]) for row in rows if row)
         lines = [f"{row[0]:{width}}" + "".join(f"  {cell:>13}" for cell in row[1:]) if row else "" for row in rows]
         return "\n".join([*(line.rstrip() for line in lines), "", self.message])

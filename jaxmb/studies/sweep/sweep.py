@@ -1,7 +1,6 @@
 """A function of named parameters over many cases."""
 
 import contextlib
-import importlib.metadata
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._version import __version__
 from ...parts.names import names_arguments
 from . import dataset, store as stores
 from .batch import Batch, whole_chunk
@@ -136,7 +136,7 @@ def sweep(
     hashed, unknown = identity_of_function(function)
     _check_version(version, {} if path is None else unknown)
     known = {
-        "jaxmb_version": _installed_version(),
+        "jaxmb_version": __version__,
         "python": sys.implementation.cache_tag,
         "x64": str(jnp.result_type(float) == jnp.float64),
         "version": "" if version is None else str(version),
@@ -284,13 +284,6 @@ def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, 
     for name, given, kept in (("chunk", chunk, before["chunk"]), ("budget", budget, before["budget"])):
         if given not in (None, "auto", kept):
             raise ValueError(f"The store {path} was begun with {name}={kept}, got {given!r}; leave it out to go on.")
-
-
-def _installed_version() -> str:
-    try:
-        return importlib.metadata.version("jaxmb")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _empty(described: Mapping[str, Any]) -> dict[str, np.ndarray]:

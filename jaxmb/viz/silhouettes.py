@@ -1,0 +1,54 @@
+"""Shapes and the lines of parts as areas and lines of a figure."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ..linalg.rotations import rotation_matrix
+from ..parts.shapes import AbstractShape
+from ..system.picture import Line
+from .solids import hull
+
+_TURN = np.linspace(0.0, 2 * np.pi, 33)
+_CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN], axis=1)
+_UP = np.array([0.0, 0.0, 0.5])
+_SQUARE = np.array([(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0), (-0.5, -0.5, 0.0)])
+# The edges of shapes of unit size.
+_EDGES = {
+    "box": [np.concatenate([_SQUARE - _UP, _SQUARE + _UP]), *(np.stack([x - _UP, x + _UP]) for x in _SQUARE[1:4])],
+    "cylinder": [_CIRCLE - _UP, _CIRCLE + _UP],
+    "sphere": [_CIRCLE, np.roll(_CIRCLE, 1, axis=1), np.roll(_CIRCLE, 2, axis=1)],
+}
+_COIL = np.array([0.0, 0.15, *np.linspace(0.2, 0.8, 12), 0.85, 1.0])
+
+
+def area(shape: AbstractShape) -> Float[np.ndarray, "corners 3"]:
+    """The corners [m] of what a shape covers in the plane, its convex hull, in the axes of its body."""
+    vertices = getattr(shape, "vertices", None)
+    points = np.concatenate(_EDGES[shape.primitive]) if vertices is None else vertices
+    return hull(list(_placed(shape, points)))
+
+
+def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:
+    """The edges [m] of a shape in the axes of its body; of a bar its middle line, of a surface of triangles none."""
+    if shape.primitive == "cylinder" and shape.scale[2] > 3 * shape.scale[0]:
+        return [_placed(shape, np.stack([-_UP, _UP]))]
+    return [_placed(shape, line) for line in _EDGES.get(shape.primitive, [])]
+
+
+def _placed(shape, points):
+    return shape.position + (points * shape.scale) @ rotation_matrix(shape.orientation).T
+
+
+def stroke(line: Line, time: int, width: float) -> Float[np.ndarray, "points 3"]:
+    """The points [m] of the line of a part at a time: of a spring a zigzag, of a belt a closed line."""
+    points = line.points[time]
+    if line.kind == "belt":
+        return np.concatenate([points, points[:1]])
+    if line.kind == "rod":
+        return points
+    start, along = points[0], points[-1] - points[0]
+    across = np.array([-along[1], along[0], 0.0]) if np.any(along[:2]) else np.array([1.0, 0.0, 0.0])
+    out = start + _COIL[:, None] * along
+    sides = np.where(np.arange(len(_COIL) - 4) % 2 == 0, 1.0, -1.0)[:, None]
+    out[2:-2] += 1.5 * width * sides * across / np.linalg.norm(across)
+    return out
