@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Spherical
 from ..scene import Scene
 from . import chains
-from .description import Joint, Link, Machine, quaternion
+from .description import Joint, Machine, quaternion
 from .fuse import Fused, fuse
+from .light import rigid, without_ends
 from .notes import Notes
 
 # The time in which a compliant stop stops a joint [s], if the file gives none: MuJoCo's default.
@@ -60,6 +61,7 @@ class Built:
 
 def build(machine: Machine, notes: Notes) -> Built:
     """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
+    without_ends(machine, notes)
     return _Builder(machine, notes).build()
 
 
@@ -67,7 +69,9 @@ class _Builder:
     def __init__(self, machine: Machine, notes: Notes):
         self.machine, self.notes = machine, notes
         self.of_name = {joint.name: joint for joint in machine.joints}
+        before = len(notes.refused)
         self.fused = fuse(machine, notes)
+        self.unplaced = len(notes.refused) > before
         self.bodies: list[Any] = []
         self.joints: list[Any] = []
         self.forces: list[Any] = []
@@ -80,10 +84,12 @@ class _Builder:
         self.tendons: dict[str, tuple[str, float]] = {}
 
     def build(self) -> Built:
-        machine = self.machine
+        machine, none = self.machine, cast(Any, None)
+        if self.unplaced:
+            return Built(none, {}, {}, self.fused, [], {}, {})
         for carrier in self.fused.carriers.values():
             carrier.name = self._named(carrier.name, "link")
-            self.bodies.append(_body(carrier))
+            self._body(carrier)
             if carrier.moved:
                 self._moved(carrier)
         # Names of joints come before those of other elements.
@@ -96,9 +102,9 @@ class _Builder:
         if np.any(machine.gravity):
             self.forces.append(Gravity(machine.gravity, name=self._named("gravity")))
         if self.notes.refused or not self.bodies:
-            if not self.bodies:
-                self.notes.refused.append("There is no moving link.")
-            scene: Any = None
+            if not self.fused.carriers:
+                self.notes.refused.append("There is no moving link (base='free' sets the root link of URDF free).")
+            scene = none
         else:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)
         collisions = self._of_bodies(machine.collisions)
@@ -114,6 +120,17 @@ class _Builder:
         if name and out != name:
             self.notes.say("Elements have other names, since names are unique in a scene: {}.", f"{name} → {out}")
         return out
+
+    def _body(self, carrier):
+        place = {"position": carrier.position, "orientation": quaternion(carrier.rotation)}
+        inertia = rigid(carrier, self.notes)
+        try:
+            body = Body(carrier.name, mass=carrier.mass, inertia=inertia, centre=carrier.centre, **place)
+            body.check()
+        except ValueError as error:
+            self.notes.refused.append(f"{carrier.where}{error}")
+        else:
+            self.bodies.append(body)
 
     # Joints
 
@@ -430,14 +447,3 @@ def _near(joint: Joint, zero: Any):
     """Whether the limits of a hinge, if it has any, keep it within half a turn of a zero."""
     limits = _range(joint)
     return joint.kind != "hinge" or limits is None or max(abs(limit - zero) for limit in limits) <= np.pi
-
-
-def _body(carrier: Link):
-    place = {"position": carrier.position, "orientation": quaternion(carrier.rotation)}
-    inertia = 0.5 * (carrier.inertia + carrier.inertia.T)
-    body = Body(carrier.name, mass=carrier.mass, inertia=inertia, centre=carrier.centre, **place)
-    try:
-        body.check()
-    except ValueError as error:
-        raise ValueError(f"{carrier.where}{error}") from None
-    return body

@@ -6,6 +6,7 @@ import numpy as np
 
 from .chains import Body
 from .description import GROUND, Joint, Link, Machine
+from .light import bodies_of
 from .notes import Notes
 
 
@@ -90,22 +91,14 @@ def _about(link, joint):
 def fuse(machine: Machine, notes: Notes) -> Fused:
     """Fuse links that are fixed to each other, the later ones of the file to the earlier ones."""
     links = {GROUND: Link(GROUND), **machine.links}
-    parent = {name: name for name in links}
-
-    def root(name):
-        while parent[name] != name:
-            name = parent[name]
-        return name
-
-    order = {name: k for k, name in enumerate(links)}
-    for joint in machine.joints:
-        if joint.kind == "fixed":
-            first, last = sorted((root(joint.parent), root(joint.child)), key=order.__getitem__)
-            parent[last] = first
-    of = {name: root(name) for name in links}
+    of = bodies_of(machine)
     groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
     moving = [joint for joint in machine.joints if joint.kind != "fixed"]
     light = {name for name, own in groups.items() if name != GROUND and not any(link.mass > 0 for link in own)}
+    for name in light:
+        for link in groups[name]:
+            if np.any(link.inertia):
+                notes.refused.append(f"{link.where}Link {link.name!r} has an inertia, but no mass: give it a mass.")
     chains = _chains(moving, of, light, links, notes)
     carriers = {name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light}
     fused = Fused(carriers, of, links, {}, chains)

@@ -1,37 +1,79 @@
 """Shapes of URDF and SDF, elements that have the same names and meanings in both."""
 
 import importlib.util
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..parts.shapes import AbstractShape, Box, Color, Cylinder, Ellipsoid, Ground, Mesh, Sphere, along, capsule
+from .description import Machine
 from .notes import Notes
+from .source import Resources
 from .xml_tree import Element
+
+# What leaves out the elements of a tag.
+_WORDS = {"visual": "pictures", "collision": "collisions"}
 
 
 def color_of(rgba: Any) -> Color | None:
     """Red, green and blue from 0 to 255 of numbers in [0, 1]; None for what is not seen."""
-    r, g, b = (round(255 * float(value)) for value in rgba[:3])
+    r, g, b = (round(255 * min(max(float(value), 0.0), 1.0)) for value in rgba[:3])
     return (r, g, b) if rgba[3] else None
 
 
-def read_geometry(element: Element, notes: Notes, **place: Any) -> tuple[AbstractShape, ...]:
-    """The shapes of a `<visual>` or `<collision>`; `place`: their position, orientation and color."""
+def read_shapes(
+    link: Element,
+    name: str,
+    machine: Machine,
+    notes: Notes,
+    files: Resources,
+    place: Callable[[Element], dict[str, Any]],
+) -> None:
+    """Read the `<visual>`s and `<collision>`s of a link.
+
+    What has wrong numbers is refused, unless its kind is to be left out: then nothing acts by it. `place`: position,
+    orientation and color of such an element; a color of None is not seen.
+    """
+    for tag, word in _WORDS.items():
+        for element in link.all(tag):
+            if tag == "visual" and word in notes.ignore:
+                notes.leaves_out(word, name)
+                _skip(element)
+                continue
+            try:
+                own = place(element)
+                shapes = _read_geometry(element, notes, files, own)
+            except ValueError as error:
+                _skip(element)
+                notes.refuse(word, name, str(error))
+                continue
+            if tag == "collision":
+                machine.collisions += [(name, shape) for shape in shapes]
+            elif own["color"] is not None:
+                machine.shapes += [(name, shape) for shape in shapes]
+
+
+def _skip(element):
+    for child in element.children:
+        child.read = True
+        _skip(child)
+
+
+def _read_geometry(element, notes, files, place):
     geometry = element.first("geometry")
     shape = geometry.children[0] if geometry is not None and geometry.children else None
     if shape is None:
         raise ValueError(f"{element.where}<{element.tag}> needs a <geometry>.")
     shape.read = True
     try:
-        return _read(shape, notes, place)
+        return _read(shape, notes, files, place)
     except ValueError as error:
         said = str(error)
         raise ValueError(said if said.startswith(shape.where) else f"{shape.where}{said}") from None
 
 
-def _read(shape, notes, place):
+def _read(shape, notes, files, place) -> tuple[AbstractShape, ...]:
     length = lambda name: float(_numbers(shape, name, 1)[0])
     match shape.tag:
         case "box":
@@ -49,7 +91,7 @@ def _read(shape, notes, place):
             shape.first("size")
             return (Ground().moved(np.zeros(3), normal).moved(**_placed(place)),)
         case "mesh":
-            return _mesh(shape, notes, place)
+            return _mesh(shape, notes, files, place)
     for child in shape.children:
         child.read = True
     notes.say("Shapes that are not shown: {}.", f"<{shape.tag}>")
@@ -68,14 +110,20 @@ def _numbers(shape, name, count=3, default=None):
     return shape.numbers(shape.attributes.get(name, default) if default else shape.need(name), count)
 
 
-def _mesh(shape, notes, place):
+def _mesh(shape, notes, files, place):
     uri = shape.first("uri")
-    file = shape.need("filename") if uri is None else uri.text.strip()
+    name = shape.need("filename") if uri is None else uri.text.strip()
     scale = _numbers(shape, "scale", default="1 1 1")
-    if not Path(file).is_file():
-        notes.say("Mesh files are missing, so the picture lacks them: {}.", file)
+    file = files.find(name)
+    if file is None:
+        notes.say("Mesh files are missing, so the picture lacks them; package_dirs= says where to look: {}.", name)
         return ()
     if importlib.util.find_spec("trimesh") is None:
         notes.say('Meshes need trimesh, so the picture lacks them: pip install "jaxmb[view]".')
         return ()
-    return (Mesh.read(file, scale=scale, **place),)
+    try:
+        return (Mesh.read(file, scale=scale, **place),)
+    except ValueError as error:
+        cause = error.__cause__ or error
+        notes.say(f"Mesh files cannot be read ({type(cause).__name__}: {cause}), so the picture lacks them: {{}}.", name)
+        return ()

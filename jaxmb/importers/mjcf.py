@@ -68,7 +68,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     if "ACTUATION" not in off:
         machine.actuators = read_actuators(mujoco, model, names, notes, off)
     _read_marks(model, names, machine)
-    _read_shapes(mujoco, model, names, machine)
+    _read_shapes(mujoco, model, names, machine, notes)
     built = build(machine, notes)
     said = notes.finish(file)
     locate = _Locate(mujoco, model, names, built)
@@ -78,7 +78,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     }
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
     seen = built.shapes, built.collision_shapes
-    return ImportedModel(names.model, built.scene, said, coordinates, built.controls, states, *seen, locate)
+    return ImportedModel(names.model, built.scene, tuple(said), coordinates, built.controls, states, *seen, said, locate)
 
 
 class _Names:
@@ -252,14 +252,14 @@ def _read_marks(model, names, machine):
         machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k])))
 
 
-def _read_shapes(mujoco, model, names, machine):
+def _read_shapes(mujoco, model, names, machine, notes):
     for k in range(model.ngeom):
         color, body = color_of(model.geom_rgba[k]), names("body", model.geom_bodyid[k])
         place = {"position": np.array(model.geom_pos[k]), "orientation": np.array(model.geom_quat[k]), "color": color}
         own = [(body, shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
         if model.geom_contype[k] or model.geom_conaffinity[k]:
             machine.collisions += own
-        elif color is not None:
+        elif color is not None and not notes.leaves_out("pictures", body):
             machine.shapes += own
 
 

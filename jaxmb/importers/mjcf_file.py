@@ -25,7 +25,13 @@ def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
             warnings.simplefilter("always")
             spec = _specification(mujoco, source)
             _without_pictures(spec, notes)
-            model = spec.compile()
+            model = _compiled(spec, notes)
+            model.names.decode()
+    except UnicodeDecodeError:
+        raise ValueError(
+            f"{file}: names must be in UTF-8, whatever encoding a file declares: save it, and those that it includes, "
+            "as UTF-8."
+        ) from None
     except ValueError as error:
         notes.finish(file)
         raise ValueError(f"{file}: {str(error).strip()}") from None
@@ -38,6 +44,32 @@ def _specification(mujoco, source):
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     return mujoco.MjSpec.from_string(source) if is_text(source) else mujoco.MjSpec.from_file(str(source))
+
+
+def _compiled(spec, notes):
+    """The model; numbers of shapes do not matter where these are left out."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        left_out = [own for own in spec.geoms if _is_weightless(own) and _word(own) in notes.ignore]
+        for geom in left_out:
+            notes.say("Shapes are not read, since some of them have wrong numbers: {}.", geom.parent.name)
+            spec.delete(geom)
+        try:
+            return spec.compile()
+        except ValueError:
+            raise error from None
+
+
+def _word(geom):
+    """What leaves a shape out."""
+    return "collisions" if geom.contype or geom.conaffinity else "pictures"
+
+
+def _is_weightless(geom):
+    """Whether the mass of a body does not come from a shape."""
+    body = geom.parent
+    return body.name == "world" or body.explicitinertial or geom.mass == 0 or geom.density == 0
 
 
 def load_mujoco() -> Any:
@@ -66,7 +98,12 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")
-    is_missing = lambda mesh: mesh.file and not (folder / mesh.file).exists()
+    is_missing = lambda own: own.file and not (folder / own.file).exists()
+    for field in [own for own in spec.hfields if is_missing(own)]:
+        notes.refuse("collisions", field.name, f"The file {field.file!r} of the height field {field.name!r} is missing")
+        for geom in [own for own in spec.geoms if own.hfieldname == field.name]:
+            spec.delete(geom)
+        spec.delete(field)
     missing = {_named(mesh): mesh for mesh in spec.meshes if is_missing(mesh)}
     if missing:
         notes.say(f"Mesh files are missing, so the picture lacks them: {', '.join(sorted(missing))}.")
@@ -82,8 +119,7 @@ def _without_meshes(spec, missing, notes):
         if geom.meshname not in missing:
             continue
         body = geom.parent
-        weighs = not (geom.mass == 0 or geom.density == 0)
-        if body.name != "world" and weighs and not body.explicitinertial:
+        if not _is_weightless(geom):
             notes.refuse(
                 "meshes",
                 body.name,

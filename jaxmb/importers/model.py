@@ -21,7 +21,8 @@ class ImportedModel:
         of the file, and bodies their frames; links that are fixed to others, sites and other marks are frames. An
         angle or displacement of a joint is that of the file. Joints in succession, with no mass in between, are one
         `Composite`. The armature of a joint is a `JointInertia`.
-    - `notes`: sentences on what is approximated and what is left out.
+    - `notes`: sentences on what is approximated and what is left out, one for each kind; `named`: for each of them all
+        the names, or lines of the file, that it holds for: it lists the first ones.
     - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.
     - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
         `simulate(..., inputs=)`.
@@ -38,6 +39,7 @@ class ImportedModel:
     states: Mapping[str, State] = dataclasses.field(default_factory=dict)
     shapes: Mapping[str, tuple[AbstractShape, ...]] = dataclasses.field(default_factory=dict, repr=False)
     collision_shapes: Mapping[str, tuple[AbstractShape, ...]] = dataclasses.field(default_factory=dict, repr=False)
+    named: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict, repr=False)
     locate: Callable[[np.ndarray, np.ndarray], State] | None = dataclasses.field(default=None, repr=False)
 
     def state(self, qpos: Any, qvel: Any = None) -> State:

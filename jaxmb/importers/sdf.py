@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from .build import build
 from .description import GROUND, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
-from .geometry import read_geometry
+from .geometry import read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
-from .source import file_name, text_of
+from .source import Resources, file_name, text_of
+from .xml_model import model_of
 from .xml_tree import Element, parse
 
 _KINDS: dict[str, Kind] = {
@@ -23,8 +23,12 @@ _KINDS: dict[str, Kind] = {
     "fixed": "fixed",
     "universal": "hinge",
 }
+# What joints call the ground, and some files a link of theirs.
+_WORLD = "world"
 # From this size on a limit of a joint is none.
 _UNLIMITED = 1e15
+# Moments and products of inertia that are not given [kg m²].
+_INERTIA = {"ixx": 1.0, "ixy": 0.0, "ixz": 0.0, "iyy": 1.0, "iyz": 0.0, "izz": 1.0}
 _GREY = (128, 128, 128)
 # Elements that do not act on the motion.
 _EFFECTLESS = {"sensor", "light", "material", "self_collide", "allow_auto_disable", "audio_source", "transparency"}
@@ -35,23 +39,28 @@ def sdf(
     *,
     gravity: Any = (0.0, 0.0, -9.81),
     ignore: str | Collection[str] = (),
+    package_dirs: str | os.PathLike[str] | Collection[str | os.PathLike[str]] = (),
 ) -> ImportedModel:
     """A machine from SDF.
 
-    A model is free unless a joint binds it to `world`, or it is static. Angles that are written with few digits, such
+    A model is free unless a joint binds it to `world`, or it is static. Before version 1.5 of the format, axes of
+    joints are in the frame of the model. Angles that are written with few digits, such
     as 1.5708, are the multiples of π/12 that they round: the hinges of a loop are then as parallel as they are meant.
 
     **Arguments:** `source`: a path, or the text of a file, with one model; `gravity` [m/s²], shape (3,), unless a world
-    in the file has it; `ignore`: what is to be left out, words such as `"limits"` and `"friction"`, or names of joints.
+    in the file has it; `ignore`: what is to be left out, words such as `"limits"`, `"collisions"` and `"pictures"`, or
+    names of joints; `package_dirs`: where `model://name/` is looked for first, folders of models or that hold models;
+    then in the folder of the file and those above it.
 
     **Returns:** an `ImportedModel`; its `notes` say what is approximated.
 
     **Raises:** `ValueError` with file and line for elements that cannot be imported.
     """
-    notes, file = Notes(checked_ignore(ignore)), file_name(source)
+    notes, file, files = Notes(checked_ignore(ignore)), file_name(source), Resources.of(source, package_dirs)
     root = parse(text_of(source), file)
     if root.tag != "sdf":
         raise ValueError(f"{root.where}the root of SDF is <sdf>, got <{root.tag}>.")
+    version = _version(root)
     holder = root.first("world") or root
     for include in (*holder.all("include"), *root.all("include")):
         raise ValueError(f"{include.where}<include> is not followed: put the model into the file.")
@@ -69,26 +78,26 @@ def sdf(
     if "placement_frame" in model.attributes:
         notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's own frame.")
     static = model.first("static")
+    static = static is not None and _true(static.text)
     for element in model.all("link"):
-        _read_link(element, machine, place, notes)
-        if static is not None and static.text.strip() in ("1", "true"):
+        _read_link(element, machine, place, notes, files)
+        if static:
             machine.joints.append(Joint(f"{element.need('name')} weld", "fixed", GROUND, element.need("name")))
     for element in model.all("joint"):
-        _read_joint(element, machine, place[1], notes)
-    if machine.collisions:
-        notes.refuse("collisions", "", "Links have shapes for collisions")
-    for element in root.unread():
-        if element.tag not in _EFFECTLESS:
-            notes.say(f"{element.where}<{element.tag}> is not read.")
-    listed = sorted({element.tag for element in root.unread()} & _EFFECTLESS)
-    if listed:
-        notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
-    built = build(machine, notes)
-    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
-    said = notes.finish(file)
-    return ImportedModel(
-        machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes, built.collision_shapes
-    )
+        _read_joint(element, machine, place[1], version, notes)
+    return model_of(root, machine, notes, file, _EFFECTLESS)
+
+
+def _version(root: Element) -> tuple[int, ...]:
+    """The version of the format, `(1, 6)`."""
+    given = root.need("version").strip()
+    if re.fullmatch(r"\d+(\.\d+)*", given) is None:
+        raise ValueError(f"{root.where}the version of the format is a number such as 1.9, got {given!r}.")
+    return tuple(int(part) for part in given.split("."))
+
+
+def _true(word: str) -> bool:
+    return word.strip().lower() in ("1", "true")
 
 
 def _pose(element: Element, notes: Notes):
@@ -98,11 +107,11 @@ def _pose(element: Element, notes: Notes):
         return np.zeros(3), np.eye(3)
     relative = own.attributes.get("relative_to", own.attributes.get("frame", ""))
     if relative not in ("", "__model__"):
-        notes.refused.append(f"{own.where}a pose relative to {relative!r}: give it in the model's frame.")
+        raise ValueError(f"{own.where}a pose relative to {relative!r}: give it in the model's frame.")
     words = own.text.split()
     numbers = own.numbers(count=6)
     angles = [_rounded(word, value, own, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
-    if own.attributes.get("degrees") in ("1", "true"):
+    if _true(own.attributes.get("degrees", "")):
         angles = [np.deg2rad(value) for value in numbers[3:]]
     return numbers[:3], roll_pitch_yaw(angles)
 
@@ -120,7 +129,7 @@ def _rounded(word, value, element, notes):
     return value
 
 
-def _read_link(element, machine, place, notes):
+def _read_link(element, machine, place, notes, files):
     name = element.need("name")
     if name in machine.links:
         raise ValueError(f"{element.where}link {name!r} is there twice.")
@@ -133,31 +142,29 @@ def _read_link(element, machine, place, notes):
         link.mass = inertial.number("mass", 1.0)
         own = inertial.first("inertia")
         xx, xy, xz, yy, yz, zz = (
-            (1.0 if i in ("ixx", "iyy", "izz") else 0.0) if own is None else own.number(i)
-            for i in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+            default if own is None else own.number(moment, default) for moment, default in _INERTIA.items()
         )
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-        if inertial.attributes.get("auto") in ("1", "true"):
+        if _true(inertial.attributes.get("auto", "")):
             notes.refused.append(f"{inertial.where}the inertia of link {name!r} comes from its shapes: write it out.")
+    elif name == _WORLD:
+        machine.joints.append(Joint(f"{name} weld", "fixed", GROUND, name))
     else:
-        notes.refused.append(f"{element.where}link {name!r} has no <inertial>: give it a mass and an inertia.")
+        link.mass, link.inertia = 1.0, np.eye(3)
+        notes.say("Links without <inertial> have the mass 1 kg and moments of inertia of 1 kg m²: {}.", name)
     weighs = element.first("gravity")
-    if weighs is not None and weighs.text.strip() in ("0", "false"):
+    if weighs is not None and not _true(weighs.text):
         machine.buoyancy[name] = 1.0
     machine.links[name] = link
-    for tag in ("visual", "collision"):
-        for own in element.all(tag):
-            _read_shape(own, name, machine, notes)
+
+    def seen(element):
+        position, rotation = _pose(element, notes)
+        return {"position": position, "orientation": quaternion(rotation), "color": _GREY}
+
+    read_shapes(element, name, machine, notes, files, seen)
 
 
-def _read_shape(element, link, machine, notes):
-    position, rotation = _pose(element, notes)
-    own = read_geometry(element, notes, position=position, orientation=quaternion(rotation), color=_GREY)
-    shapes = machine.collisions if element.tag == "collision" else machine.shapes
-    shapes += [(link, shape) for shape in own]
-
-
-def _read_joint(element, machine, of_model, notes):
+def _read_joint(element, machine, of_model, version, notes):
     name, kind = element.need("name"), element.need("type")
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
@@ -171,9 +178,9 @@ def _read_joint(element, machine, of_model, notes):
     for tag in ("parent", "child"):
         own = element.first(tag)
         link = "" if own is None else own.text.strip()
-        if link not in machine.links and link != "world":
+        if link not in machine.links and link != _WORLD:
             raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
-        ends.append(GROUND if link == "world" else link)
+        ends.append(GROUND if link == _WORLD else link)
     child = machine.links.get(ends[1], Link(GROUND))
     position, rotation = _pose(element, notes)
     frame = child.rotation @ rotation
@@ -190,18 +197,19 @@ def _read_joint(element, machine, of_model, notes):
         pairs = [(joint, axes[0] if axes else None)]
     for joint, axis in pairs:
         if axis is not None:
-            _read_axis(joint, axis, frame, of_model, machine, notes, kind)
+            _read_axis(joint, axis, frame, of_model, machine, version, notes, kind)
         elif joint.kind in ("hinge", "slide"):
             raise ValueError(f"{element.where}joint {name!r} needs an <axis>.")
         machine.joints.append(joint)
 
 
-def _read_axis(joint, axis, frame, of_model, machine, notes, kind):
+def _read_axis(joint, axis, frame, of_model, machine, version, notes, kind):
     xyz = axis.first("xyz")
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
     in_model = axis.first("use_parent_model_frame")
-    if (in_model is not None and in_model.text.strip() in ("1", "true")) or expressed == "__model__":
+    # Before version 1.5 axes are in the frame of the model, which 1.5 and 1.6 have a word for.
+    if (version < (1, 5) if in_model is None else _true(in_model.text)) or expressed == "__model__":
         frame = of_model
     elif expressed:
         if expressed not in machine.links:
@@ -224,8 +232,10 @@ def _read_axis(joint, axis, frame, of_model, machine, notes, kind):
                 child.read = True
                 notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
         if kind != "ball" and lower > -_UNLIMITED and upper < _UNLIMITED:
-            if not lower < upper:
-                raise ValueError(f"{limit.where}the limits of joint {joint.name!r} must increase: {lower}, {upper}.")
-            joint.limits = (lower, upper)
+            if lower < upper:
+                joint.limits = (lower, upper)
+            else:
+                where = f"{limit.where}the limits of joint {joint.name!r}"
+                notes.refuse("limits", joint.name, f"{where} must increase, got {lower} and {upper}")
         elif kind != "ball" and (lower > -_UNLIMITED or upper < _UNLIMITED):
             notes.refuse("limits", joint.name, f"{limit.where}joint {joint.name!r} is limited on one side")

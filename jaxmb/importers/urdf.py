@@ -7,12 +7,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .build import build
+from ..parts.names import unknown
 from .description import GROUND, Coupling, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
-from .geometry import color_of, read_geometry
+from .geometry import color_of, read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
-from .source import file_name, text_of
+from .source import Resources, file_name, text_of
+from .xml_model import model_of
 from .xml_tree import Element, parse
 
 _KINDS: dict[str, Kind] = {
@@ -21,6 +22,8 @@ _KINDS: dict[str, Kind] = {
     "prismatic": "slide",
     "fixed": "fixed",
     "floating": "free",
+    # Of Bullet and MuJoCo, beside the format.
+    "spherical": "ball",
 }
 # Elements that do not act on the motion.
 _EFFECTLESS = {"material", "transmission", "verbose", "name"}
@@ -32,6 +35,7 @@ def urdf(
     base: Literal["fixed", "free"] = "fixed",
     gravity: Any = (0.0, 0.0, -9.81),
     ignore: str | Collection[str] = (),
+    package_dirs: str | os.PathLike[str] | Collection[str | os.PathLike[str]] = (),
 ) -> ImportedModel:
     """A machine from URDF.
 
@@ -40,13 +44,15 @@ def urdf(
     - `source`: a path, or the text of a file.
     - `base`: whether the root link is fixed to the ground, or free. A root link called `world` is the ground.
     - `gravity` [m/s²], shape (3,), which the format does not hold.
-    - `ignore`: what is to be left out, words such as `"limits"` and `"friction"`, or names of joints.
+    - `ignore`: what is to be left out, words such as `"limits"`, `"collisions"` and `"pictures"`, or names of joints.
+    - `package_dirs`: where `package://name/` is looked for first, folders of packages or that hold packages; then in
+        the folder of the file and those above it.
 
     **Returns:** an `ImportedModel`; its `notes` say what is approximated.
 
     **Raises:** `ValueError` with file and line for elements that cannot be imported.
     """
-    notes, file = Notes(checked_ignore(ignore)), file_name(source)
+    notes, file, files = Notes(checked_ignore(ignore)), file_name(source), Resources.of(source, package_dirs)
     if base not in ("fixed", "free"):
         raise ValueError(f"base must be 'fixed' or 'free', got {base!r}.")
     root = parse(text_of(source), file)
@@ -56,21 +62,15 @@ def urdf(
         raise ValueError(f"{root.where}the file has xacro macros: run xacro on it first.")
     machine = Machine(root.attributes.get("name", "robot"), np.asarray(gravity, float))
     for element in root.all("link"):
-        _read_link(element, machine, notes)
+        _read_link(element, machine, notes, files)
     joints = [_read_joint(element, machine, notes) for element in root.all("joint")]
     _place(machine, joints, base, root)
     for joint, element, _ in joints:
         machine.joints.append(joint)
-        _read_mimic(joint, element, machine)
-    if machine.collisions:
-        notes.refuse("collisions", "", "Links have shapes for collisions")
-    _say_unread(root, notes)
-    built = build(machine, notes)
-    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
-    said = notes.finish(file)
-    return ImportedModel(
-        machine.name, built.scene, said, coordinates, built.controls, {}, built.shapes, built.collision_shapes
-    )
+        _read_mimic(joint, element, machine, [own.name for own, _, _ in joints], notes)
+    if any(element.first("limit") is not None for element in root.all("joint")):
+        notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
+    return model_of(root, machine, notes, file, _EFFECTLESS)
 
 
 def _origin(element: Element | None):
@@ -82,7 +82,7 @@ def _origin(element: Element | None):
     return position, roll_pitch_yaw(own.numbers(own.attributes.get("rpy", "0 0 0")))
 
 
-def _read_link(element, machine, notes):
+def _read_link(element, machine, notes, files):
     name = element.need("name")
     if name in machine.links:
         raise ValueError(f"{element.where}link {name!r} is there twice.")
@@ -97,22 +97,16 @@ def _read_link(element, machine, notes):
         xx, xy, xz, yy, yz, zz = (inertia.attribute_number(i) for i in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     machine.links[name] = link
-    for tag in ("visual", "collision"):
-        for own in element.all(tag):
-            _read_shape(own, name, machine, notes)
+    read_shapes(element, name, machine, notes, files, _seen)
 
 
-def _read_shape(element, link, machine, notes):
+def _seen(element):
+    """Place and color of a shape."""
     position, rotation = _origin(element)
     material = element.first("material")
     given = None if material is None else material.first("color")
     rgba = (0.5, 0.5, 0.5, 1.0) if given is None else given.numbers(given.attributes.get("rgba", "0.5 0.5 0.5 1"), 4)
-    color = color_of(rgba)
-    own = read_geometry(element, notes, position=position, orientation=quaternion(rotation), color=color)
-    if element.tag == "collision":
-        machine.collisions += [(link, shape) for shape in own]
-    elif color is not None:
-        machine.shapes += [(link, shape) for shape in own]
+    return {"position": position, "orientation": quaternion(rotation), "color": color_of(rgba)}
 
 
 def _read_joint(element, machine, notes):
@@ -140,14 +134,24 @@ def _read_joint(element, machine, notes):
         joint.damping = dynamics.attribute_number("damping")
         joint.friction = dynamics.attribute_number("friction")
     if limit is not None and kind in ("revolute", "prismatic"):
-        lower, upper = limit.attribute_number("lower"), limit.attribute_number("upper")
-        if lower > upper:
-            raise ValueError(f"{limit.where}the limits of joint {name!r} must increase, got {lower} and {upper}.")
-        if lower == upper:
-            notes.say("Limits that leave no range are taken for none: {}.", name)
-        else:
-            joint.limits = (lower, upper)
+        joint.limits = _limits(limit, name, notes)
     return joint, element, _origin(element)
+
+
+def _limits(limit, name, notes):
+    try:
+        lower, upper = limit.attribute_number("lower"), limit.attribute_number("upper")
+    except ValueError as error:
+        notes.refuse("limits", name, str(error))
+        return None
+    if lower > upper:
+        where = f"{limit.where}the limits of joint {name!r}"
+        notes.refuse("limits", name, f"{where} must increase, got {lower} and {upper}")
+        return None
+    if lower == upper:
+        notes.say("Limits that leave no range are taken for none: {}.", name)
+        return None
+    return lower, upper
 
 
 def _place(machine, joints, base, root):
@@ -193,20 +197,15 @@ def _spread(machine, joint):
     joint.parent = names[1]
 
 
-def _read_mimic(joint, element, machine):
+def _read_mimic(joint, element, machine, names, notes):
     mimic = element.first("mimic")
-    if mimic is not None:
-        factor, offset = mimic.attribute_number("multiplier", 1.0), mimic.attribute_number("offset")
-        others = [(mimic.need("joint"), np.array([factor]), 0.0)]
-        machine.couplings.append(Coupling(f"{joint.name} mimic", joint.name, offset, others))
-
-
-def _say_unread(root, notes):
-    for element in root.unread():
-        if element.tag not in _EFFECTLESS:
-            notes.say(f"{element.where}<{element.tag}> is not read.")
-    listed = sorted({element.tag for element in root.unread()} & _EFFECTLESS)
-    if listed:
-        notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
-    if any(element.first("limit") is not None for element in root.all("joint")):
-        notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
+    if mimic is None:
+        return
+    factor, offset = mimic.attribute_number("multiplier", 1.0), mimic.attribute_number("offset")
+    other, name = mimic.need("joint"), f"{joint.name} mimic"
+    if joint.kind == "fixed":
+        notes.say("Fixed joints follow no other: their <mimic> has no effect: {}.", joint.name)
+    elif other not in names:
+        notes.refuse("couplings", name, f"{mimic.where}<mimic> of {joint.name!r}: {unknown('joint', other, names)}")
+    else:
+        machine.couplings.append(Coupling(name, joint.name, offset, [(other, np.array([factor]), 0.0)]))

@@ -9,11 +9,12 @@ import numpy as np
 
 @dataclasses.dataclass
 class Element:
-    """An element: its tag, attributes, text and children, and `where` it stands, `"file:line: "`."""
+    """An element: its tag, attributes, text and children, and `where` it stands, `"file:line: "`, with the line."""
 
     tag: str
     attributes: dict[str, str]
     where: str
+    line: int
     text: str = ""
     children: list["Element"] = dataclasses.field(default_factory=list)
     read: bool = False
@@ -69,26 +70,41 @@ class Element:
 def parse(text: str, file: str) -> Element:
     """The root element of a text.
 
-    **Raises:** `ValueError` with the line for a text that is not XML.
+    **Raises:** `ValueError` with the line for a text that is not XML, and for one that declares a document type: its
+    entities may stand for more text than any memory holds.
     """
-    root = Element("", {}, "")
+    root = Element("", {}, "", 0)
     stack = [root]
-    parser = expat.ParserCreate()
+    # A text is decoded already, whatever its first line declares.
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    # Before the declaration of XML nothing may stand, not even an empty line, and no zero of C behind the text.
+    text = text.rstrip("\0")
+    blank = len(text) - len(text.lstrip())
+    above = text.count("\n", 0, blank)
 
     def start(tag, attributes):
-        element = Element(tag, attributes, f"{file}:{parser.CurrentLineNumber}: ")
+        line = parser.CurrentLineNumber + above
+        element = Element(tag, attributes, f"{file}:{line}: ", line)
         stack[-1].children.append(element)
         stack.append(element)
 
     def data(words):
         stack[-1].text += words
 
+    def document_type(*_):
+        raise ValueError(
+            f"{file}:{parser.CurrentLineNumber + above}: a document type or an entity is declared, which is not read: "
+            "remove <!DOCTYPE …> and write out what its entities stand for."
+        )
+
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda tag: stack.pop()
     parser.CharacterDataHandler = data
+    parser.StartDoctypeDeclHandler = document_type
     try:
-        parser.Parse(text.encode(), True)
+        parser.Parse(text[blank:].encode("utf-8", "surrogatepass"), True)
     except expat.ExpatError as error:
-        raise ValueError(f"{file}:{error.lineno}: {expat.ErrorString(error.code)}.") from None
+        raise ValueError(f"{file}:{error.lineno + above}: {expat.ErrorString(error.code)}.") from None
     root.children[0].read = True
     return root.children[0]

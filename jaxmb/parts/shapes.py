@@ -171,13 +171,21 @@ class Mesh(AbstractShape):
         **Arguments:** `scale` [m per unit of the file], one number or one along each axis, where a negative one
         mirrors; `position`, `orientation` and `color` as of all shapes.
 
-        **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs.
+        **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs; `ValueError` for a file that trimesh
+        cannot read, such as one without an extension, which tells its format.
         """
         try:
             import trimesh
         except ImportError as error:
             raise ImportError('Mesh.read needs trimesh; install it with: pip install "jaxmb[view]"') from error
-        mesh, scales = trimesh.load_mesh(path), np.broadcast_to(np.asarray(scale, float), (3,))
+        scales = np.broadcast_to(np.asarray(scale, float), (3,))
+        try:
+            mesh = trimesh.load_mesh(path)
+        except Exception as error:  # Its readers of many formats raise whatever they meet.
+            format_of = Path(path).suffix or "without an extension, which tells the format"
+            raise ValueError(
+                f"Mesh.read: trimesh cannot read {str(path)!r} ({format_of}): {type(error).__name__}: {error}"
+            ) from error
         if not len(mesh.faces):
             raise ValueError(f"Mesh.read: there are no triangles in {str(path)!r}.")
         # A mirrored triangle is seen from its other side.

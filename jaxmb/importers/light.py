@@ -1,0 +1,101 @@
+"""Links whose inertia is none, or not that of a rigid body."""
+
+from collections import Counter
+
+import numpy as np
+
+from .description import GROUND, Link, Machine
+from .notes import Notes
+
+# The share of the largest moment of inertia that is taken for rounding.
+_ROUNDED = 0.05
+
+
+def bodies_of(machine: Machine) -> dict[str, str]:
+    """For each link and the ground the first one of the file that it is fixed to."""
+    order = {name: k for k, name in enumerate((GROUND, *machine.links))}
+    parent = {name: name for name in order}
+
+    def root(name):
+        while parent[name] != name:
+            parent[name] = parent[parent[name]]
+            name = parent[name]
+        return name
+
+    for joint in machine.joints:
+        if joint.kind == "fixed":
+            first, last = sorted((root(joint.parent), root(joint.child)), key=order.__getitem__)
+            parent[last] = first
+    return {name: root(name) for name in order}
+
+
+def without_ends(machine: Machine, notes: Notes) -> None:
+    """Take the links out of a machine that have no mass and hang at one joint, with all that they carry.
+
+    They take no force, so none passes their joint, whatever acts there. Those stay that something else holds as well:
+    a loop, a tendon, an actuator, or couplings that could pass a force on.
+    """
+    while True:
+        of = bodies_of(machine)
+        heavy = {of[GROUND], *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
+        # A free joint holds nothing.
+        moving = [joint for joint in machine.joints if joint.kind not in ("fixed", "free")]
+        held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
+        held.update(of[link] for loop in machine.loops for link in (loop.link_a, loop.link_b))
+        held.update(of[link] for tendon in machine.tendons for link, _ in tendon.points)
+        ends = {body: None for body in of.values() if body not in heavy and held[body] == 0}
+        for joint in moving:
+            for link in (joint.parent, joint.child):
+                if of[link] not in heavy and held[of[link]] == 1 and _alone(machine, notes, joint):
+                    ends[of[link]] = joint.name
+        if not ends:
+            return
+        _take_out(machine, {name for name, body in of.items() if body in ends}, set(ends.values()) - {None}, notes)
+
+
+def _alone(machine, notes, joint):
+    """Whether no force that acts on a joint can reach another one."""
+    acting = [actuator for actuator in machine.actuators if not actuator.on_tendon and actuator.of == joint.name]
+    along = [tendon for tendon in machine.tendons if any(name == joint.name for name, _ in tendon.joints)]
+    coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
+    if acting or along or len(coupled) > 1:
+        return False
+    own = {
+        "springs": joint.stiffness,
+        "damping": joint.damping,
+        "armature": joint.armature,
+        "friction": joint.friction,
+        "limits": joint.limits is not None,
+    }
+    return not coupled or not any(value and kind not in notes.ignore for kind, value in own.items())
+
+
+def _coupled(coupling):
+    """The joints that a coupling has."""
+    return set() if coupling.of_tendons else {coupling.joint, *(name for name, _, _ in coupling.others)}
+
+
+def _take_out(machine, links, joints, notes):
+    notes.say("Links without mass at the ends of the machine take no force and are left out: {}.", *links)
+    machine.links = {name: link for name, link in machine.links.items() if name not in links}
+    machine.joints = [own for own in machine.joints if own.name not in joints and own.child not in links]
+    machine.buoyancy = {name: share for name, share in machine.buoyancy.items() if name not in links}
+    machine.couplings = [own for own in machine.couplings if not _coupled(own) & joints]
+    machine.marks = [own for own in machine.marks if own.link not in links]
+    machine.shapes = [own for own in machine.shapes if own[0] not in links]
+    machine.collisions = [own for own in machine.collisions if own[0] not in links]
+
+
+def rigid(link: Link, notes: Notes) -> np.ndarray:
+    """The inertia of a link, shape (3, 3), symmetric, with its largest principal moment at most the sum of the others
+    where it is larger by rounding.
+    """
+    inertia = 0.5 * (link.inertia + link.inertia.T)
+    moments, axes = np.linalg.eigh(inertia)
+    most = moments[0] + moments[1]
+    if moments[0] <= 0 or not most < moments[2] <= most * (1 + _ROUNDED):
+        return inertia
+    notes.say(
+        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to it: {}.", link.name
+    )
+    return axes @ np.diag([*moments[:2], most]) @ axes.T
