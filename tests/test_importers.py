@@ -490,6 +490,44 @@ def test_collisions_are_refused_unless_left_out():
     assert model.shapes == model.collision_shapes
 
 
+def test_a_fluid_is_left_out():
+    text = file(rod("a", HINGE), "", '<option density="1.2" viscosity=".1"/>')
+    found = importers.mjcf(text, ignore="fluid")
+    assert "Left out, as ignore='fluid' asks: fluid." in found.notes and set(kinds(found)) == {"hip", "gravity"}
+
+
+EXPLICIT = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+
+
+@pytest.mark.parametrize(
+    "shape, word, message",
+    [
+        ('<geom name="g" size="0"/>', "pictures", "size 0 must be positive"),
+        ('<geom name="g" size="0" contype="1" conaffinity="1"/>', "collisions", "size 0 must be positive"),
+        (
+            '<geom name="g" type="hfield" hfield="hills" contype="1" conaffinity="1"/>',
+            "collisions",
+            "The file 'hills.png' of the height field 'hills' is missing",
+        ),
+    ],
+)
+def test_numbers_of_shapes_do_not_matter_where_they_are_ignored(shape, word, message):
+    """Also of shapes that a sensor names."""
+    hills = '<asset><hfield name="hills" file="hills.png" size="1 1 1 1"/></asset>'
+    more = '<sensor><framepos objtype="geom" objname="g"/></sensor>'
+    text = file(f'<body name="a"><joint name="hip"/>{EXPLICIT}{shape}</body>', more, hills if "hfield" in shape else "")
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+    found = importers.mjcf(text, ignore=word)
+    assert set(kinds(found)) == {"hip", "gravity"} and not found.shapes
+    assert "Not read, since they do not act on the motion: 1 sensors." in found.notes
+
+
+def test_pictures_are_left_out():
+    text = file(rod("a", HINGE))
+    assert importers.mjcf(text).shapes and not importers.mjcf(text, ignore="pictures").shapes
+
+
 def test_elements_are_left_out_by_kind_or_by_name():
     text = file(rod("a", '<joint name="hip" range="-30 40" damping=".1"/>'))
     assert "hip stop" in kinds(importers.mjcf(text))

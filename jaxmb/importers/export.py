@@ -58,7 +58,9 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     write_forces(system, tree, elements, sections, notes)
     root.extend(section for section in sections.values() if len(section))
     ElementTree.indent(root)
-    return Exported(ElementTree.tostring(root, encoding="unicode"), tuple(notes.finish("The scene", "MuJoCo cannot express")))
+    return Exported(
+        ElementTree.tostring(root, encoding="unicode"), tuple(notes.finish("The scene", "MuJoCo cannot express"))
+    )
 
 
 def _body(parent, node: Node, tree: Tree, mass, inertia):

@@ -94,11 +94,8 @@ def fuse(machine: Machine, notes: Notes) -> Fused:
     of = bodies_of(machine)
     groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
     moving = [joint for joint in machine.joints if joint.kind != "fixed"]
-    light = {name for name, own in groups.items() if name != GROUND and not any(link.mass > 0 for link in own)}
-    for name in light:
-        for link in groups[name]:
-            if np.any(link.inertia):
-                notes.refused.append(f"{link.where}Link {link.name!r} has an inertia, but no mass: give it a mass.")
+    weighs = lambda link: link.mass or np.any(link.inertia)
+    light = {name for name, own in groups.items() if name != GROUND and not any(weighs(link) for link in own)}
     chains = _chains(moving, of, light, links, notes)
     carriers = {name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light}
     fused = Fused(carriers, of, links, {}, chains)
@@ -141,9 +138,9 @@ def _chains(joints, of, light, links, notes):
 
 def _summed(frame: Link, links: list[Link]) -> Link:
     """Several links as one, in the frame of one of them."""
-    if len(links) == 1:
-        return dataclasses.replace(frame)
     mass = sum(link.mass for link in links)
+    if len(links) == 1 or not mass:
+        return dataclasses.replace(frame)
     centres = [frame.rotation.T @ (link.position + link.rotation @ link.centre - frame.position) for link in links]
     centre = sum(link.mass * own for link, own in zip(links, centres, strict=True)) / mass
     inertia = np.zeros((3, 3))

@@ -125,5 +125,7 @@ def _mesh(shape, notes, files, place):
         return (Mesh.read(file, scale=scale, **place),)
     except ValueError as error:
         cause = error.__cause__ or error
-        notes.say(f"Mesh files cannot be read ({type(cause).__name__}: {cause}), so the picture lacks them: {{}}.", name)
+        notes.say(
+            f"Mesh files cannot be read ({type(cause).__name__}: {cause}), so the picture lacks them: {{}}.", name
+        )
         return ()

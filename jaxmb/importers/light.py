@@ -37,7 +37,7 @@ def without_ends(machine: Machine, notes: Notes) -> None:
     """
     while True:
         of = bodies_of(machine)
-        heavy = {of[GROUND], *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
+        heavy = {GROUND, *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
         # A free joint holds nothing.
         moving = [joint for joint in machine.joints if joint.kind not in ("fixed", "free")]
         held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
@@ -96,6 +96,7 @@ def rigid(link: Link, notes: Notes) -> np.ndarray:
     if moments[0] <= 0 or not most < moments[2] <= most * (1 + _ROUNDED):
         return inertia
     notes.say(
-        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to it: {}.", link.name
+        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to it: {}.",
+        link.name,
     )
     return axes @ np.diag([*moments[:2], most]) @ axes.T

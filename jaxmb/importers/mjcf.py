@@ -78,7 +78,9 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     }
     coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
     seen = built.shapes, built.collision_shapes
-    return ImportedModel(names.model, built.scene, tuple(said), coordinates, built.controls, states, *seen, said, locate)
+    return ImportedModel(
+        names.model, built.scene, tuple(said), coordinates, built.controls, states, *seen, said, locate
+    )
 
 
 class _Names:

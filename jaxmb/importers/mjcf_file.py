@@ -94,7 +94,10 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
     ]
     if left_out:
         notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
-    for kind in ("materials", "textures", "skins"):
+    if spec.sensors:
+        notes.say(f"Not read, since they do not act on the motion: {len(spec.sensors)} sensors.")
+    # Sensors may name what is left out below.
+    for kind in ("materials", "textures", "skins", "sensors"):
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")

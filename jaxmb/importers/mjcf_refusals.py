@@ -43,9 +43,8 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     if model.nplugin:
         notes.refused.append("Plugins are not known; remove them from the file.")
     if model.opt.density or model.opt.viscosity:
-        notes.refuse("fluid", "", "A fluid acts on the bodies: set density and viscosity of <option> to zero")
+        notes.refuse("fluid", "", "A fluid is not modelled: set density and viscosity of <option> to zero")
     effectless = {
-        "sensors": model.nsensor,
         "cameras": model.ncam,
         "lights": model.nlight,
         "height fields": model.nhfield,
