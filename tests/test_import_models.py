@@ -1,6 +1,8 @@
 """Real machines from packages that hold their files; only those that are installed, and only with `--all`."""
 
+import dataclasses
 import importlib.metadata
+from xml.etree import ElementTree
 
 import diffrax
 import jax
@@ -33,6 +35,19 @@ TREES = {
     "leap hand": ("playground", f"{PLAYGROUND}manipulation/leap_hand/xmls/leap_rh_mjx.xml"),
     "h1": ("playground", f"{PLAYGROUND}locomotion/h1/xmls/h1_mjx_feetonly.xml"),
 }
+# What a fluid would do is left out.
+SWIMMERS = {
+    "fish": ("dm_control", "suite/fish.xml"),
+    "box": ("brax", "test_data/fluid_box_offset_com.xml"),
+    "ellipsoid": ("brax", "test_data/fluid_ellipsoid.xml"),
+}
+# Robots whose pictures have wrong numbers, with ball joints of Bullet, or with empty lines before their XML.
+URDF = {
+    "differential": ("pybullet", "differential/diff_ring.urdf"),
+    "humanoid": ("pybullet", "pybullet_data/humanoid/humanoid.urdf"),
+    "laikago": ("pybullet", "laikago/laikago_toes_zup.urdf"),
+    "talos": ("example-robot-data", "robots/talos_left_arm.urdf"),
+}
 ROBOTIQ = ("playground", f"{PLAYGROUND}manipulation/franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85.xml")
 CASSIE = ("example-robot-data", "cassie_description/robots/cassie_v2.sdf")
 
@@ -52,6 +67,47 @@ def test_trees_move_as_in_mujoco(name):
     system = check_dynamics(model, 100, scale=0.5)
     moving = model.locate.model.body_weldid > 0
     assert float(np.sum(system.mass)) == pytest.approx(np.sum(model.locate.model.body_mass[moving]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", SWIMMERS)
+def test_swimmers_move_as_in_mujoco_without_their_fluid(name):
+    imported = importers.mjcf(path_of(*SWIMMERS[name]), ignore=(*OFF, "fluid"))
+    option = imported.locate.model.opt
+    option.density = option.viscosity = 0.0
+    check_dynamics(imported, scale=0.5)
+
+
+def placed_by_mujoco(model, path):
+    """A model from URDF with the states and equations that MuJoCo has for the same file."""
+    spec = mujoco.MjSpec.from_string(text_without(path))
+    other = importers.mjcf(spec, ignore=(*OFF, "couplings"))
+    rows = {body.name: k for k, body in enumerate(other.scene.bodies)}
+    order = np.array([rows[body.name] for body in model.scene.bodies])
+
+    class Locate:
+        model = other.locate.model
+
+        def __call__(self, qpos, qvel):
+            state = other.locate(qpos, qvel)
+            return mb.State(state.q.reshape(-1, 7)[order].ravel(), state.u.reshape(-1, 6)[order].ravel())
+
+    return dataclasses.replace(model, locate=Locate())
+
+
+def text_without(path):
+    """The text of a URDF without shapes."""
+    root = ElementTree.fromstring(path.read_text().strip("\0 \n"))
+    for link in root.iter("link"):
+        for child in [own for own in link if own.tag in ("visual", "collision")]:
+            link.remove(child)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+@pytest.mark.parametrize("name", URDF)
+def test_robots_from_urdf_move_as_in_mujoco(name):
+    path = path_of(*URDF[name])
+    model = importers.urdf(path, ignore=(*OFF, "pictures", "couplings"))
+    check_dynamics(placed_by_mujoco(model, path), scale=0.5)
 
 
 def test_a_urdf_tree_moves_as_in_mujoco():
