@@ -127,6 +127,10 @@ def test_a_planar_joint():
             robot(link("a"), link("b"), joint("j", "a", "b", "helical")),
             r"The text:4: joint 'j' has the unknown type 'helical'",
         ),
+        (
+            robot(link("a"), link("b"), link("c"), joint("j", "b", "c"), joint("k", "c", "b")),
+            "The text:1: the links make no tree: no joints lead from 'a' to 'b', 'c'",
+        ),
         (robot(link("a"), joint("j", "a", "b")), r"The text:3: joint 'j' has the child 'b', and there is no such link"),
         (robot(link("a"), link("b", ""), joint("j", "a", "b")), "There is no moving link .base='free' sets"),
         (
@@ -227,6 +231,7 @@ def test_the_loop_is_closed_and_its_redundancy_named():
         (model(body("a"), hinge("j", "world", "a", kind="bolt")), "The text:3: joint 'j' has the unknown type 'bolt'"),
         (model(body("a"), hinge("j", "world", "a", kind="gearbox")), "joint 'j' is of type 'gearbox'"),
         (model(body("a"), hinge("j", "world", "b")), "joint 'j' has the child 'b'"),
+        (model(body("a"), hinge("j", "a", "a")), "The text:3: parent and child of joint 'j' are the same, 'a'"),
         ("<sdf version='1.6'><include><uri>x</uri></include></sdf>", "The text:1: <include> is not followed"),
         ("<sdf><model name='m'/></sdf>", "The text:1: <sdf> needs the attribute 'version'"),
         ("<sdf version='new'><model name='m'/></sdf>", "the version of the format is a number such as 1.9, got 'new'"),
@@ -332,6 +337,14 @@ def bomb(root):
 def test_declared_entities_are_refused(read, root):
     with pytest.raises(ValueError, match="The text:2: a document type or an entity is declared, which is not read"):
         read(bomb(root))
+
+
+def test_a_deeply_nested_file():
+    deep = f"<visual>{'<a>' * 10_000}{'</a>' * 10_000}</visual>"
+    text = robot(
+        link("world", ""), link("a", INERTIAL + deep), joint("j", "world", "a"), "<b>" * 10_000 + "</b>" * 10_000
+    )
+    assert [own.name for own in importers.urdf(text, ignore="pictures").scene.bodies] == ["a"]
 
 
 def test_mujoco_expands_no_entities():

@@ -39,25 +39,19 @@ def read_shapes(
         for element in link.all(tag):
             if tag == "visual" and word in notes.ignore:
                 notes.leaves_out(word, name)
-                _skip(element)
+                element.skip()
                 continue
             try:
                 own = place(element)
                 shapes = _read_geometry(element, notes, files, own)
             except ValueError as error:
-                _skip(element)
+                element.skip()
                 notes.refuse(word, name, str(error))
                 continue
             if tag == "collision":
                 machine.collisions += [(name, shape) for shape in shapes]
             elif own["color"] is not None:
                 machine.shapes += [(name, shape) for shape in shapes]
-
-
-def _skip(element):
-    for child in element.children:
-        child.read = True
-        _skip(child)
 
 
 def _read_geometry(element, notes, files, place):
@@ -92,8 +86,7 @@ def _read(shape, notes, files, place) -> tuple[AbstractShape, ...]:
             return (Ground().moved(np.zeros(3), normal).moved(**_placed(place)),)
         case "mesh":
             return _mesh(shape, notes, files, place)
-    for child in shape.children:
-        child.read = True
+    shape.skip()
     notes.say("Shapes that are not shown: {}.", f"<{shape.tag}>")
     return ()
 

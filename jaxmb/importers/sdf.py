@@ -169,8 +169,7 @@ def _read_joint(element, machine, of_model, version, notes):
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
         if kind in ("gearbox", "screw", "revolute2"):
-            for child in element.children:
-                child.read = True
+            element.skip()
             notes.refuse("gearboxes", name, f"{element.where}joint {name!r} is of type {kind!r}")
             return
         raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
@@ -181,6 +180,8 @@ def _read_joint(element, machine, of_model, version, notes):
         if link not in machine.links and link != _WORLD:
             raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
         ends.append(GROUND if link == _WORLD else link)
+    if ends[0] == ends[1]:
+        raise ValueError(f"{element.where}parent and child of joint {name!r} are the same, {link!r}.")
     child = machine.links.get(ends[1], Link(GROUND))
     position, rotation = _pose(element, notes)
     frame = child.rotation @ rotation

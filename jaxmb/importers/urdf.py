@@ -170,9 +170,10 @@ def _place(machine, joints, base, root):
     of_parent: dict[str, list[Any]] = {}
     for own in joints:
         of_parent.setdefault(own[0].parent, []).append(own)
-    queue = [roots[0]]
+    queue, unreached = [roots[0]], set(machine.links)
     while queue:
         parent = machine.links[queue.pop()]
+        unreached.remove(parent.name)
         for joint, element, (position, rotation) in of_parent.get(parent.name, ()):
             child = machine.links[joint.child]
             child.position = parent.position + parent.rotation @ position
@@ -181,6 +182,9 @@ def _place(machine, joints, base, root):
             queue.append(child.name)
             if element.attributes["type"] == "planar":
                 _spread(machine, joint)
+    if unreached:
+        listed = ", ".join(map(repr, sorted(unreached)))
+        raise ValueError(f"{root.where}the links make no tree: no joints lead from {roots[0]!r} to {listed}.")
 
 
 def _spread(machine, joint):

@@ -58,13 +58,23 @@ class Element:
             return default
         return float(self.numbers(self.attributes[name], 1)[0])
 
+    def skip(self) -> None:
+        """Take all that is in the element as read."""
+        below = list(self.children)
+        while below:
+            child = below.pop()
+            child.read = True
+            below += child.children
+
     def unread(self) -> Iterator["Element"]:
         """Elements that nothing has asked for, the outermost of them."""
-        for child in self.children:
-            if not child.read:
-                yield child
+        below = self.children[::-1]
+        while below:
+            child = below.pop()
+            if child.read:
+                below += child.children[::-1]
             else:
-                yield from child.unread()
+                yield child
 
 
 def parse(text: str, file: str) -> Element:
