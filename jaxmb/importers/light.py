@@ -43,7 +43,8 @@ def without_ends(machine: Machine, notes: Notes) -> None:
         held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
         held.update(of[link] for loop in machine.loops for link in (loop.link_a, loop.link_b))
         held.update(of[link] for tendon in machine.tendons for link, _ in tendon.points)
-        ends = {body: None for body in of.values() if body not in heavy and held[body] == 0}
+        # Bodies to leave out, and the joints that they hang at.
+        ends: dict[str, str | None] = {body: None for body in of.values() if body not in heavy and held[body] == 0}
         for joint in moving:
             for link in (joint.parent, joint.child):
                 if of[link] not in heavy and held[of[link]] == 1 and _alone(machine, notes, joint):
