@@ -35,11 +35,13 @@ TREES = {
     "leap hand": ("playground", f"{PLAYGROUND}manipulation/leap_hand/xmls/leap_rh_mjx.xml"),
     "h1": ("playground", f"{PLAYGROUND}locomotion/h1/xmls/h1_mjx_feetonly.xml"),
 }
-# What a fluid would do is left out.
+# What a fluid would do is left out, and a height field whose file is missing.
 SWIMMERS = {
     "fish": ("dm_control", "suite/fish.xml"),
     "box": ("brax", "test_data/fluid_box_offset_com.xml"),
     "ellipsoid": ("brax", "test_data/fluid_ellipsoid.xml"),
+    "two spheres": ("brax", "test_data/fluid_two_spheres.xml"),
+    "go1 on hills": ("playground", f"{PLAYGROUND}locomotion/go1/xmls/scene_mjx_feetonly_rough_terrain.xml"),
 }
 # Robots whose pictures have wrong numbers, with ball joints of Bullet, or with empty lines before their XML.
 URDF = {
