@@ -298,10 +298,10 @@ def test_axes_of_sdf_by_its_version(version, inside, axis, kind):
     text = model(link, turned, own).replace("version='1.6'", f"version='{version}'")
     # The link's y axis is the model's x axis, which is the world's; the model's y axis is the world's z axis.
     found = part(importers.sdf(text), "j 1 j 2" if kind == "universal" else "j")
-    first = found.axis_a_W if kind == "universal" else found.axis_a
+    first = found.axes[0] if kind == "universal" else found.axis_a
     np.testing.assert_allclose(first, axis, atol=1e-15)
     if kind == "universal":
-        np.testing.assert_allclose(found.axis_b_W, (0, -1, 0), atol=1e-15)
+        np.testing.assert_allclose(found.axes[1], (0, -1, 0), atol=1e-15)
 
 
 def test_the_inertia_that_sdf_has_by_default():
