@@ -304,7 +304,7 @@ class _Builder:
             own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros[1:]}
             if len(ends) == 2:
                 own = {field: values[0] for field, values in own.items()}
-            self.joints.append(JointCoupling(name, names[0], tuple(names[1:]), zero=zeros[0], **own))
+            self.joints.append(JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=zeros[0], **own))
             for other, powers, zero in coupling.others:
                 if not coupling.of_tendons and not self._turns_without_end(coupling.joint, powers):
                     self._seen_up_to_half_a_turn(other, coupling.name, zero)

@@ -194,18 +194,19 @@ class AbstractBodySystem(AbstractBodies):
         return parameter_paths(self._gravity_name, self._groups, self.servos)
 
     def with_frames_of(self, before):
+        centre: Any = lambda group: getattr(group.group.part, "centre", None)
+        pairs = zip(self.bodies, before.bodies, strict=True)
+        changed = [(group, centre(group) - centre(old)) for group, old in pairs if centre(group) is not centre(old)]
+        if not changed:
+            return self
         space, q, u = self.layout.space, self.guess.q, self.guess.u
         poses, velocities = self.poses(q), self.velocities(u)
-        for group, old in zip(self.bodies, before.bodies, strict=True):
-            centre, was = getattr(group.group.part, "centre", None), getattr(old.group.part, "centre", None)
-            if centre is None or centre is was:
-                continue
+        for group, moved in changed:
             bodies, d = group.group.body_index[:, 0], space.dimension
-            moved = jax.vmap(space.direction)(poses[bodies], centre - was)
-            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], centre - was)
-            q = q.at[self.layout.pose_index[bodies, :d]].add(moved)
+            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], moved)
+            q = q.at[self.layout.pose_index[bodies, :d]].add(jax.vmap(space.direction)(poses[bodies], moved))
             u = u.at[self.layout.velocity_index[bodies, :d]].set(velocity)
-        return self if q is self.guess.q else dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
+        return dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
 
     def positive_parameters(self):
         return frozenset(positive_parameters(self._groups))

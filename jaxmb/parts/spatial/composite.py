@@ -66,7 +66,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     points_W: fields.Number = fields.point(body=None, shape=(None, "d"), gives=("points",), needed=False)
     orientation: fields.Number = fields.attitude(optional=True)
     middle: fields.Number = fields.parameter(unit="rad", optional=True)
-    periodic: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
 
     @property
     def rows(self):

@@ -19,7 +19,7 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory
 from .loss import Loss
-from .measurements import Measurements
+from .measurements import Measurements, have_times
 from .sensors import Channel, Rows, Sensor, readings_of
 
 # The name of a residual function's result among the readings.
@@ -180,10 +180,11 @@ def _of_user(residuals: Array, loss: Loss) -> Rows:
 
 def with_times(experiment: Experiment, where: str = "") -> Experiment:
     """An experiment with what was measured by name, and with times, whatever they were read from."""
-    if isinstance(experiment.measured, Measurements):
+    measured: Any = experiment.measured
+    if have_times(measured):
         if experiment.ts is not None:
             raise ValueError(f"Measurements{where} have their own times; leave out ts.")
-        experiment = dataclasses.replace(experiment, measured=experiment.measured.values, ts=experiment.measured.ts)
+        experiment = dataclasses.replace(experiment, measured=measured.values, ts=measured.ts)
     if experiment.ts is None:
         raise ValueError(f"ts{where} is missing: the times of what was measured.")
     return experiment
@@ -211,8 +212,8 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
 
 def _by_name(experiment: Experiment) -> Mapping[str, VectorLike] | None:
     """What was measured, of an experiment as `with_times` returns it."""
-    assert not isinstance(experiment.measured, Measurements)
-    return experiment.measured
+    measured: Any = experiment.measured
+    return measured
 
 
 def checked_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:

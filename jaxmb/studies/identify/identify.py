@@ -19,7 +19,7 @@ from ..ranges import Bounds
 from .experiment import Experiment, with_times
 from .identification import Identification, identification
 from .loss import loss_named
-from .measurements import Measurements
+from .measurements import Measurements, have_times
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
 from .sensors import Sensor
 from .shooting import shoot
@@ -182,7 +182,7 @@ def identify(
 
 def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> tuple[Problem, bool]:
     """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
-    if isinstance(measured, Mapping | Measurements) or measured is None:
+    if measured is None or isinstance(measured, Mapping) or have_times(measured):
         experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]

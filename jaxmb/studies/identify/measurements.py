@@ -21,6 +21,11 @@ class Measurements(NamedTuple):
     values: dict[str, np.ndarray]
 
 
+def have_times(measured: Any) -> bool:
+    """Whether measured data have values by name and their own times, as `Measurements` do."""
+    return hasattr(measured, "ts") and isinstance(getattr(measured, "values", None), Mapping)
+
+
 def read_measurements(
     source: str | Path | Any, columns: Mapping[str, str | Sequence[str]] | None = None, *, time: str = "t"
 ) -> Measurements:
