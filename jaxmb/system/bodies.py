@@ -194,17 +194,18 @@ class AbstractBodySystem(AbstractBodies):
         return parameter_paths(self._gravity_name, self._groups, self.servos)
 
     def with_frames_of(self, before):
-        centre: Any = lambda group: getattr(group.group.part, "centre", None)
+        centre = lambda group: getattr(group.group.part, "centre", None)
         pairs = zip(self.bodies, before.bodies, strict=True)
-        changed = [(group, centre(group) - centre(old)) for group, old in pairs if centre(group) is not centre(old)]
+        moved = [(group, centre(group), centre(old)) for group, old in pairs]
+        changed = [(group, new - old) for group, new, old in moved if new is not None and new is not old]
         if not changed:
             return self
         space, q, u = self.layout.space, self.guess.q, self.guess.u
         poses, velocities = self.poses(q), self.velocities(u)
-        for group, moved in changed:
+        for group, shift in changed:
             bodies, d = group.group.body_index[:, 0], space.dimension
-            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], moved)
-            q = q.at[self.layout.pose_index[bodies, :d]].add(jax.vmap(space.direction)(poses[bodies], moved))
+            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], shift)
+            q = q.at[self.layout.pose_index[bodies, :d]].add(jax.vmap(space.direction)(poses[bodies], shift))
             u = u.at[self.layout.velocity_index[bodies, :d]].set(velocity)
         return dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
 
