@@ -166,7 +166,7 @@ CASES = {
         3, world(spatial.Planar), of_b(lambda q, point, a, b, x: move(q[1], turn(a, x[2]), point, in_plane(a, x)))
     ),
     "Fixed": Case(6, ball(spatial.Fixed), of_b(lambda q, point, a, b, x: q[1])),
-    "Composite of two hinges apart": composite("hinge", "hinge", apart=True),
+    "Composite": composite("hinge", "hinge", apart=True),
     "Composite of all kinds": composite("hinge", "slide", "hinge", "slide", "hinge", apart=True),
     "Distance": Case(1, link, of_b(on_link)),
     "PointOnPlane": Case(
