@@ -31,12 +31,11 @@ _ROUNDING = 1e-3
 
 
 class Scalar(NamedTuple):
-    """A scalar coordinate of the scene: the name of the file's joint or, if it is `of_tendon`, tendon; what must be
-    added to it to give the coordinate of the file; and whether it `moves`, see `ScalarCoordinate` of `jaxmb.parts`.
+    """A scalar coordinate of the scene: the name of the file's joint or, if it is `of_tendon`, tendon; and whether it
+    `moves`, see `ScalarCoordinate` of `jaxmb.parts`.
     """
 
     name: str
-    offset: float
     of_tendon: bool = False
     moves: bool = True
 
@@ -45,13 +44,13 @@ class Scalar(NamedTuple):
 class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
-    **Fields:** `coordinates`: for each joint the coordinate's name or None, and what must be added to it to give that
-    of the file; `controls`: for each actuator the name of its control; `fused`: what links became; `scalars`: the
-    scalar coordinates of the scene in order; `shapes` and `collision_shapes` of bodies by name.
+    **Fields:** `coordinates`: for each joint the name of its coordinate, whose values are those of the file, or None;
+    `controls`: for each actuator the name of its control; `fused`: what links became; `scalars`: the scalar coordinates
+    of the scene in order; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
-    coordinates: dict[str, tuple[str | None, float]]
+    coordinates: dict[str, str | None]
     controls: dict[str, str]
     fused: Fused
     scalars: list[Scalar]
@@ -76,12 +75,12 @@ class _Builder:
         self.joints: list[Any] = []
         self.forces: list[Any] = []
         self.frames: list[Any] = []
-        self.coordinates: dict[str, tuple[str | None, float]] = {}
+        self.coordinates: dict[str, str | None] = {}
         self.controls: dict[str, str] = {}
         self.scalars: list[Scalar] = []
         self.counted: dict[str, str] = {}
         self.names: set[str] = {GROUND}
-        self.tendons: dict[str, tuple[str, float]] = {}
+        self.tendons: dict[str, str | None] = {}
 
     def build(self) -> Built:
         machine, none = self.machine, cast(Any, None)
@@ -156,7 +155,7 @@ class _Builder:
                 found.half_turn,
             )
         self.joints += found.parts
-        self.coordinates |= {joint: (coordinate, 0.0) for joint, coordinate in found.coordinates.items()}
+        self.coordinates |= found.coordinates
         for joint in joints:
             self._passive(joint, a.name, b)
 
@@ -167,7 +166,7 @@ class _Builder:
 
     def _passive(self, joint: Joint, a: str, b: chains.Body):
         """What acts on a joint of itself."""
-        coordinate, offset = self.coordinates[joint.name]
+        coordinate = self.coordinates[joint.name]
         values = {
             "springs": joint.stiffness,
             "damping": joint.damping,
@@ -183,22 +182,22 @@ class _Builder:
             self.forces.append(
                 JointSpring(
                     self._named(f"{joint.name} spring"),
-                    self._counted(joint.name, coordinate, offset) if "springs" in wanted else coordinate,
+                    self._counted(joint.name, coordinate) if "springs" in wanted else coordinate,
                     stiffness=joint.stiffness if "springs" in wanted else 0.0,
                     damping=joint.damping if "damping" in wanted else 0.0,
-                    free=joint.free - offset,
-                    middle=None if _near(joint, joint.free) else self._middle(joint.name) - offset,
+                    free=joint.free,
+                    middle=None if _near(joint, joint.free) else self._middle(joint.name),
                 )
             )
         if "armature" in wanted:
-            self._inertia(joint.name, coordinate, offset, joint.armature)
+            self._inertia(joint.name, coordinate, joint.armature)
         if "friction" in wanted:
             self._friction(joint.name, coordinate, joint.friction)
         if "limits" in wanted:
             inertia, time = joint.stop or (self.fused.moved_inertia(joint) + joint.armature, STOP_TIME)
-            self._stop(joint.name, coordinate, joint.limits, offset, inertia, time, turns=joint.kind == "hinge")
+            self._stop(joint.name, coordinate, joint.limits, inertia, time, turns=joint.kind == "hinge")
 
-    def _counted(self, name, coordinate, offset):
+    def _counted(self, name, coordinate):
         """The coordinate of a joint for springs and servos: of a hinge that may turn as it likes, the length of a cord
         that it winds up, which counts on through full turns.
         """
@@ -208,7 +207,7 @@ class _Builder:
         if name not in self.counted:
             cord = self._named(f"{name} turns")
             self.joints.append(FixedTendon(cord, coordinate, coefficients=(1.0,)))
-            self.scalars.append(Scalar(name, offset, moves=False))
+            self.scalars.append(Scalar(name, moves=False))
             self.counted[name] = f"{cord}.length"
         return self.counted[name]
 
@@ -227,15 +226,15 @@ class _Builder:
         for kind in sorted(left):
             self.notes.refuse(kind, joint.name, f"{joint.where}{kind} of the {joint.kind} joint {joint.name!r}")
 
-    def _inertia(self, name, coordinate, offset, armature, *, of_tendon=False):
+    def _inertia(self, name, coordinate, armature, *, of_tendon=False):
         self.joints.append(JointInertia(self._named(f"{name} armature"), coordinate, inertia=armature))
-        self.scalars.append(Scalar(name, offset, of_tendon))
+        self.scalars.append(Scalar(name, of_tendon))
 
     def _friction(self, name, coordinate, force):
         self.forces.append(JointFriction(self._named(f"{name} friction"), coordinate, force=force))
         self.notes.say("Dry friction is force · tanh(rate / transition_speed), so that joints at rest creep: {}.", name)
 
-    def _stop(self, name, coordinate, limits, offset, inertia, time, *, turns):
+    def _stop(self, name, coordinate, limits, inertia, time, *, turns):
         lower, upper = limits
         if turns and upper - lower >= 2 * np.pi:
             self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
@@ -245,8 +244,8 @@ class _Builder:
             JointStop(
                 self._named(f"{name} stop"),
                 coordinate,
-                lower=lower - offset,
-                upper=upper - offset,
+                lower=lower,
+                upper=upper,
                 smoothing=_ROUNDING * (upper - lower),
                 **own,
             )
@@ -283,28 +282,27 @@ class _Builder:
             if self.notes.leaves_out("couplings", coupling.name):
                 continue
             known = self.tendons if coupling.of_tendons else self.coordinates
-            ends = [(coupling.joint, coupling.zero), *((other, zero) for other, _, zero in coupling.others)]
-            names: list[str] = []
-            zeros: list[float] = []
-            for joint, zero in ends:
-                name, offset = self._coordinate(joint, "couplings", coupling.name, known)
-                names += [] if name is None else [name]
-                zeros.append(zero - offset)
+            ends = coupling.joint, *(other for other, _, _ in coupling.others)
+            found = [self._coordinate(end, "couplings", coupling.name, known) for end in ends]
+            names = [name for name in found if name is not None]
             if len(names) < len(ends):
                 continue
             name = self._named(coupling.name, "coupling")
             if len(ends) == 1:
-                self.joints.append(JointDriver(name, names[0], value=zeros[0] + coupling.constant))
+                self.joints.append(JointDriver(name, names[0], value=coupling.zero + coupling.constant))
                 continue
             size = max(len(np.trim_zeros(powers, "b")) for _, powers, _ in coupling.others)
             coefficients = np.zeros((len(coupling.others), 1 + size))
             coefficients[0, 0] = coupling.constant
             for row, (_, powers, _) in zip(coefficients, coupling.others, strict=True):
                 row[1 : 1 + len(powers)] = powers[:size]
-            own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros[1:]}
+            zeros = [zero for _, _, zero in coupling.others]
+            own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros}
             if len(ends) == 2:
                 own = {field: values[0] for field, values in own.items()}
-            self.joints.append(JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=zeros[0], **own))
+            self.joints.append(
+                JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=coupling.zero, **own)
+            )
             for other, powers, zero in coupling.others:
                 if not coupling.of_tendons and not self._turns_without_end(coupling.joint, powers):
                     self._seen_up_to_half_a_turn(other, coupling.name, zero)
@@ -314,11 +312,11 @@ class _Builder:
         return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
     def _coordinate(self, what, kind, of, known=None):
-        """The coordinate of a joint, or of something else that is known, and what must be added to it."""
-        name, offset = (self.coordinates if known is None else known).get(what, (None, 0.0))
+        """The coordinate of a joint, or of something else that is known."""
+        name = (self.coordinates if known is None else known).get(what)
         if name is None:
             self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate of its own")
-        return name, offset
+        return name
 
     # Tendons and actuators
 
@@ -327,50 +325,45 @@ class _Builder:
             if self.notes.leaves_out("tendons", tendon.name):
                 continue
             if tendon.points:
-                name, offset = self._named(tendon.name, "tendon"), 0.0
+                name = self._named(tendon.name, "tendon")
                 self.joints.append(Tendon(name, [self.fused.point(link, point) for link, point in tendon.points]))
             else:
-                found = [(self._coordinate(joint, "tendons", tendon.name), c) for joint, c in tendon.joints]
-                if any(coordinate is None for (coordinate, _), _ in found):
+                along = [self._coordinate(joint, "tendons", tendon.name) for joint, _ in tendon.joints]
+                if None in along:
                     continue
                 name = self._named(tendon.name, "tendon")
-                for (_, own), (joint, _) in zip((each for each, _ in found), tendon.joints, strict=True):
-                    if self.of_name[joint].kind == "hinge":
-                        self.scalars.append(Scalar(joint, own, moves=False))
-                along, coefficients = [own for (own, _), _ in found], [c for _, c in found]
-                offset = sum(c * own for (_, own), c in found)
-                self.joints.append(FixedTendon(name, along, coefficients=coefficients))
-            self.tendons[tendon.name] = (f"{name}.length", offset)
-            self._of_tendon(tendon, f"{name}.length", offset)
+                hinges = [joint for joint, _ in tendon.joints if self.of_name[joint].kind == "hinge"]
+                self.scalars += [Scalar(joint, moves=False) for joint in hinges]
+                self.joints.append(FixedTendon(name, along, coefficients=[c for _, c in tendon.joints]))
+            self.tendons[tendon.name] = f"{name}.length"
+            self._of_tendon(tendon, f"{name}.length")
 
-    def _of_tendon(self, tendon, coordinate, offset):
+    def _of_tendon(self, tendon, coordinate):
         if tendon.stiffness or tendon.damping:
             own: dict[str, Any] = {
                 "stiffness": tendon.stiffness,
                 "damping": tendon.damping,
-                "free": tendon.free - offset,
+                "free": tendon.free,
             }
             self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
         if tendon.armature and not self.notes.leaves_out("armature", tendon.name):
-            self._inertia(tendon.name, coordinate, offset, tendon.armature, of_tendon=True)
+            self._inertia(tendon.name, coordinate, tendon.armature, of_tendon=True)
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
             self._friction(tendon.name, coordinate, tendon.friction)
         if tendon.limits is not None and not self.notes.leaves_out("limits", tendon.name):
             inertia, time = tendon.stop or (1.0, STOP_TIME)
-            self._stop(tendon.name, coordinate, tendon.limits, offset, inertia, time, turns=False)
+            self._stop(tendon.name, coordinate, tendon.limits, inertia, time, turns=False)
 
     def _actuators(self):
         for actuator in self.machine.actuators:
             if self.notes.leaves_out("actuators", actuator.name):
                 continue
             known = self.tendons if actuator.on_tendon else self.coordinates
-            coordinate, offset = self._coordinate(actuator.of, "actuators", actuator.name, known)
+            coordinate = self._coordinate(actuator.of, "actuators", actuator.name, known)
             if coordinate is None:
                 continue
             if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
-                coordinate = self._counted(actuator.of, coordinate, offset)
-            gear, shift = actuator.gear, actuator.gear * offset
-            shifted = lambda own, shift=shift: (own[0] + own[1] * shift, own[1], own[2])
+                coordinate = self._counted(actuator.of, coordinate)
             ranges = {name: getattr(actuator, name) for name in ("control_range", "force_range")}
             name = self._named(actuator.name, "actuator")
             self.controls[actuator.name] = f"{name}.control"
@@ -379,10 +372,10 @@ class _Builder:
                     name,
                     coordinate,
                     control=actuator.control,
-                    gear=gear,
-                    gain=shifted(actuator.gain),
-                    bias=shifted(actuator.bias),
-                    middle=0.0 if actuator.on_tendon else self._middle(actuator.of) - offset,
+                    gear=actuator.gear,
+                    gain=actuator.gain,
+                    bias=actuator.bias,
+                    middle=0.0 if actuator.on_tendon else self._middle(actuator.of),
                     lag=actuator.lag,
                     **ranges,
                 )

@@ -76,7 +76,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
         mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or f"key {k}": locate(model.key_qpos[k], model.key_qvel[k])
         for k in range(model.nkey)
     }
-    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
+    coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
     seen = built.shapes, built.collision_shapes
     return ImportedModel(
         names.model, built.scene, tuple(said), coordinates, built.controls, states, *seen, said, locate
@@ -322,7 +322,7 @@ class _Locate:
             u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
         for k, own in self._scalars:
             value = data.ten_length[k] if own.of_tendon else data.qpos[model.jnt_qposadr[k]]
-            q.append(value - own.offset)
+            q.append(value)
             if own.moves:
                 u.append(data.ten_velocity[k] if own.of_tendon else data.qvel[model.jnt_dofadr[k]])
         return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))

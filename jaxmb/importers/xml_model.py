@@ -25,7 +25,7 @@ def model_of(root: Element, machine: Machine, notes: Notes, file: str, effectles
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
     built = build(machine, notes)
-    coordinates = {joint: name for joint, (name, _) in built.coordinates.items() if name is not None}
+    coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
     said = notes.finish(file)
     return ImportedModel(
         machine.name,
