@@ -188,7 +188,10 @@ INSTANTS = {
         named("spatial", "Spherical", "Revolute", "Universal", "Gimbal", "Cylindrical"),
         UdwadiaKalaba(),
     ),
-    "spatial slides": (named("spatial", "Screw", "Prismatic", "Planar", "Fixed", "Composite"), UdwadiaKalaba("inverses")),
+    "spatial slides": (
+        named("spatial", "Screw", "Prismatic", "Planar", "Fixed", "Composite"),
+        UdwadiaKalaba("inverses"),
+    ),
     "spatial points": (named("spatial", "Distance", "PointOnPlane", "PointOnLine", "Driver"), NullSpace()),
     "spatial rolling": (named("spatial", "KnifeEdge", "RollingDisk", "RollingSphere"), UdwadiaKalaba("singular_mass")),
     "spatial friction": ([parts.rubbing_3d()], Partitioned()),
