@@ -198,7 +198,7 @@ def test_derivatives_of_a_wheel_with_a_rotor_and_a_cord():
 def geared(n):
     """Links on hinges that are not parallel, one after the other, and a drive with much inertia on each."""
     point = lambda k: np.array([0.4 * k, 0.05 * (-1) ** k, 0.0])
-    axis = lambda k: (0.0, 1.0, 0.3 * (-1) ** k)
+    axis = lambda k: (0.0, 0.96, 0.28 * (-1) ** k)
     bodies = [
         spatial.Body(f"link{k}", mass=1.0, inertia=0.2 * J, position=(point(k) + point(k + 1)) / 2) for k in range(n)
     ]
@@ -214,14 +214,15 @@ def geared(n):
 def test_sparse_elimination():
     """Of many links: the accelerations of dense matrices, and by two methods the same motion."""
     system = geared(8)
-    assert system.elimination is not None and system.implicit_in_blocks
+    assert system.elimination is not None
     start = mb.assemble(system, rates={f"hinge{k}.angle": 0.5 for k in range(8)})
     sparse, dense = (
         accelerations(system, FORMULATIONS[name], 0.0, start.q, start.u)[0] for name in ("multipliers", "null_space")
     )
     np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-10 * np.max(np.abs(dense)))
     ts = np.linspace(0.0, 0.5, 3)
-    ends = [mb.simulate(system, start, t1=0.5, rtol=1e-9, saveat=ts, solver=own) for own in (None, Hermite())]
+    partitioned = {"solver": Hermite(), "manifold": mb.manifold.Partition()}
+    ends = [mb.simulate(system, start, t1=0.5, rtol=1e-9, saveat=ts, **own) for own in ({}, partitioned)]
     np.testing.assert_allclose(ends[1].ys.q, ends[0].ys.q, rtol=0, atol=1e-7)
     for motion in ends:
         assert np.max(motion.constraint_violation) < 1e-10
@@ -250,7 +251,7 @@ def test_a_geared_flywheel_moves_the_same():
 
 @pytest.mark.long
 def test_linear_and_steady_motion():
-    """Vibration of a hinge with a spring, and a wheel with a rotor that turns."""
+    """Vibration of a hinge with a spring, and a wheel with a rotor that turns steadily."""
     rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.0, 0.0))
     hip = planar.Revolute("hip", "ground", "rod", point=(0.0, 0.0))
     spring = mb.JointSpring("spring", "hip.angle", stiffness=8.0, free=0.0)
@@ -259,7 +260,10 @@ def test_linear_and_steady_motion():
     eigenvalues = mb.linearise(system, mb.assemble(system)).eigenvalues
     np.testing.assert_allclose(np.abs(np.imag(eigenvalues)), np.sqrt(8.0 / (0.1 + INERTIA)), rtol=1e-9)
 
-    free = mb.with_parameters(wheel(), {"spring.stiffness": 0.0})
+    wheel = spatial.Body("wheel", mass=1.0, inertia=J)
+    axle = spatial.Revolute("axle", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=Z)
+    own = mb.JointInertia("rotor", "axle.angle", inertia=INERTIA)
+    free = mb.Scene([wheel], joints=[axle, own]).compile()
     state = mb.steady_motion(free, mb.assemble(free), rates={"axle.angle": 3.0})
     assert float(state.u[-1]) == pytest.approx(3.0, rel=1e-9)
 

@@ -71,7 +71,7 @@ def root_locus(
     - `state(system)`: the equilibrium or steady motion of each system, such as `mb.equilibrium`; not with a function.
     - `t`, `coordinates`, `rates`: as in `linearise`.
 
-    All values are computed in one batch, so functions must be traceable by JAX.
+    All values are computed in one program, so functions must be traceable by JAX.
 
     **Returns:** a `RootLocus`, with NumPy arrays.
 
@@ -87,11 +87,12 @@ def root_locus(
     first = linearise(*case(given[0]), t=t, coordinates=coordinates, rates=rates)
     chosen = first.states[: first.coordinates], first.states[first.coordinates :]
 
-    @eqx.filter_jit
-    @jax.vmap
-    def of_all(value):
+    def of_one(value):
         linear = linearise(*case(value), t=t, coordinates=chosen[0], rates=chosen[1])
         return linear.eigenvalues, linear.basis.astype(linear.vectors.dtype) @ linear.vectors
+
+    # A loop: in a batch two LAPACK routines at once may wait for each other's threads for ever, on two cores.
+    of_all = eqx.filter_jit(lambda values: jax.lax.map(of_one, values))
 
     found, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
     bad = ~np.all(np.isfinite(found), axis=1)
