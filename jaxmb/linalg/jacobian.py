@@ -17,7 +17,7 @@ from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor,
 from .rotations import norm
 
 # A solution is refined until its rows are met to this many rounding errors of what adds up in them, or as often.
-_ROUNDING = 128
+_ROUNDING = 512
 _REFINEMENTS = 4
 
 
