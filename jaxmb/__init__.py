@@ -16,6 +16,8 @@ from . import (
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from ._version import __version__ as __version__
+from .bodies import RigidBodySystem as RigidBodySystem
+from .bodies.scene import Scene as Scene
 from .linalg import rotations as rotations
 from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.actuators import Actuator as Actuator
@@ -37,7 +39,6 @@ from .parts.joint_laws import (
 from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
 from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
-from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
@@ -62,7 +63,6 @@ from .studies.linear import (
 from .studies.optimise import Optimum as Optimum, optimise as optimise, robust as robust
 from .studies.sweep import cases as cases, load_sweep as load_sweep, sweep as sweep
 from .system import (
-    RigidBodySystem as RigidBodySystem,
     Variable as Variable,
     design as design,
     parameters as parameters,

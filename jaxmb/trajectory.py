@@ -20,7 +20,7 @@ from .formulations import AbstractFormulation, accelerations
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import unknown
 from .system import Reaction, Solved
-from .system.violation import row_sizes
+from .system.residuals import row_sizes
 
 
 class ConstraintViolation(NamedTuple):

@@ -11,7 +11,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.system.joint_graph import joint_order
+from jaxmb.bodies.joint_graph import joint_order
 
 METHOD: dict[str, Any] = {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Projection(), "max_steps": 3000}
 FIXED: dict[str, Any] = METHOD | {"stepsize_controller": diffrax.ConstantStepSize()}

@@ -15,8 +15,8 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import lagrangian, mechanisms, planar, spatial
+from jaxmb.bodies import independence, structure
 from jaxmb.manifold import Baumgarte
-from jaxmb.states import independence, structure
 
 GRAVITY = mb.Gravity((0.0, -9.81))
 

@@ -12,14 +12,14 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.bodies.block_cut_tree import components
+from jaxmb.bodies.independence import Part, subsets
+from jaxmb.bodies.joint_graph import joint_order
+from jaxmb.bodies.layout import Layout
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.formulations.formulation import pivoted_jacobian
 from jaxmb.manifold import Partition, Projection
 from jaxmb.parts.spatial.kinematics import SPACE
-from jaxmb.states.independence import Part, subsets
-from jaxmb.system.block_cut_tree import components
-from jaxmb.system.joint_graph import joint_order
-from jaxmb.system.layout import Layout
 
 
 def by_blocks(system):

@@ -12,8 +12,8 @@ from compiling import jit_quickly
 from oracles import large
 
 import jaxmb as mb
+from jaxmb.bodies import structure
 from jaxmb.mechanisms.observe import point_motion
-from jaxmb.states import structure
 
 TIMES = np.array([0.2, 0.4, 0.6, 0.8])
 

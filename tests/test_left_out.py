@@ -14,11 +14,11 @@ from jax.extend import core
 
 import jaxmb as mb
 from jaxmb import lagrangian, planar, spatial
+from jaxmb.bodies import rigid_bodies
 from jaxmb.formulations import formulation
 from jaxmb.linalg import elimination, rotations
 from jaxmb.manifold import constrained, orthogonal_projection, partition
 from jaxmb.parts import contact
-from jaxmb.system import rigid_bodies
 
 
 def primitives(jaxpr) -> Counter:

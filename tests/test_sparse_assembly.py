@@ -9,9 +9,9 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.states import closest
 from jaxmb.states.closest_sparse import sparse_configuration, sparse_velocities
-from jaxmb.system.joint_graph import joint_order
 
 
 def planar_tree(n=15, **options):

@@ -14,10 +14,10 @@ from oracles.sprung_chain import sprung_chain
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.bodies.field_jacobian import motion_jacobian
 from jaxmb.linalg.block_lu import eliminate_unsymmetric
 from jaxmb.linalg.elimination_order import order_nodes
 from jaxmb.manifold import Partition, Projection, Unconstrained, default_manifold
-from jaxmb.manifold.motion_jacobian import motion_jacobian
 from jaxmb.solvers import Hermite
 from jaxmb.solvers._structured import StructuredInverses, _spectrum
 

@@ -8,9 +8,9 @@ from oracles import tracked_vehicle as oracle
 from scipy.spatial import ConvexHull
 
 from jaxmb import planar
+from jaxmb.bodies.groups import stack
+from jaxmb.bodies.layout import Layout
 from jaxmb.parts.planar.kinematics import PLANE
-from jaxmb.system.groups import stack
-from jaxmb.system.layout import Layout
 
 RADII = np.array([0.3, 0.25, 0.2, 0.35])
 PATH = [("hull", (2.0, 0.1)), ("hull", (-2.0, 0.0)), ("rear", (0.0, 0.0)), ("front", (0.1, 0.0))]

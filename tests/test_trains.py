@@ -14,11 +14,11 @@ from oracles import trains as oracle
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.formulations import Multipliers, Poincare, accelerations
 from jaxmb.manifold import Partition, Projection
 from jaxmb.mechanisms._relative import velocities
 from jaxmb.mechanisms.train import coupler_forces
-from jaxmb.system.joint_graph import joint_order
 
 # A draft gear that is a linear spring.
 LINEAR = functools.partial(planar.DraftGear, stiffness=2e7, unloading=1.0, preload=0.0, slack=0.0, travel=10.0)

@@ -19,7 +19,7 @@ from ..linalg.elimination import eliminate, full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..linalg.newton import root
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 from .friction import find_multipliers
 
 if TYPE_CHECKING:
@@ -60,20 +60,22 @@ class AbstractFormulation(eqx.Module):
         return self
 
 
-def pivoted_jacobian(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> DenseJacobian:
+def pivoted_jacobian(
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
+) -> DenseJacobian:
     """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
     jacobian = system.jacobian(t, q, u)
     pivots = full_pivot(jacobian, scale=system.velocity_scale(), level=row_levels(system))
     return DenseJacobian(jacobian, eliminate(jacobian, pivots.order, system.acceleration_rank))
 
 
-def row_levels(system: AbstractSystem) -> Array:
+def row_levels(system: AbstractEquation) -> Array:
     """Holonomic rows before nonholonomic ones before those of accelerations, so that the dependent velocities nest."""
     row = jnp.arange(system.acceleration_rows)
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
 
 
-def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None:
+def check_mass(system: AbstractEquation, formulation: AbstractFormulation) -> None:
     """Raise a `ValueError` for a formulation that needs the inverse of a mass matrix that is singular."""
     if formulation.inverts_mass and not system.positive_definite_mass:
         raise ValueError(
@@ -83,7 +85,7 @@ def check_mass(system: AbstractSystem, formulation: AbstractFormulation) -> None
 
 
 def accelerations(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],
@@ -122,7 +124,7 @@ class Solution(NamedTuple):
 
 
 def solve_constrained(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],
@@ -168,7 +170,7 @@ def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
 
 
 def friction_coupling(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from ..bodies.scene import Scene
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, Tendon
 from ..parts.forces import Damper, Gravity, PointForce
@@ -17,7 +18,6 @@ from ..parts.spatial.bodies import Body
 from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Spherical
-from ..scene import Scene
 from . import chains
 from .description import Joint, Machine, quaternion
 from .fuse import Fused, fuse

@@ -7,8 +7,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from .._types import State
+from ..bodies import RigidBodySystem
 from ..parts.base import GROUND
-from ..system import RigidBodySystem
 from .description import matrix
 from .export_forces import write_forces
 from .export_tree import Node, Tree, numbers, spanning_tree

@@ -5,9 +5,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..bodies import RigidBodySystem
 from ..parts.base import AbstractInertialConstraint
 from ..parts.spatial.kinematics import SPACE
-from ..system import RigidBodySystem
 from .description import matrix, quaternion
 from .export_tree import Tree, numbers, parts_of
 from .notes import Notes

@@ -8,11 +8,11 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 
+from ..bodies import RigidBodySystem
 from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.on_frames import framed
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
-from ..system import RigidBodySystem
 from .description import matrix, turned
 from .notes import Notes
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from .._types import State
+from ..bodies.scene import Scene
 from ..parts.shapes import AbstractShape
-from ..scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,10 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, State
 from ..parts.series import AbstractSignal
-from ..system import AbstractGeneralizedSystem, DenseInertia, DiagonalInertia
-from ..system.describe import count_independent, count_rows, shorten, specialised_constraints
-from ..system.description import Description
+from ..system import AbstractSystem, DenseInertia, DiagonalInertia
+from ..system.catalogue import ParameterPath
+from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
 from ..system.design_variables import DesignVariables, description_rows
-from ..system.equation import ParameterPath
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics
 from .nonideal import AbstractNonIdealForce
@@ -47,7 +46,7 @@ class Input(eqx.Module):
     binds: bool = eqx.field(static=True)
 
 
-class AbstractLagrangian(AbstractGeneralizedSystem):
+class AbstractLagrangian(AbstractSystem):
     """The functions of a Lagrangian system, and every kernel that follows from them by automatic differentiation.
 
     **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
@@ -86,10 +85,6 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     @property
     def position_rows(self) -> int:
         return self._rows(0)
-
-    @property
-    def coordinate_rows(self) -> int:
-        return self.position_rows
 
     @property
     def velocity_rows(self) -> int:
@@ -138,26 +133,16 @@ class AbstractLagrangian(AbstractGeneralizedSystem):
     def signals(self):
         return {name: (own.signal, own.binds) for name, own in self.inputs.items()}
 
-    def positive_parameters(self):
-        # The meaning of a parameter is the user's.
-        return frozenset()
-
     # Kinematics
 
     def rates(self, t, q, u):
         return self.kinematics.rates(t, q, u, self.parameters_at(t))
-
-    def normalize(self, q):
-        return q
 
     # Constraints
 
     @eqx.filter_jit
     def position_residual(self, t, q):
         return self._join(c.value(t, q, q, q, self.parameters_at(t)) for c in self.constraints if c.level == 0)
-
-    def coordinate_residual(self, t, q):
-        return self.position_residual(t, q)
 
     @eqx.filter_jit
     def coordinate_jacobian(self, t, q):

@@ -65,7 +65,7 @@ class LagrangianSystem(AbstractLagrangian):
     positive_definite_mass: bool = eqx.field(static=True)
     linear: bool = eqx.field(static=True)
     drift_free: bool = eqx.field(static=True)
-    ranks: Ranks
+    ranks: Ranks = eqx.field()  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ import numpy as np
 from .._types import State
 from ..formulations import AbstractFormulation, accelerations
 from ..formulations.formulation import check_mass
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 from .manifold import AbstractManifold, all_rows_formulation, normalize_state
 
 
@@ -58,7 +58,7 @@ class Baumgarte(AbstractManifold):
 class StabilisedField(eqx.Module):
     """`(q, u) ↦ (K(t, q, u), u̇)` with accelerations that stabilise the constraints."""
 
-    system: AbstractSystem
+    system: AbstractEquation
     formulation: AbstractFormulation
     rate: float = eqx.field(static=True)
 

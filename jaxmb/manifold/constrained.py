@@ -21,7 +21,7 @@ from ..formulations.formulation import solve_constrained
 from ..linalg.elimination import Factor, PivotOrder, eliminate, solve_positive
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.newton import chord
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 
 _MAX_ITERATIONS = 12
 
@@ -66,19 +66,19 @@ class RestoredState(eqx.Module):
     failed: Bool[Array, ""] | None
 
 
-def shares_split(system: AbstractSystem) -> bool:
+def shares_split(system: AbstractEquation) -> bool:
     """Whether one split serves coordinates and velocities: q̇ = u, and no nonholonomic rows."""
     return system.rates_are_velocities and system.velocity_rows == system.position_rows
 
 
-def coordinate_factor(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: ChartIndices) -> Factor:
+def coordinate_factor(system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices) -> Factor:
     """Factor of the coordinates' Jacobian in a chart."""
     order = split.velocity if split.coordinate is None else split.coordinate
     return eliminate(system.coordinate_jacobian(t, q), order, system.coordinate_rank)
 
 
 def correct_positions(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: ChartIndices
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices
 ) -> Float[Array, "nq"]:
     """Coordinates nearer to the manifold, by one modified-Newton correction with the stored matrix."""
     if system.coordinate_rank == 0:
@@ -89,7 +89,7 @@ def correct_positions(
 # Each function with a derivative rule is wrapped in a compiled one, so that it is traced once for all its places.
 @eqx.filter_jit
 def ideal_acceleration(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],
@@ -119,7 +119,7 @@ def _ideal_acceleration(system, formulation, t, q, u, order):
 
 @eqx.filter_jit
 def general_acceleration(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     q: Float[Array, "nq"],
@@ -146,7 +146,7 @@ def general_acceleration(
 
 @eqx.filter_jit
 def restore_state(
-    system: AbstractSystem,
+    system: AbstractEquation,
     t: Scalar,
     q: Float[Array, "nq"],
     u: Float[Array, "nu"],
@@ -200,7 +200,7 @@ def _solve_linear(inertia, solved, constraint_residual, force_residual):
 
 @eqx.filter_custom_jvp
 def restore_positions(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], split: ChartIndices, tol: float
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices, tol: float
 ) -> tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]:
     """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`."""
     if system.coordinate_rank == 0:

@@ -4,7 +4,7 @@ import diffrax
 
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 from .manifold import AbstractManifold
 from .partition import Partition
 from .projection import Projection
@@ -12,7 +12,7 @@ from .unconstrained import Unconstrained
 
 
 def default_manifold(
-    system: AbstractSystem, solver: diffrax.AbstractSolver, formulation: AbstractFormulation | None
+    system: AbstractEquation, solver: diffrax.AbstractSolver, formulation: AbstractFormulation | None
 ) -> AbstractManifold:
     """The policy that suits a system, a solver, and a formulation if one is given."""
     implicit = isinstance(solver, AbstractMultistep) and solver.solves_implicitly

@@ -13,7 +13,7 @@ from ..formulations import AbstractFormulation
 from ..formulations.formulation import friction_coupling, row_levels
 from ..formulations.friction import contracts
 from ..linalg.elimination import full_pivot
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 
 # Result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a run
 # only where no error estimate shortens the step.
@@ -25,7 +25,7 @@ _SINGULAR_COUPLING = 1e-3
 
 
 def diagnose(
-    system: AbstractSystem, t: Scalar, y: State, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]
+    system: AbstractEquation, t: Scalar, y: State, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]
 ) -> Any:
     """Tell singular configurations, and failures of Newton's method, from other failures of a simulation whose steps
     end on the constraints.
@@ -55,7 +55,7 @@ def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
 
 
 def diagnose_friction(
-    system: AbstractSystem,
+    system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
     y: State,

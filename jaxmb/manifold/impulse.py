@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, State
 from ..linalg.elimination import solve_positive
-from ..system import AbstractSystem
-from ..system.padded_rows import binding_velocities, velocity_rows
+from ..system import AbstractEquation
+from ..system.residuals import binding_velocities, velocity_rows
 from .orthogonal_projection import independent_rows
 
 # Jumps are looked for in this number of intervals in all, and in no fewer between two restarts.
@@ -54,7 +54,7 @@ def after_jumps(
     return t + (moved - fixed)
 
 
-def after_impulse(system: AbstractSystem, t: Scalar, y: State) -> State:
+def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state just after a time at which prescribed rates jump: `M (u⁺ − u⁻) = Aᵀ Λ`, `ψ(t, q, u⁺) = 0`.
 
     Where no rate jumps the impulses Λ are zero. Constraints are taken as ideal.
@@ -85,7 +85,7 @@ class Jump(NamedTuple):
 
 
 def find_jumps(
-    system: AbstractSystem, q: Float[Array, "nq"], t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
+    system: AbstractEquation, q: Float[Array, "nq"], t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
 ) -> list[Jump]:
     """Look for times between two others at which prescribed rates, or their derivatives, jump.
 

@@ -13,14 +13,14 @@ from jaxtyping import Array, Bool
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace
 from ..linalg.arrays import as_array, namespace
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
 
-Correction = Callable[[AbstractSystem, Scalar, State], State]
+Correction = Callable[[AbstractEquation, Scalar, State], State]
 
 
 class AbstractManifold(eqx.Module):
@@ -35,7 +35,7 @@ class AbstractManifold(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, system: AbstractSystem, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: Scalar
+        self, system: AbstractEquation, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: Scalar
     ) -> tuple[diffrax.AbstractTerm, diffrax.AbstractSolver]:
         """The term to integrate and the solver to do it with.
 
@@ -43,7 +43,7 @@ class AbstractManifold(eqx.Module):
         """
 
     @abc.abstractmethod
-    def default_formulation(self, system: AbstractSystem) -> AbstractFormulation:
+    def default_formulation(self, system: AbstractEquation) -> AbstractFormulation:
         """The formulation of a simulation that names none."""
 
     @abc.abstractmethod
@@ -59,7 +59,7 @@ class AbstractManifold(eqx.Module):
 
     @abc.abstractmethod
     def diagnose(
-        self, system: AbstractSystem, t: Scalar, y: State, solver_state: Any, result: Any, failed: Bool[Array, ""]
+        self, system: AbstractEquation, t: Scalar, y: State, solver_state: Any, result: Any, failed: Bool[Array, ""]
     ) -> Any:
         """The outcome of a simulation, made precise where the policy knows why it failed.
 
@@ -68,13 +68,13 @@ class AbstractManifold(eqx.Module):
         """
 
 
-def normalize_state(system: AbstractSystem, t: Scalar, y: State) -> State:
+def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state with its coordinates' own invariants satisfied."""
     del t
     return dataclasses.replace(y, q=system.normalize(y.q))
 
 
-def all_rows_formulation(system: AbstractSystem) -> AbstractFormulation:
+def all_rows_formulation(system: AbstractEquation) -> AbstractFormulation:
     """A formulation that needs no partition of the velocities: the cheapest one that the mass matrix allows."""
     return Multipliers() if system.positive_definite_mass else NullSpace()
 

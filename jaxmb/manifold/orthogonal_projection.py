@@ -20,9 +20,8 @@ from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, solve_linear
-from ..system import AbstractSystem
-from ..system.displacement import displaced
-from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
+from ..system import AbstractEquation
+from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
 from .manifold import normalize_state
 
 _ITERATIONS = 8
@@ -35,12 +34,12 @@ _MEASURED = 0.6
 _MEASURED_SPEED = 0.4
 
 
-def project_normalized(system: AbstractSystem, t: Scalar, y: State) -> State:
+def project_normalized(system: AbstractEquation, t: Scalar, y: State) -> State:
     """`project` from coordinates that need not satisfy their own invariants, such as interpolated ones."""
     return project(system, t, normalize_state(system, t, y))
 
 
-def project(system: AbstractSystem, t: Scalar, y: State) -> State:
+def project(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order where the
     Jacobian is one dense matrix. Where Newton's method fails the state and its derivatives are not a number.
     """
@@ -49,7 +48,7 @@ def project(system: AbstractSystem, t: Scalar, y: State) -> State:
     return jax.tree.map(lambda x: x * factor.astype(x.dtype), found)
 
 
-def projected(system: AbstractSystem, t: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
+def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
     """The state that `project` reaches, and whether Newton's method failed; a state that was not found has no meaning,
     and finite derivatives.
     """
@@ -123,10 +122,10 @@ def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Ar
 
 
 def project_in_metric(
-    system: AbstractSystem,
+    system: AbstractEquation,
     t: Scalar,
     y: State,
-    metric_of: Callable[[AbstractSystem, Scalar, State], AbstractInertia],
+    metric_of: Callable[[AbstractEquation, Scalar, State], AbstractInertia],
     linearized_at: MassProjector | None,
     tol: Scalar,
 ) -> tuple[State, MassProjector, Int[Array, ""], Bool[Array, ""]]:

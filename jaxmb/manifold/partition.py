@@ -19,8 +19,8 @@ from ..formulations.formulation import check_mass, row_levels
 from ..linalg.elimination import eliminate, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
-from ..system import AbstractSystem
-from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
+from ..system import AbstractEquation
+from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
 from .constrained import (
     ChartIndices,
     ConstrainedAcceleration,
@@ -158,7 +158,7 @@ class Chart(eqx.Module):
 class PartitionTerm(AbstractManifoldTerm):
     """A constrained system as a term with charts."""
 
-    system: AbstractSystem
+    system: AbstractEquation
     formulation: AbstractFormulation
     max_influence: float = eqx.field(static=True)
     newton_tol: Float[Array, ""]

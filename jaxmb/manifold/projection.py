@@ -19,13 +19,11 @@ from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
-from ..system import AbstractSystem
-from ..system.padded_rows import binding_velocities
-from ..system.violation import drops_rows, row_sizes, violation_of_dropped_rows
+from ..system import AbstractEquation
+from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
-from .motion_jacobian import motion_jacobian
 from .orthogonal_projection import project_in_metric, project_normalized, projected
 from .restoration import SolvedState, restore_near
 from .vector_field import VectorField
@@ -75,7 +73,7 @@ class Projection(AbstractManifold):
         if not isinstance(solver, AbstractMultistep):
             return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
         _check_multistep(system, formulation, type(solver).__name__)
-        if solver.solves_implicitly and (not system.has_bodies or system.nz):
+        if solver.solves_implicitly and not system.has_field_jacobian:
             raise ValueError(
                 f"Projection with {type(solver).__name__} needs a scene of bodies, whose graph orders its equations, "
                 "without internal states; use Partition()."
@@ -152,7 +150,7 @@ class ProjectionTerm(AbstractManifoldTerm):
     Newton iterations so far.
     """
 
-    system: AbstractSystem
+    system: AbstractEquation
     formulation: AbstractFormulation
     newton_tol: Float[Array, ""]
 
@@ -215,9 +213,7 @@ class ProjectionTerm(AbstractManifoldTerm):
         return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
 
     def jacobian(self, t, y, args):
-        # Asked for by implicit solvers only, which `prepare` admits for scenes of bodies.
-        system: Any = self.system
-        return motion_jacobian(system, t, y)
+        return self.system.field_jacobian(t, y)
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)
@@ -235,7 +231,7 @@ class ProjectionTerm(AbstractManifoldTerm):
 class ProjectedSolver(WrappedSolver):
     """A Runge–Kutta solver whose steps end with a projection on the constraints."""
 
-    system: AbstractSystem
+    system: AbstractEquation
 
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)

@@ -19,9 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Scalar, State
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord
-from ..system import AbstractSystem
-from ..system.displacement import displaced
-from ..system.padded_rows import position_rows
+from ..system import AbstractEquation
+from ..system.residuals import displaced, position_rows
 
 _ITERATIONS = 8
 # Corrections shrink at least by this multiple of the distance to the state of the factor, in scales of the coordinates.
@@ -59,7 +58,7 @@ class RestoredState(eqx.Module):
 
 # Wrapped in a compiled function, so that it is traced once for all its places.
 @eqx.filter_jit
-def restore_near(system: AbstractSystem, t: Scalar, y: State, solved: SolvedState, tol: Scalar) -> RestoredState:
+def restore_near(system: AbstractEquation, t: Scalar, y: State, solved: SolvedState, tol: Scalar) -> RestoredState:
     """Project a state on constraints that are ideal and linear in velocities, and find the accelerations there.
 
     Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.

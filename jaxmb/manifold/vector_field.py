@@ -4,13 +4,13 @@ import equinox as eqx
 
 from .._types import State
 from ..formulations import AbstractFormulation, accelerations
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 
 
 class VectorField(eqx.Module):
     """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
 
-    system: AbstractSystem
+    system: AbstractEquation
     formulation: AbstractFormulation
 
     def __call__(self, t, y, args):

@@ -10,7 +10,6 @@ so the mass matrix is full, but its inverse tridiagonal.
 """
 
 from collections.abc import Callable
-from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,11 +17,10 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..planar import DraftGear
-from ..system import AbstractGeneralizedSystem, AbstractInertia, DenseInertia
-from ..system.describe import count_independent, shorten, specialised_constraints
-from ..system.description import Description
+from ..system import AbstractInertia, AbstractSystem, DenseInertia
+from ..system.catalogue import ParameterPath
+from ..system.description import Description, count_independent, shorten, specialised_constraints
 from ..system.design_variables import DesignVariables, description_rows
-from ..system.equation import ParameterPath, Ranks
 
 
 class RelativeInertia(AbstractInertia):
@@ -61,7 +59,7 @@ def _scaled(by, v):
     return (by if v.ndim == 1 else by[:, None]) * v
 
 
-class RelativeTrain(AbstractGeneralizedSystem):
+class RelativeTrain(AbstractSystem):
     """A train on a straight track; every number a leaf.
 
     **Fields:** `mass` [kg], shape (n,); `couplers`, a draft gear whose numbers have shape (n − 1,); `law(t, v,
@@ -78,19 +76,6 @@ class RelativeTrain(AbstractGeneralizedSystem):
     guess: State
     length: Float[Array, ""]
     design: tuple[DesignVariables, ...] = ()
-
-    position_rows: ClassVar[int] = 0
-    coordinate_rows: ClassVar[int] = 0
-    velocity_rows: ClassVar[int] = 0
-    acceleration_rows: ClassVar[int] = 0
-    ideal: ClassVar[bool] = True
-    friction_parts: ClassVar[frozenset[str]] = frozenset()
-    positive_definite_mass: ClassVar[bool] = True
-    rates_are_velocities: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    drift_free: ClassVar[bool] = True
-    ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
-    rows: ClassVar[tuple[tuple[str, int], ...]] = ()
 
     def describe(self):
         facts = (
@@ -113,15 +98,6 @@ class RelativeTrain(AbstractGeneralizedSystem):
     def coordinate_names(self):
         return {"x1": [0]} | {f"y{k}": [k] for k in range(1, self.nq)}
 
-    def rate_names(self):
-        return self.coordinate_names()
-
-    def signals(self):
-        return {}
-
-    def with_signals(self, signals):
-        raise ValueError(f"A train in relative coordinates takes no inputs; got {', '.join(signals)}.")
-
     def parameter_paths(self):
         paths: dict[str, list[ParameterPath]] = {}
         for k in range(self.nq):
@@ -138,9 +114,6 @@ class RelativeTrain(AbstractGeneralizedSystem):
 
     def positive_parameters(self):
         return frozenset(f"car{k + 1}.mass" for k in range(self.nq))
-
-    def rates(self, t, q, u):
-        return u
 
     def inertia(self, t, q, u):
         return RelativeInertia(self.mass)
@@ -161,40 +134,11 @@ class RelativeTrain(AbstractGeneralizedSystem):
         # Positions along the track up to a constant, that of couplers without extension.
         return jnp.sum(self.couplers.stored(q[1:])) + self.slope * jnp.sum(self.mass * velocities(q))
 
-    def normalize(self, q):
-        return q
-
     def coordinate_scale(self):
         return jnp.ones(self.nq)
 
     def velocity_scale(self):
         return jnp.ones(self.nu)
-
-    # No constraints
-
-    def position_residual(self, t, q):
-        return jnp.zeros(0, q.dtype)
-
-    def coordinate_residual(self, t, q):
-        return jnp.zeros(0, q.dtype)
-
-    def coordinate_jacobian(self, t, q):
-        return jnp.zeros((0, self.nq), q.dtype)
-
-    def velocity_residual(self, t, q, u):
-        return jnp.zeros(0, q.dtype)
-
-    def jacobian(self, t, q, u):
-        return jnp.zeros((0, self.nu), q.dtype)
-
-    def constraint_force(self, t, q, u, multipliers):
-        return jnp.zeros_like(u)
-
-    def nonideal_force(self, t, q, u, multipliers):
-        return jnp.zeros_like(u)
-
-    def acceleration_residual(self, t, q, u, udot):
-        return jnp.zeros(0, q.dtype)
 
 
 # Attachment of a coupler, which has no effect on a straight track.

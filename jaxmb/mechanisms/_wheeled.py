@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame, Rates
 from ..parts.fields import as_jax
-from ..scene import Scene
 from ..system import parameters as parameters_of
 from .mechanism import Mechanism, Model, References, build, is_rigid
 from .observe import columns, lagrangian_coordinates, point_motion

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
-from ..scene import Scene
+from ..bodies.scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 
 # Lengths [m] along the bodies, in the letters of the source.

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..lagrangian import LagrangianSystem, Nonholonomic
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
-from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import lagrangian_coordinates, point_coordinates
 

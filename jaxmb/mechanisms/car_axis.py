@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..linalg.rotations import norm
 from ..parts.forces import Gravity
 from ..parts.functions import Constraint, Force
-from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import columns
 

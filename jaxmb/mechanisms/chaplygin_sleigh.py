@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from .. import planar
-from ..scene import Scene
+from ..bodies.scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import columns, point_motion
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from .. import spatial
 from .._types import VectorLike
+from ..bodies.scene import Scene
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.names import unknown
-from ..scene import Scene
 from ..states.assembly import assemble
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import body_axis

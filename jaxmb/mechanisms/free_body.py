@@ -3,7 +3,7 @@
 import numpy as np
 
 from .. import spatial
-from ..scene import Scene
+from ..bodies.scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import columns
 

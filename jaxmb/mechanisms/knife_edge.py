@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import columns
 

@@ -13,8 +13,8 @@ import numpy as np
 from jax.core import Tracer
 
 from .._types import State, VectorLike
+from ..bodies.scene import Scene
 from ..parts.names import unknown
-from ..scene import Scene
 from ..states.assembly import assemble
 from ..system import AbstractSystem, with_parameters
 from ..trajectory import Trajectory

@@ -1,8 +1,8 @@
 """A net of knots and rods."""
 
 from .. import spatial
+from ..bodies.scene import Scene
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .mechanism import Mechanism, build, mechanism
 from .observe import columns
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import columns
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import spatial
+from ..bodies.scene import Scene
 from ..linalg import rotations
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import body_axis
 

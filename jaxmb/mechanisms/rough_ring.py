@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..lagrangian import CoulombFriction, Holonomic, LagrangianSystem
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import lagrangian_coordinates, point_coordinates
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from .. import spatial
+from ..bodies.scene import Scene
 from ..linalg import rotations
 from ..parts.forces import Gravity
-from ..scene import Scene
 from .four_bar import circles_meet
 from .mechanism import Mechanism, build, mechanism
 from .observe import columns, point_motion

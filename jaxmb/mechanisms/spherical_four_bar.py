@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import spatial
+from ..bodies.scene import Scene
 from ..lagrangian import Holonomic, LagrangianSystem
 from ..linalg import rotations
 from ..parts.functions import Force
-from ..scene import Scene
 from ..system import parameters as parameters_of
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import columns, lagrangian_coordinates

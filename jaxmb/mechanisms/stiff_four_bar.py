@@ -3,7 +3,7 @@
 import numpy as np
 
 from .. import planar
-from ..scene import Scene
+from ..bodies.scene import Scene
 from .four_bar import four_bar
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import bar_angles, point_motion

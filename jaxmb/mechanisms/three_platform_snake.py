@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
 from ..parts.fields import as_jax
-from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import columns, lagrangian_coordinates
 

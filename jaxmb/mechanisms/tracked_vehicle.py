@@ -8,11 +8,11 @@ import numpy as np
 
 from .. import planar
 from .._types import State, VectorLike
+from ..bodies.scene import Scene
 from ..parts import contact
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.terrain import AbstractTerrain, Bump
-from ..scene import Scene
 from ..states.equilibrium import equilibrium
 from ..system import parameters
 from ._shoe_track import Shoes, running, shoe_track, undriven

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 
 from .. import planar
+from ..bodies.scene import Scene
 from ..lagrangian import LagrangianSystem, ServoConstraint
 from ..parts.functions import Constraint, Force
 from ..parts.servo import Servo
-from ..scene import Scene
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import lagrangian_coordinates
 

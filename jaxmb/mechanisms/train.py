@@ -10,12 +10,12 @@ import numpy as np
 
 from .. import planar
 from .._types import VectorLike
+from ..bodies.scene import Scene
 from ..parts.base import AbstractForce
 from ..parts.fields import as_jax, as_parameter
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.smooth import sign, step
-from ..scene import Scene
 from .mechanism import Mechanism, References, build, mechanism
 
 

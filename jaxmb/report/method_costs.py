@@ -11,6 +11,7 @@ import numpy as np
 
 from .._results import RESULTS
 from .._types import State
+from ..bodies.motion_graph import motion_order
 from ..formulations import Multipliers
 from ..manifold import AbstractManifold, Baumgarte, Partition
 from ..manifold.default import default_manifold
@@ -18,7 +19,6 @@ from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 from ..solvers import Adams, Hermite
 from ..system import AbstractSystem
-from ..system.motion_graph import motion_order
 from ..trajectory import Trajectory
 from .evaluations import evaluations
 from .reference import reference

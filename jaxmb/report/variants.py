@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import State
+from ..bodies.constraint_groups import ConstraintGroup, VelocityConstraintGroup
+from ..bodies.force_groups import ForceGroup
+from ..bodies.groups import Group, stack
+from ..bodies.structure import with_structure
 from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
 from ..parts.contents import paths
 from ..parts.fields import field_names
 from ..parts.forces import Damper
-from ..states.structure import with_structure
 from ..system import AbstractSystem, parameters, with_parameters
-from ..system.constraint_groups import ConstraintGroup, VelocityConstraintGroup
-from ..system.force_groups import ForceGroup
-from ..system.groups import Group, stack
 
 # Powers of the length in the units of parameters.
 _LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}

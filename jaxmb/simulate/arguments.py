@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import check_kind, real_array
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import as_array, is_traced
@@ -16,7 +17,6 @@ from ..manifold import AbstractManifold
 from ..parts.names import unknown
 from ..solvers import Adams
 from ..system import AbstractSystem
-from ..system.arguments import check_kind, real_array
 from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8

@@ -11,6 +11,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
@@ -22,7 +23,6 @@ from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController
 from ..solvers._one_step import OneStepController
 from ..states.consistency import consistent
 from ..system import AbstractSystem
-from ..system.arguments import check_kind
 from ..system.inputs import Signals, check_inputs, input_break_times, with_inputs
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory

@@ -5,10 +5,10 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
+from .._arguments import check_kind, real_array
 from .._types import Scalar, State
 from ..linalg.arrays import is_traced
 from ..system import AbstractSystem
-from ..system.arguments import check_kind, real_array
 
 
 def check_system(function: str, system: Any) -> None:

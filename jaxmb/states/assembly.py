@@ -17,10 +17,9 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
-from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
-from .held_coordinates import holding, internal_states, split_names
+from .held_coordinates import holding, internal_states, prescribe, split_names
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar
 from ..linalg.elimination import full_pivot
 from ..linalg.newton import newton, root, solve_linear
-from ..system import AbstractSystem
+from ..system import AbstractEquation
 from .closest_sparse import sparse_configuration, sparse_velocities
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
@@ -34,7 +34,7 @@ _REFINED = 1e-10
 _REFINEMENTS = 16
 
 
-def eliminates_by_blocks(system: AbstractSystem) -> bool:
+def eliminates_by_blocks(system: AbstractEquation) -> bool:
     """Whether closest states are found without dense matrices."""
     only_positions = system.velocity_rows == system.position_rows
     return system.elimination is not None and only_positions and system.position_rows >= MANY_ROWS
@@ -42,7 +42,7 @@ def eliminates_by_blocks(system: AbstractSystem) -> bool:
 
 @eqx.filter_jit
 def closest_configuration(
-    system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...], rank: int
+    system: AbstractEquation, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...], rank: int
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
     """The configuration closest to the guess with some coordinates held; and whether every residual is at rounding
     level.
@@ -99,7 +99,7 @@ def _refine(residual, x):
 
 @eqx.filter_jit
 def closest_velocities(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: tuple[bool, ...]
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: tuple[bool, ...]
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities closest to the guess with some rates held; and whether every residual is at rounding level.
 
@@ -130,7 +130,7 @@ def closest_velocities(
 
 
 def meet_constraints(
-    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
+    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
 ) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
     """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
 
@@ -170,7 +170,7 @@ def meet_constraints(
 
 
 def residual_size(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
 ) -> Float[Array, ""]:
     """Largest constraint residual, each row scaled to unit norm of its gradient times the system's size.
 

@@ -25,9 +25,8 @@ from .._types import Scalar
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import newton
-from ..system import AbstractSystem
-from ..system.displacement import displaced
-from ..system.padded_rows import binding_velocities, position_rows, velocity_rows
+from ..system import AbstractEquation
+from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
 
 # Rows are independent if every pivot of the elimination (a squared distance between rows of unit norm) exceeds this. A
 # row of n four-bars with its crank held has a pivot of 0.7 / n³, and 5e-14 where 333 of them are held twice.
@@ -48,7 +47,7 @@ _GRADIENTS = 300
 
 
 def meet_sparse(
-    system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
+    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
 ) -> Float[Array, "nq"]:
     """The configuration to which Gauss–Newton with step halving leads from a guess, without motion along fixed
     velocities; without derivative. Implied rows are allowed: the normal equations are regularised at rounding level.
@@ -88,7 +87,7 @@ def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) 
 
 
 def sparse_configuration(
-    system: AbstractSystem,
+    system: AbstractEquation,
     t: Scalar,
     guess: Float[Array, "nq"],
     held: Bool[np.ndarray, "nq"],
@@ -103,7 +102,7 @@ def sparse_configuration(
 
 
 def sparse_velocities(
-    system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[np.ndarray, "nu"]
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: Bool[np.ndarray, "nu"]
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities closest to a guess, with some rates held; and whether they were found."""
     # Rates that are held have an infinite mass.

@@ -12,7 +12,7 @@ from jax import lax
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..system import AbstractSystem
-from ..system.violation import row_sizes, violations
+from ..system.residuals import row_sizes, violations
 
 # The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
 # at least this power of eps, 3e-4 in single precision.

@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 from .._types import Scalar, State, VectorLike
 from ..linalg.newton import newton
 from ..system import AbstractSystem
-from ..system.coordinates import prescribe
 from .arguments import check_system, checked_guess, checked_time
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, internal_states, split_names
+from .held_coordinates import holding, internal_states, prescribe, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200

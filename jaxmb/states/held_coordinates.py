@@ -1,21 +1,43 @@
 """Prescribed coordinates by name: entries of q and u, and the own coordinates of joints."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from .._arguments import real_array, real_shape
 from .._types import Scalar, VectorLike
-from ..linalg.arrays import is_traced
+from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import unknown
 from ..system import AbstractSystem
-from ..system.arguments import real_array
-from ..system.coordinates import prescribe
-from ..system.joint_graph import joint_order_with_more
 from .closest import eliminates_by_blocks
+
+
+def prescribe(
+    what: str, names: Mapping[str, list[int]], values: Mapping[str, VectorLike], vector: Float[Array, "n"]
+) -> tuple[Float[Array, "n"], Bool[np.ndarray, "n"]]:
+    """Write values by name into a vector.
+
+    **Returns:** the vector, and a static mask of the entries that were prescribed.
+
+    **Raises:** `ValueError` for unknown names, wrong shapes, and values that are no real numbers.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"A {what} is prescribed by name, {{'crank.angle': 0.3}}; got {values!r}.")
+    fixed = np.zeros(vector.shape[0], bool)
+    for name, value in values.items():
+        if name not in names:
+            raise unknown(what, name, names)
+        index = names[name]
+        shape = real_shape(f"{what.capitalize()} {name!r}", value)
+        if shape not in ((), (len(index),)) or (shape == () and len(index) > 1):
+            raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {shape}.")
+        value = as_array(value, vector.dtype)
+        vector = replaced(vector, np.array(index), value)
+        fixed[index] = True
+    return vector, fixed
 
 
 def split_names(
@@ -56,12 +78,9 @@ def internal_states(
     return z, {name: value for name, value in values.items() if name not in own}
 
 
-def holding(system: Any, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
+def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
     """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
     if not values:
         return system
     rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
-    held: Any = system.holding(values, rates, t)
-    if not eliminates_by_blocks(system):
-        return held
-    return dataclasses.replace(held, elimination=joint_order_with_more(held, system, system.elimination))
+    return system.holding(values, rates, t, in_blocks=eliminates_by_blocks(system))

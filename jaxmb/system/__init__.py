@@ -1,4 +1,4 @@
-"""The equation of constrained motion, and the compiled rigid-body system."""
+"""The equation of constrained motion, and what can be asked of any model by name."""
 
 from ..linalg.inertia import (
     AbstractInertia as AbstractInertia,
@@ -6,11 +6,10 @@ from ..linalg.inertia import (
     DenseInertia as DenseInertia,
     DiagonalInertia as DiagonalInertia,
 )
+from .catalogue import AbstractSystem as AbstractSystem
 from .design import design as design
 from .design_variables import Variable as Variable
-from .equation import AbstractSystem as AbstractSystem
-from .generalized import AbstractGeneralizedSystem as AbstractGeneralizedSystem
+from .equation import AbstractEquation as AbstractEquation, Ranks as Ranks
 from .inputs import with_inputs as with_inputs
 from .parameters import parameters as parameters, with_parameters as with_parameters
 from .quantities import BodyMotion as BodyMotion, Quantity as Quantity, Reaction as Reaction, Solved as Solved
-from .rigid_bodies import RigidBodySystem as RigidBodySystem

@@ -8,13 +8,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from .._arguments import check_kind, real_shape
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
 from ..parts.names import unknown
-from .arguments import check_kind, real_shape
+from .catalogue import AbstractSystem
 from .design_variables import DesignVariables, Variable
-from .equation import AbstractSystem
 from .parameters import System, parameters, with_parameters
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool
 
+from .._arguments import real_array
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
-from .arguments import real_array
 
 # Rounding of a value at its bound, in units of the spacing of numbers there.
 _ROUNDING = 16

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from .._types import Scalar
 from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal
-from .equation import AbstractSystem
+from .catalogue import AbstractSystem
 from .parameters import parameters
 
 System = TypeVar("System", bound=AbstractSystem)

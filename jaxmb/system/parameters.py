@@ -12,7 +12,7 @@ from .._types import VectorLike
 from ..linalg.arrays import is_traced, replaced
 from ..parts.fields import as_jax
 from ..parts.names import unknown
-from .equation import AbstractSystem
+from .catalogue import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
 

@@ -1,18 +1,12 @@
-"""What a picture shows of a motion of bodies: where they are, the shapes of their parts, and where these act."""
+"""What a picture shows of a motion."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._types import State
-from ..parts.base import GROUND, PathKind
+from ..parts.base import PathKind
 from ..parts.shapes import AbstractShape
-from .groups import Group
 
 
 class Anchors(NamedTuple):
@@ -52,113 +46,3 @@ class Picture(NamedTuple):
     paths: dict[str, Line]
     centres: dict[str, Float[np.ndarray, "3"]]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
-
-
-def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State) -> Picture:
-    """The picture of a system of bodies and of these stacked parts."""
-    layout, names = system.layout, (*system.body_names, GROUND)
-    space, groups = layout.space, [_pictured(group) for group in groups]
-    # Scalar coordinates are at no place.
-    known = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
-    position, orientation = (np.asarray(own)[list(known)] for own in _placements(system, ys))
-    single = [
-        (name, tuple(known[body] for body in bodies if body in known), part)
-        for group in groups
-        for name, bodies, part in zip(group.names, group.bodies, _unstacked(group), strict=True)
-    ]
-    parts: dict[str, Anchors] = {}
-    for name, own, part in single:
-        points = [part.anchor(k) for k in range(len(own))]
-        parts.setdefault(
-            name, Anchors(own, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
-        )
-    width = _width(float(system.length), parts)
-    shapes = [
-        (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in part.shapes(space, width)
-    ]
-    # The friction of a joint acts where the joint does.
-    of_laws = {law: joint for g in system.nonideal for law, joint in zip(g.group.names, g.joints, strict=True)}
-    mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
-    if not system.spatial:
-        moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
-    return Picture(
-        planar=not system.spatial,
-        up=_up(space, None if system.gravity is None else np.asarray(system.gravity)),
-        width=width,
-        positions=dict(zip(names, position, strict=True)),
-        orientations=dict(zip(names, orientation, strict=True)),
-        parts=parts | {law: parts[joint] for law, joint in of_laws.items()},
-        shapes=shapes,
-        paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
-        centres={name: np.asarray(space.in_space(own)) for g in system.bodies for name, own in _centres(g.group)},
-        inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
-    )
-
-
-def _pictured(group):
-    """The parts as a picture shows them; what acts on the ground keeps the place that it was given there."""
-    moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
-    on_ground = group.body_index[:, -1] == group.layout.ground
-    kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
-    return eqx.tree_at(lambda own: own.part, group, jax.tree.map(kept, group.part, moved))
-
-
-def _centres(group):
-    """The mass centres of bodies with their names, where they are not the origins."""
-    given = getattr(group.part, "centre", None)
-    return () if given is None else zip(group.names, np.asarray(given), strict=True)
-
-
-def _unstacked(group):
-    """The parts of a group, their numbers as NumPy arrays."""
-    stacked = jax.tree.map(np.asarray, group.part)
-    return [jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(group.names))]
-
-
-def _width(length, parts):
-    """The radius of a bar, to the system's size and to that of a typical body."""
-    reach: dict[str, float] = {}
-    for part in parts.values():
-        for body, point in zip(part.bodies, part.points, strict=True):
-            if point is not None and body != GROUND:
-                reach[body] = max(reach.get(body, 0.0), float(np.linalg.norm(point)))
-    typical = float(np.median([own for own in reach.values() if own > 0] or [length]))
-    return min(0.024 * length, 0.08 * typical)
-
-
-def _paths(system, group, ts, ys) -> dict[str, Line]:
-    lines = _world_paths(system, group, ts, ys)
-    if lines is None:
-        return {}
-    lines = np.asarray(lines)
-    lines = np.concatenate([lines, np.zeros((*lines.shape[:-1], 3 - lines.shape[-1]))], axis=-1)
-    return {name: Line(group.part.path_kind, lines[:, k]) for k, name in enumerate(group.names)}
-
-
-@eqx.filter_jit
-def _placements(system, ys):
-    poses = jax.vmap(system.prepared_poses)(ys.q)
-    position, orientation = jax.vmap(jax.vmap(system.layout.space.placement))(poses)
-    return jnp.swapaxes(position, 0, 1), jnp.swapaxes(orientation, 0, 1)
-
-
-@eqx.filter_jit
-def _world_paths(system, group, ts, ys):
-    """World points of the lines of the parts, shape (times, parts, points, d), or None."""
-
-    def at_time(t, y):
-        poses = group.gather(system.prepared_poses(y.q))
-        return group.map(lambda at, x: at(t).path(system.layout.space, x), poses)
-
-    return jax.vmap(at_time)(ts, ys)
-
-
-def _up(space, gravity):
-    """Against gravity, along a coordinate axis of the world."""
-    vertical = np.zeros(3)
-    if space.dimension == 2 or gravity is None or not np.any(gravity):
-        vertical[space.dimension - 1] = 1.0
-    else:
-        k = np.argmax(np.abs(gravity))
-        vertical[k] = -np.sign(gravity[k])
-    return vertical

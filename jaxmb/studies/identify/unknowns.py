@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._arguments import check_kind
 from ..._types import VectorLike
 from ...parts.names import unknown
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
-from ...system.arguments import check_kind
 from ...system.design import design_bounds
 from ..ranges import Bounds, FreeParameters, range_of
 from .experiment import Experiment, Trial, arrays, channels_of, initial_unknown, known_parameters, times_of, with_times

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
 from ...linalg.eigen import eigen
@@ -19,7 +20,6 @@ from ...simulate import simulate
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem
-from ...system.arguments import real_array
 from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
+from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...parts.names import names_arguments, unknown
 from ...system import AbstractSystem, parameters, with_parameters
-from ...system.arguments import real_array
 from .linearise import linearise
 
 

@@ -11,6 +11,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
 from ...linalg.failure import not_a_number_where
@@ -20,7 +21,6 @@ from ...linalg.shortest import pseudoinverse
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...system import AbstractSystem
-from ...system.arguments import real_array
 from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
 from .linear_equations import fastest, vector_field
 from .linearise import remaining

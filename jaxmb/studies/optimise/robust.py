@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..._arguments import real_array
 from ..._types import VectorLike
 from ...parts.names import names_arguments, unknown
-from ...system.arguments import real_array
 
 
 @names_arguments

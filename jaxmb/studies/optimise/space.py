@@ -9,11 +9,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..._arguments import real_array
 from ..._types import VectorLike
 from ...linalg.arrays import is_traced
 from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
-from ...system.arguments import real_array
 from ...system.design import Bounds, design_bounds
 from ..ranges import FreeParameters, HalfLine, Interval, Line
 

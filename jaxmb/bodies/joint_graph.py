@@ -21,7 +21,6 @@ from ..linalg.elimination_order import order_nodes
 from ..linalg.sums import placed_sums
 from .block_cut_tree import components
 from .layout import Layout
-from .rigid_bodies import RigidBodySystem
 
 # A body on which this many joints hang is a node of the elimination. (A step of two coupled carriers, each with five
 # arms: 49 µs, and 57 where only the front one is such a node.)
@@ -35,9 +34,7 @@ _LEAST_ROWS_WITH_IMPLIED = 150
 _MOST_FRICTION = 0.5
 
 
-def elimination_order(
-    system: RigidBodySystem, left_out: tuple[int, ...], absolute: frozenset[int]
-) -> JointOrder | None:
+def elimination_order(system: Any, left_out: tuple[int, ...], absolute: frozenset[int]) -> JointOrder | None:
     """The order of elimination of a scene's joints; None where a dense matrix is faster.
 
     **Arguments:** as in `joint_order`.
@@ -50,9 +47,7 @@ def elimination_order(
     return joint_order(system, left_out, absolute)
 
 
-def joint_order(
-    system: RigidBodySystem, left_out: tuple[int, ...] = (), absolute: frozenset[int] = frozenset()
-) -> JointOrder:
+def joint_order(system: Any, left_out: tuple[int, ...] = (), absolute: frozenset[int] = frozenset()) -> JointOrder:
     """The order of elimination of a scene's joints.
 
     **Arguments:** `left_out`: rows of A that are not eliminated, such as those that others imply; `absolute`: numbers
@@ -62,7 +57,7 @@ def joint_order(
     return _joint_order(system.layout, parts, left_out, absolute)
 
 
-def joint_order_with_more(system: RigidBodySystem, before: RigidBodySystem, order: JointOrder) -> JointOrder:
+def joint_order_with_more(system: Any, before: Any, order: JointOrder) -> JointOrder:
     """The order of elimination of a scene that has more position constraints, after those of one with a known order."""
     parts = lambda own: sum(len(g.group.names) for g in own.constraints)
     more, rows = parts(system) - parts(before), system.position_rows - before.position_rows

@@ -1,48 +1,10 @@
-"""A system in words: parts, rows, degrees of freedom, redundancy, and computations that are specialised away."""
+"""A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and what is specialised away."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .description import Description
-from .equation import AbstractSystem
-
-
-def count_rows(system: AbstractSystem) -> str:
-    """The number of constraint rows, of independent ones among them, and of those that do not bind positions."""
-    text = f"{system.acceleration_rows}, of which {system.acceleration_rank} independent"
-    kinds = {
-        "nonholonomic": system.velocity_rows - system.position_rows,
-        "between accelerations only": system.acceleration_rows - system.velocity_rows,
-    }
-    listed = ", ".join(f"{number} {kind}" for kind, number in kinds.items() if number)
-    return f"{text} ({listed})" if listed else text
-
-
-def count_independent(system: AbstractSystem) -> str:
-    """The numbers of coordinates and velocities that the constraints leave free."""
-    return f"{system.nq - system.coordinate_rank} coordinates, {system.nu - system.velocity_rank} velocities"
-
-
-def specialised_constraints(system: AbstractSystem) -> list[str]:
-    """Sentences on the computations that this system's constraints, or their absence, make unnecessary."""
-    if not system.acceleration_rows:
-        return ["no constraints: no elimination, no Newton iteration, no charts"]
-    out = []
-    if system.position_rows == system.acceleration_rows:
-        out.append("holonomic only: no rows between velocities, no chart of velocities besides that of coordinates")
-    if not system.position_rows:
-        out.append("no constraints between positions: no Newton iteration")
-    if system.acceleration_rank == system.acceleration_rows:
-        out.append("no redundancy: no row is dropped")
-    if system.drift_free:
-        out.append("scleronomic: no derivative with respect to time")
-    return out
-
-
-def shorten(names: Iterable[str]) -> str:
-    """Names in one line, abbreviated if there are many."""
-    names = list(names)
-    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:4])}, … {names[-1]} ({len(names)})"
+from ..system import AbstractSystem
+from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
 
 
 def describe_scene(

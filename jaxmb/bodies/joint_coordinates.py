@@ -13,11 +13,11 @@ from jaxtyping import Array
 
 from .._types import Scalar
 from ..parts.joint_parts import JointDriver
+from ..system.catalogue import AbstractSystem
+from ..system.quantities import Quantity
 from .constraint_groups import ConstraintGroup
-from .equation import AbstractSystem
 from .groups import CoordinateGroup, Group
 from .layout import Layout
-from .quantities import Quantity
 
 # A coordinate and its derivatives with respect to time, by the ends of their names.
 ORDERS = ("", "_rate", "_acceleration")

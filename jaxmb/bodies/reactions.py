@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import cross
+from ..system.quantities import Reaction
 from .constraint_groups import AbstractConstraintGroup
 from .force_groups import ForceGroup, NonIdealGroup
 from .groups import Group
-from .quantities import Reaction
 
 
 def reaction_wrenches(

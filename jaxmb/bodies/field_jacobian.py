@@ -1,4 +1,10 @@
-"""The derivative of the equations of motion along the constraints, with the structure of a scene's graph."""
+"""The derivative of the equations of motion along the constraints, with the structure of a scene's graph.
+
+A part acts on its own bodies only, so the derivatives of its wrenches are a small matrix of blocks; parts of one type
+are differentiated together.
+"""
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,10 +21,43 @@ from ..linalg.blocks import transpose_vector_products, vector_products
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractFieldJacobian, AbstractResolvent
-from ..system.layout import Layout
-from ..system.motion_graph import MotionOrder, motion_order
-from ..system.rigid_bodies import RigidBodySystem
-from ..system.stiffness import contributions
+from .layout import Layout
+from .motion_graph import MotionOrder, motion_order
+
+
+def contributions(
+    system: Any,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    u: Float[Array, "nu"],
+    multipliers: Float[Array, "m"],
+) -> tuple[Float[Array, "e v v"], Float[Array, "e v v"]]:
+    """K and D: derivatives of the wrenches of forces and of constraints with given multipliers, with respect to
+    displacements along velocities and to the velocities. Each part contributes a block for each pair of its bodies,
+    the one that the wrench acts on first; the gyroscopic moments of bodies follow.
+    """
+    poses, velocities = system.prepared_poses(q), system.all_velocities(u)
+    size = system.layout.space.velocity_size
+    stiffness, damping = [], []
+    for g in system.forces:
+        both = g.derivatives(t, poses, velocities)
+        for parts, blocks in zip((stiffness, damping), both, strict=True):
+            parts.append(_by_pairs(blocks))
+    row = 0
+    for g in system.joints:
+        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
+        row += own.size
+        stiffness.append(_by_pairs(g.wrench_derivatives(t, poses, velocities, own)))
+        damping.append(jnp.zeros_like(stiffness[-1]))
+    gyroscopic = system.gyroscopic_damping(u)
+    stiffness.append(jnp.zeros_like(gyroscopic))
+    damping.append(gyroscopic)
+    join = lambda blocks: jnp.concatenate([own.reshape(-1, size, size) for own in blocks])
+    return join(stiffness), join(damping)
+
+
+def _by_pairs(blocks: Float[Array, "parts k v k v"]) -> Float[Array, "parts k k v v"]:
+    return jnp.moveaxis(blocks, 3, 2)
 
 
 class MotionJacobian(AbstractFieldJacobian):
@@ -164,7 +203,7 @@ class MotionResolvent(AbstractResolvent):
         )
 
 
-def motion_jacobian(system: RigidBodySystem, t: Scalar, y: State) -> MotionJacobian:
+def motion_jacobian(system: Any, t: Scalar, y: State) -> MotionJacobian:
     """J at a state on the constraints."""
     order, layout = motion_order(system), system.layout
     q, u = y.q, y.u

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._types import State
-from .linalg.arrays import is_traced
-from .parts.base import (
+from .._types import State
+from ..linalg.arrays import is_traced
+from ..parts.base import (
     GROUND,
     AbstractBody,
     AbstractCompound,
@@ -22,26 +22,26 @@ from .parts.base import (
     AbstractVelocityConstraint,
     rows_of,
 )
-from .parts.boundary import check_kernels
-from .parts.contents import anonymous, inner_parts
-from .parts.fields import as_parameter, declarations, values_of
-from .parts.forces import Gravity
-from .parts.frames import AbstractFrame, frames_by_name
-from .parts.joint_parts import AbstractCoordinatePart
-from .parts.names import unknown
-from .parts.on_frames import framed, law_on_frames, on_frames
-from .parts.planar.kinematics import PLANE
-from .parts.servo import Servo
-from .parts.sources import AbstractOfSources
-from .parts.spatial.kinematics import SPACE
-from .states.structure import with_structure
-from .system import RigidBodySystem
-from .system.constraint_groups import ConstraintGroup, VelocityConstraintGroup, servo_group
-from .system.description import Description
-from .system.equation import Ranks
-from .system.force_groups import ForceGroup, NonIdealGroup
-from .system.groups import BodyGroup, CoordinateGroup, FrameGroup, stack
-from .system.layout import Layout
+from ..parts.boundary import check_kernels
+from ..parts.contents import anonymous, inner_parts
+from ..parts.fields import as_parameter, declarations, values_of
+from ..parts.forces import Gravity
+from ..parts.frames import AbstractFrame, frames_by_name
+from ..parts.joint_parts import AbstractCoordinatePart
+from ..parts.names import unknown
+from ..parts.on_frames import framed, law_on_frames, on_frames
+from ..parts.planar.kinematics import PLANE
+from ..parts.servo import Servo
+from ..parts.sources import AbstractOfSources
+from ..parts.spatial.kinematics import SPACE
+from ..system.description import Description
+from ..system.equation import Ranks
+from .constraint_groups import ConstraintGroup, VelocityConstraintGroup, servo_group
+from .force_groups import ForceGroup, NonIdealGroup
+from .groups import BodyGroup, CoordinateGroup, FrameGroup, stack
+from .layout import Layout
+from .rigid_bodies import RigidBodySystem
+from .structure import with_structure
 
 # Parts that act on other parts, given by their names.
 _OF_OTHERS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractOfSources)

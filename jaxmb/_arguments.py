@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..linalg.arrays import as_array, is_traced
+from .linalg.arrays import as_array, is_traced
 
 
 def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> None:

@@ -17,17 +17,10 @@ from jaxtyping import Array
 
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.rotations import cross, unrotate
-from ..system.bodies import Implied
-from ..system.displacement import displaced
-from ..system.equation import Ranks
-from ..system.joint_graph import elimination_order, joint_order
-from ..system.padded_rows import binding_velocities, position_rows
-from ..system.rigid_bodies import RigidBodySystem
-from .assembly import violated_joints
-from .closest import tolerance
-from .closest_sparse import largest_residual, meet_sparse
-from .independence import Part, absolute_parts, eliminate, matrix, subsets
-from .redundancy import (
+from ..states.assembly import violated_joints
+from ..states.closest import tolerance
+from ..states.closest_sparse import largest_residual, meet_sparse
+from ..states.redundancy import (
     ZERO,
     Group,
     Nearby,
@@ -37,6 +30,11 @@ from .redundancy import (
     dense_remains,
     smallest_step,
 )
+from ..system.equation import Ranks
+from ..system.residuals import binding_velocities, displaced, position_rows
+from .independence import Part, absolute_parts, eliminate, matrix, subsets
+from .joint_graph import elimination_order, joint_order
+from .rigid_bodies import Implied, RigidBodySystem
 
 # Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
 # bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1

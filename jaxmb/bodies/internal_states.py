@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..parts.contents import entry, internal_states
+from ..system.quantities import Quantity
 from .force_groups import ForceGroup
-from .quantities import Quantity
 
 
 class StateField(NamedTuple):

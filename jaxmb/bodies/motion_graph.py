@@ -29,7 +29,6 @@ from ..linalg.elimination_order import NodeOrder, order_nodes
 from ..linalg.sums import PlacedSums, placed_sums
 from .joint_graph import joint_order
 from .layout import Layout
-from .rigid_bodies import RigidBodySystem
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +59,7 @@ class MotionOrder:
     nodes: NodeOrder = dataclasses.field(compare=False)
 
 
-def motion_order(system: RigidBodySystem) -> MotionOrder:
+def motion_order(system: Any) -> MotionOrder:
     """The order of elimination of a scene's bodies and joints."""
     joints = system.elimination
     if joints is None and system.velocity_rows > 0:
@@ -74,7 +73,7 @@ def _motion_order(
     layout: Layout, acting: tuple[tuple[tuple[int, ...], ...], ...], joints: JointOrder | None
 ) -> MotionOrder:
     ground, size = layout.ground, layout.space.velocity_size
-    # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.system.stiffness` lists them.
+    # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.bodies.field_jacobian` lists them.
     rows = [own[i] for group in acting for own in group for i in range(len(own)) for _ in own]
     columns = [own[j] for group in acting for own in group for _ in own for j in range(len(own))]
     rows, columns = [*rows, *range(ground)], [*columns, *range(ground)]

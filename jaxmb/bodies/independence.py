@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..linalg.sparse_pivots import SparsePivots, pivot_rows
-from ..system.block_cut_tree import components
-from ..system.layout import Layout
+from .block_cut_tree import components
+from .layout import Layout
 
 # An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the nearest of true ranks 1e-4.
 _ZERO = 0.5

@@ -1,0 +1,792 @@
+"""Rigid bodies joined by constraints and forces: the compiled form of a scene."""
+
+import dataclasses
+import itertools
+from typing import ClassVar, NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._types import Scalar, State
+from ..linalg.arrays import is_traced, unchecked_take
+from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
+from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
+from ..linalg.jacobian import DenseJacobian
+from ..linalg.rotations import cross, normalize, rotate
+from ..linalg.sums import placed_sums
+from ..parts.base import AbstractInertialConstraint
+from ..parts.forces import Gravity
+from ..system.catalogue import AbstractSystem
+from ..system.design_variables import DesignVariables, description_rows, in_range
+from ..system.equation import Ranks
+from ..system.quantities import Quantity
+from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
+from .describe import describe_scene
+from .field_jacobian import motion_jacobian
+from .force_groups import ForceGroup, NonIdealGroup
+from .groups import BodyGroup, CoordinateGroup, FrameGroup
+from .internal_states import (
+    StateField,
+    initial_states,
+    state_fields,
+    state_names,
+    state_quantities,
+    state_rates,
+    state_scale,
+    with_states,
+)
+from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
+from .joint_graph import joint_order_with_more
+from .layout import Layout
+from .motion import body_motion, body_quantities, coordinate_names, frame_quantities, rate_names, scalar_quantities
+from .parameters import (
+    are_in_range,
+    check_parts,
+    parameter_paths,
+    positive_parameters,
+    signals_of,
+    stacked_part,
+    with_signals,
+)
+from .picture import picture
+from .reactions import applied_wrenches, nonideal_wrenches, reaction, reaction_wrenches
+
+# From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
+# velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
+_LEAST_VELOCITIES = 40
+
+
+class Implied(NamedTuple):
+    """A row that other joints imply: `row` of part `name` follows from the joints `by`."""
+
+    name: str
+    row: int
+    by: tuple[str, ...]
+
+
+class RigidBodySystem(AbstractSystem):
+    """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
+
+    **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
+    [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
+    `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`.
+    """
+
+    has_bodies: ClassVar[bool] = True
+
+    bodies: tuple[BodyGroup, ...]
+    gravity: Float[Array, "d"] | None
+    constraints: tuple[ConstraintGroup, ...]
+    velocity_constraints: tuple[VelocityConstraintGroup, ...]
+    servos: tuple[ServoGroup, ...]
+    nonideal: tuple[NonIdealGroup, ...]
+    forces: tuple[ForceGroup, ...]
+    guess: State
+    length: Float[Array, ""]
+    layout: Layout = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)
+    gravity_name: str = eqx.field(static=True)
+    ranks: Ranks = eqx.field()  # pyright: ignore[reportIncompatibleVariableOverride]
+    implied: tuple[Implied, ...] = eqx.field(static=True)
+    elimination: JointOrder | None = eqx.field(static=True)
+    design: tuple[DesignVariables, ...] = ()
+    frames: tuple[FrameGroup, ...] = ()
+    tendons: tuple[CoordinateGroup, ...] = ()
+    free_joints: tuple[CoordinateGroup, ...] = ()
+
+    # Sizes and names
+
+    @property
+    def nq(self) -> int:
+        return self.layout.nq
+
+    @property
+    def nu(self) -> int:
+        return self.layout.nu
+
+    @property
+    def spatial(self) -> bool:
+        return self.layout.space.dimension == 3
+
+    @property
+    def rates_are_velocities(self) -> bool:
+        return not self.spatial
+
+    def coordinate_names(self):
+        return coordinate_names(self.layout, self.body_names)
+
+    def rate_names(self):
+        return rate_names(self.layout, self.body_names)
+
+    # Bodies
+
+    @property
+    def mass(self) -> Float[Array, "b"]:
+        """Masses [kg] of the bodies."""
+        return self._in_order([g.mass for g in self.bodies])
+
+    @property
+    def moments_of_inertia(self) -> Float[Array, "b *matrix"]:
+        """Moments of inertia [kg m²] about the mass centres: a number in the plane, a matrix in body axes in space."""
+        return self._in_order([g.inertia for g in self.bodies])
+
+    def _in_order(self, of_groups):
+        """Per-body values of all groups, in the order of the bodies."""
+        if len(of_groups) == 1:
+            return of_groups[0]
+        order = np.argsort(np.concatenate([g.group.body_index[:, 0] for g in self.bodies]))
+        return unchecked_take(jnp.concatenate(of_groups), order)
+
+    # Kinematics
+
+    def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
+        """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
+        prepare = self.layout.space.prepare
+        ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
+        return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
+
+    def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
+        """Velocities of the bodies, of scalar coordinates and of the ground."""
+        return jnp.pad(self._velocities(u), ((0, 1), (0, 0)))
+
+    def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
+        """Poses of the bodies."""
+        return self._poses(q)[: self.layout.bodies]
+
+    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+        """Velocities of the bodies."""
+        return self._velocities(u)[: self.layout.bodies]
+
+    def _poses(self, q):
+        """Poses of the bodies and of scalar coordinates."""
+        if self.layout.uniform:
+            return q.reshape(self.layout.bodies, -1)
+        ground = jnp.asarray(self.layout.space.ground, q.dtype)
+        return unchecked_take(jnp.concatenate([q, ground]), self.layout.pose_index[:-1])
+
+    def _velocities(self, u):
+        """Velocities of the bodies and of scalar coordinates."""
+        if self.layout.uniform:
+            return u.reshape(self.layout.bodies, -1)
+        return unchecked_take(jnp.concatenate([u, jnp.zeros(1, u.dtype)]), self.layout.velocity_index[:-1])
+
+    def rates(self, t, q, u):
+        if self.rates_are_velocities:
+            return u
+        rates = self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
+        for g in self.turn_counts:
+            own = g.velocity(jnp.asarray(t, q.dtype), self.prepared_poses(q), self.all_velocities(u))
+            rates = rates.at[self._counts(g)].set(-own)
+        return rates
+
+    def normalize(self, q):
+        if self.rates_are_velocities:
+            return q
+        q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
+        for g in self.turn_counts:
+            # A count of turns does not depend on the time.
+            own = g.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
+            q = q.at[self._counts(g)].add(-own)
+        return q
+
+    def _counts(self, group):
+        """Where the counts of turns of stacked tendons stand in q, shape (parts, rows)."""
+        return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
+
+    def normalize_fixed(self, q, fixed):
+        rotating = np.flatnonzero(np.array(self.layout.rotates) & self.spatial)
+        turns = self.layout.pose_index[:-1][rotating, 3:]
+        whole = turns[np.all(fixed[turns], axis=1)]
+        for index in whole:
+            q = q.at[index].set(normalize(q[index]))
+        return q, len(whole)
+
+    def held_velocities(self, held):
+        if self.rates_are_velocities:
+            return held
+        d = self.layout.space.dimension
+        of_pose = np.append(held, np.ones(self.layout.space.pose_size, bool))[self.layout.pose_index[:-1]]
+        turns = of_pose[:, d:]
+        if np.any(np.any(turns, axis=1) & ~np.all(turns, axis=1)):
+            return None
+        of_bodies = np.concatenate([of_pose[:, :d], np.repeat(turns[:, :1], d, axis=1)], axis=1)
+        return of_bodies.reshape(-1)[self.layout.velocity_place]
+
+    def _pack(self, poses):
+        raveled = poses.reshape(-1)
+        return raveled if self.layout.uniform else unchecked_take(raveled, self.layout.coordinate_place)
+
+    @property
+    def position_rows(self) -> int:
+        return sum(len(g.group.names) * g.rows for g in self.constraints)
+
+    @property
+    def coordinate_rows(self) -> int:
+        counts = sum(len(g.group.names) * g.rows for g in self.turn_counts)
+        return self.position_rows + counts + (sum(self.layout.rotates) if self.spatial else 0)
+
+    @property
+    def velocity_rows(self) -> int:
+        return self.position_rows + sum(len(g.group.names) * g.rows for g in self.velocity_constraints)
+
+    @property
+    def acceleration_rows(self) -> int:
+        return self.velocity_rows + sum(len(g.group.names) * g.rows for g in self.servos)
+
+    @property
+    def joints(self) -> tuple[AbstractConstraintGroup, ...]:
+        """All groups of constraints, in the order of the rows of A."""
+        return (*self.constraints, *self.velocity_constraints, *self.servos)
+
+    @property
+    def ideal(self) -> bool:
+        return not self.nonideal
+
+    @property
+    def friction_parts(self) -> frozenset[str]:
+        return frozenset(name for g in self.nonideal for name in g.joints)
+
+    @property
+    def linear(self) -> bool:
+        return all(g.group.part.linear for g in self.velocity_constraints)
+
+    @property
+    def drift_free(self) -> bool:
+        return not any(g.rheonomic for g in self.constraints) and all(g.homogeneous for g in self.velocity_constraints)
+
+    @property
+    def rows(self) -> tuple[tuple[str, int], ...]:
+        """Name and number within its part of every row of A."""
+        groups = [(g.group.names, range(g.rows)) for g in self.joints]
+        return tuple((name, k) for names, rows in groups for name in names for k in rows)
+
+    # Scalar coordinates
+
+    @property
+    def _inertial(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of parts that have scalar coordinates."""
+        return tuple(g for g in self.constraints if _is_inertial(g))
+
+    @property
+    def turn_counts(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of tendons that have scalar coordinates; their residuals vanish as coordinates are normalised."""
+        return tuple(ConstraintGroup(g.group) for g in self.tendons if g.group.part.rows)
+
+    def with_initial_scalars(self) -> Self:
+        """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
+        if not self.layout.scalars:
+            return self
+        return dataclasses.replace(self, guess=_with_scalars(self, self.guess))
+
+    # Internal states
+
+    @property
+    def _state_fields(self) -> tuple[StateField, ...]:
+        return state_fields(self.forces)
+
+    @property
+    def state_ends(self) -> tuple[int, ...]:
+        return tuple(own.stop for own in self._state_fields)
+
+    def state_names(self):
+        return state_names(self._state_fields)
+
+    def with_states(self, z):
+        return dataclasses.replace(self, forces=with_states(self.forces, self._state_fields, z))
+
+    def state_rates(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return state_rates(self.forces, self._state_fields, t, poses, velocities)
+
+    def state_scale(self):
+        return lax.stop_gradient(state_scale(self.forces, self._state_fields, self.length.dtype))
+
+    def with_initial_states(self) -> Self:
+        """The system with the internal states that its parts were given in its guess, and none in its parts."""
+        fields = self._state_fields
+        if not fields:
+            return self
+        z = jax.device_put(initial_states(self.forces, fields))
+        return dataclasses.replace(
+            self,
+            guess=dataclasses.replace(self.guess, z=z),
+            forces=jax.device_put(with_states(self.forces, fields, None)),
+        )
+
+    # Parameters and names
+
+    def parameter_paths(self):
+        return parameter_paths(self._gravity_name, self._groups, self.servos)
+
+    def with_frames_of(self, before):
+        centre = lambda group: getattr(group.group.part, "centre", None)
+        pairs = zip(self.bodies, before.bodies, strict=True)
+        moved = [(group, centre(group), centre(old)) for group, old in pairs]
+        changed = [(group, new - old) for group, new, old in moved if new is not None and new is not old]
+        if not changed:
+            return self
+        space, q, u = self.layout.space, self.guess.q, self.guess.u
+        poses, velocities = self.poses(q), self.velocities(u)
+        for group, shift in changed:
+            bodies, d = group.group.body_index[:, 0], space.dimension
+            velocity = jax.vmap(space.point_velocity)(poses[bodies], velocities[bodies], shift)
+            q = q.at[self.layout.pose_index[bodies, :d]].add(jax.vmap(space.direction)(poses[bodies], shift))
+            u = u.at[self.layout.velocity_index[bodies, :d]].set(velocity)
+        return dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
+
+    def positive_parameters(self):
+        return frozenset(positive_parameters(self._groups))
+
+    def check_parameters(self, names):
+        parts = {name.split(".")[0] for name in names}
+        dimension = self.layout.space.dimension
+        if self.gravity is not None and self.gravity_name in parts and not is_traced(self.gravity):
+            self._gravity.check(dimension)
+        check_parts(itertools.chain(*self._groups.values()), parts, dimension)
+
+    def parameters_in_range(self):
+        gravity = () if self.gravity is None else (self._gravity,)
+        parts = (*gravity, *map(stacked_part, itertools.chain(*self._groups.values())))
+        return are_in_range(parts) & in_range(self.design)
+
+    @property
+    def _gravity(self):
+        return Gravity(self.gravity, name=self.gravity_name)
+
+    @property
+    def _groups(self):
+        kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
+        return {kind: getattr(self, kind) for kind in (*kinds, "free_joints")}
+
+    @property
+    def _gravity_name(self):
+        return None if self.gravity is None else self.gravity_name
+
+    def signals(self):
+        return signals_of(self._groups)
+
+    def with_signals(self, signals):
+        return dataclasses.replace(self, **with_signals(self._groups, signals))
+
+    def describe(self):
+        kinds: dict[str, list[str]] = {}
+        for g in self.bodies:
+            kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
+        plain = [g for g in self.constraints if not _is_inertial(g)]
+        return describe_scene(
+            self,
+            spatial=self.spatial,
+            bodies=kinds,
+            joints=[
+                (plain, ""),
+                (self._inertial, ", each with a velocity of its own"),
+                (self.free_joints, ", which have coordinates only"),
+                (self.velocity_constraints, ", between velocities"),
+                (self.servos, ", a program of a Servo"),
+            ],
+            forces=self.forces,
+            tendons=self.tendons,
+            laws=self.nonideal,
+            gravity=self._gravity_name,
+            implied=self.implied,
+            design=description_rows(self.design),
+            frames=self.frames,
+        )
+
+    # Views of a motion
+
+    def motion_names(self):
+        return self.body_names
+
+    def motion(self, name, ys):
+        return body_motion(self.layout, self.body_names.index(name), ys)
+
+    def quantities(self):
+        out = body_quantities(self.layout, self.body_names) | state_quantities(self._state_fields)
+        d = self.layout.space.dimension
+        for name in self.joint_names():
+            for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
+                value = lambda ts, ys, solved, name=name, field=field: getattr(
+                    self.reaction(name, ts, ys, solved.multipliers), field
+                )
+                out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
+        out |= scalar_quantities(self.layout) | joint_quantities(self, self.joint_coordinates())
+        return out | frame_quantities(self, self.frames, self.layout)
+
+    def joint_coordinates(self):
+        return joint_coordinates(self._measured, self.layout, batch=self.length.ndim)
+
+    @property
+    def _measured(self):
+        """The groups of parts that have coordinates."""
+        return (*self.constraints, *self.tendons, *self.free_joints)
+
+    def joint_coordinate(self, coordinate, t, q):
+        values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))
+        return values[coordinate.field][coordinate.member]
+
+    def holding(self, values, rates, t, in_blocks):
+        held = held_groups(self._measured, self.joint_coordinates(), values, rates, t)
+        rows = sum(g.rows for g in held)
+        ranks = dataclasses.astuple(self.ranks)
+        more = Ranks(*(rank + rows for rank in ranks))
+        out = dataclasses.replace(self, constraints=(*self.constraints, *held), ranks=more, elimination=None)
+        if self.elimination is None or not in_blocks:
+            return out
+        return dataclasses.replace(out, elimination=joint_order_with_more(out, self, self.elimination))
+
+    def position_quantities(self):
+        return tuple(f"{name}.position" for name in self.body_names)
+
+    def joint_names(self):
+        return self.constraint_names()
+
+    @eqx.filter_jit
+    def reaction(self, name, ts, ys, multipliers):
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            return reaction(self.joints, name, t, poses, velocities, own)
+
+        return jax.vmap(single)(ts, ys, multipliers)
+
+    def force_names(self):
+        return tuple(dict.fromkeys(name for g in (*self.forces, *self.nonideal) for name in g.group.names))
+
+    @eqx.filter_jit
+    def applied_wrenches(self, name, ts, ys, multipliers):
+        forces = [k for k, g in enumerate(self.forces) if name in g.group.names]
+        laws = [g for g in self.nonideal if name in g.group.names]
+
+        def single(t, y, own):
+            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
+            if laws:
+                wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, own)
+                return applied_wrenches(laws, name, wrenches)
+            groups = [self.at(y).forces[k] for k in forces]
+            return applied_wrenches(groups, name, [g.wrenches(t, poses, velocities) for g in groups])
+
+        return jax.vmap(single)(ts, ys, multipliers)
+
+    def picture(self, ts, ys):
+        return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
+
+    def not_finite(self, t, q, u):
+        t = jnp.asarray(t, q.dtype)
+        values = self._of_parts(t, q, u)
+        kinds = zip(
+            ("residual", "residual", "force"), (self.constraints, self.joints, self.forces), values, strict=True
+        )
+        found = [
+            f"the {kind} of {name!r}"
+            for kind, of_kind, of_parts in kinds
+            for group, own in zip(of_kind, of_parts, strict=True)
+            for name, value in zip(group.group.names, np.asarray(own), strict=True)
+            if not np.all(np.isfinite(value))
+        ]
+        if self.nz:
+            rates = np.asarray(self.state_rates(t, q, u))
+            found += [
+                f"the rate of {name!r}" for name, k in self.state_names().items() if not np.all(np.isfinite(rates[k]))
+            ]
+        return tuple(dict.fromkeys(found))
+
+    @eqx.filter_jit
+    def _of_parts(self, t, q, u):
+        """Residuals of positions, those of accelerations, and wrenches, group by group."""
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return (
+            [g.residual(t, poses) for g in self.constraints],
+            [g.acceleration(t, poses, velocities, jnp.zeros_like(velocities)) for g in self.joints],
+            [g.wrenches(t, poses, velocities) for g in self.forces],
+        )
+
+    # Constraints. Each kernel is a compiled function, so that it is traced once for all its uses in a program.
+
+    @eqx.filter_jit
+    def position_residual(self, t, q):
+        poses = self.prepared_poses(q)
+        return _join([g.residual(t, poses) for g in self.constraints], q.dtype)
+
+    def coordinate_residual(self, t, q):
+        residual = self.position_residual(t, q)
+        if not self.spatial:
+            return residual
+        p = self.poses(q)[_rotating(self.layout), 3:]
+        poses = self.prepared_poses(q)
+        counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
+        return jnp.concatenate([residual, *counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)])
+
+    @eqx.filter_jit
+    def coordinate_jacobian(self, t, q):
+        if self.rates_are_velocities:
+            return self._jacobian(t, q, jnp.zeros(self.nu, q.dtype), self.constraints)
+        poses = self.prepared_poses(q)
+        unit = jnp.eye(self.layout.space.pose_size, dtype=q.dtype)
+        along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(unit)
+        moves = jax.vmap(along)(poses[:, : self.layout.space.pose_size])
+        groups = (*self.constraints, *self.turn_counts)
+        blocks = [g.along(t, poses, moves) for g in groups]
+        jacobian = self._assemble(blocks, groups, q.dtype, of_poses=True)
+        rotating = _rotating(self.layout)
+        index = self.layout.pose_index[rotating, 3:]
+        rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
+        return jnp.concatenate([jacobian, rows])
+
+    @eqx.filter_jit
+    def velocity_residual(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        groups = (*self.constraints, *self.velocity_constraints)
+        return _join([g.velocity(t, poses, velocities) for g in groups], q.dtype)
+
+    @eqx.filter_jit
+    def jacobian(self, t, q, u):
+        return self._jacobian(t, q, u, self.joints)
+
+    def structured_jacobian(self, t, q, u):
+        if self.elimination is None:
+            return DenseJacobian(self.jacobian(t, q, u))
+        return self.block_jacobian(t, q, u, self.elimination)
+
+    def block_jacobian(
+        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], order: JointOrder
+    ) -> BlockJacobian:
+        """`A` in blocks of joints on bodies."""
+        blocks = [*self._blocks(t, q, u, self.joints), jnp.zeros(1, q.dtype)]
+        return block_jacobian(_join(blocks, q.dtype), order)
+
+    def _blocks(self, t, q, u, groups):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return [g.jacobian(t, poses, velocities) for g in groups]
+
+    def _jacobian(self, t, q, u, groups):
+        blocks = self._blocks(t, q, u, groups)
+        return self._assemble(blocks, groups, q.dtype, of_poses=False)
+
+    @eqx.filter_jit
+    def constraint_force(self, t, q, u, multipliers):
+        wrenches = reaction_wrenches(self.joints, t, self.prepared_poses(q), self.all_velocities(u), multipliers)
+        return self._add_up(wrenches, [g.group.body_index for g in self.joints], u.dtype)
+
+    @eqx.filter_jit
+    def nonideal_force(self, t, q, u, multipliers):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        wrenches = nonideal_wrenches(self.joints, self.nonideal, t, poses, velocities, multipliers)
+        return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
+
+    @eqx.filter_jit
+    def acceleration_residual(self, t, q, u, udot):
+        t = jnp.asarray(t, q.dtype)
+        poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
+        return _join([g.acceleration(t, poses, velocities, accelerations) for g in self.joints], q.dtype)
+
+    def _assemble(self, blocks, groups, dtype, *, of_poses):
+        source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
+        return unchecked_take(_join([*blocks, jnp.zeros(1, dtype)], dtype), source)
+
+    # Dynamics
+
+    def inertia(self, t, q, u) -> AbstractInertia:
+        if self.spatial and self.layout.uniform:
+            return BlockInertia(self.mass, self.moments_of_inertia)
+        mass = self._masses_of_coordinates
+        if self.spatial:
+            points = np.array([not rotates for rotates in self.layout.rotates])[:, None, None]
+            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular; a scalar
+            # coordinate as well.
+            moments = self.moments_of_inertia
+            unit = jnp.eye(3, dtype=moments.dtype)
+            of_scalars = jnp.tile(unit, (len(self.layout.scalars), 1, 1))
+            moments = jnp.concatenate([jnp.where(points, unit, moments), of_scalars])
+            return _MixedInertia(BlockInertia(mass, moments), self.layout)
+        moments = jnp.pad(self.moments_of_inertia, (0, len(self.layout.scalars)))
+        columns = [jnp.repeat(mass[:, None], 2, axis=1), moments[:, None]]
+        bodies = jnp.concatenate(columns, axis=1)
+        if self.layout.uniform:
+            return DiagonalInertia(bodies.reshape(-1))
+        return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
+
+    @property
+    def _masses_of_coordinates(self):
+        """What counts as the mass of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]; one, which
+        has no effect, of those that do not move.
+        """
+        if not self.layout.scalars:
+            return self.mass
+        found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self._inertial]
+        still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
+        order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
+        ones = jnp.ones(len(still), self.mass.dtype)
+        inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in found), ones]), order)
+        return jnp.concatenate([self.mass, inertias])
+
+    @eqx.filter_jit
+    def force(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        wrenches = [g.wrenches(t, poses, velocities) for g in self.forces]
+        bodies = [g.group.body_index for g in self.forces]
+        own = self._own_wrenches(u)
+        if own is not None:
+            wrenches.append(own)
+            bodies.append(_all_bodies(self.layout))
+        return self._add_up(wrenches, bodies, u.dtype)
+
+    def _add_up(self, wrenches, bodies, dtype):
+        """The generalized force of wrenches (parts, k, velocity size) on these bodies (parts, k), group by group."""
+        if not wrenches:
+            return jnp.zeros(self.nu, dtype)
+        size = self.layout.space.velocity_size
+        entries = jnp.concatenate([own.reshape(-1, size) for own in wrenches])
+        of_bodies = placed_sums(np.concatenate([own.ravel() for own in bodies]), self.layout.ground)(entries).reshape(
+            -1
+        )
+        return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
+
+    def _own_wrenches(self, u):
+        """Gravity and the gyroscopic moment `−ω × J ω`, shape (bodies, velocity size); None where there is neither."""
+        size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
+        parts = []
+        if self.gravity is not None:
+            parts.append(jnp.pad(self.mass[:, None] * self.gravity[None, :], ((0, 0), (0, size - dimension))))
+        if self.spatial and any(self.layout.rotates):
+            omega = self.velocities(u)[:, 3:]
+            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.moments_of_inertia, omega)
+            parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
+        return sum(parts[1:], start=parts[0]) if parts else None
+
+    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "ground v v"]:
+        """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
+        coordinates.
+        """
+        size = self.layout.space.velocity_size
+        if not self.spatial:
+            return jnp.zeros((self.layout.ground, size, size), u.dtype)
+        moment = lambda J, w: -cross(w, J @ w)
+        own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
+        return jnp.pad(own, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
+
+    # Implicit methods
+
+    @property
+    def has_field_jacobian(self) -> bool:
+        return self.nz == 0
+
+    @property
+    def implicit_in_blocks(self) -> bool:
+        in_blocks = self.elimination is not None or self.acceleration_rows == 0
+        plain = self.ideal_on_velocities and self.has_field_jacobian
+        return plain and in_blocks and self.nu >= _LEAST_VELOCITIES
+
+    def field_jacobian(self, t, y):
+        return motion_jacobian(self, t, y)
+
+    # Energy and momentum
+
+    @eqx.filter_jit
+    def kinetic_energy(self, t, q, u):
+        return 0.5 * jnp.dot(u, self.inertia(t, q, u).product(u))
+
+    @eqx.filter_jit
+    def potential_energy(self, t, q):
+        poses = self.prepared_poses(q)
+        energy = sum((g.energy(t, poses) for g in self.forces), start=jnp.zeros((), q.dtype))
+        if self.gravity is not None:
+            position = self.poses(q)[:, : self.layout.space.dimension]
+            energy = energy - jnp.sum(self.mass * (position @ self.gravity))
+        return energy
+
+    def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
+        """`Σ m v` [kg m/s], world axes."""
+        del q
+        return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
+
+    def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
+        space.
+        """
+        poses, velocities = self.poses(q), self.velocities(u)
+        if not self.spatial:
+            x, v = poses[:, :2], velocities[:, :2]
+            orbital = self.mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])
+            return jnp.sum(orbital + self.moments_of_inertia * velocities[:, 2])
+        spin = jax.vmap(lambda p, J, w: rotate(p, J @ w))(poses[:, 3:], self.moments_of_inertia, velocities[:, 3:])
+        orbital = jax.vmap(cross)(poses[:, :3], self.mass[:, None] * velocities[:, :3])
+        return jnp.sum(spin + orbital, axis=0)
+
+    # Scales
+
+    def coordinate_scale(self):
+        return self._scale(self.layout.pose_index, self.nq)
+
+    def velocity_scale(self):
+        return self._scale(self.layout.velocity_index, self.nu)
+
+    def _scale(self, index, size):
+        length = lax.stop_gradient(self.length)
+        translation = [False] * size
+        for body in index[: self.layout.bodies]:
+            for k in body[: self.layout.space.dimension]:
+                translation[k] = True
+        for own, row in zip(self.layout.scalars, index[self.layout.bodies : -1], strict=True):
+            if row[0] < size:
+                translation[row[0]] = own.is_length
+        return jnp.where(np.array(translation), length, 1.0)
+
+
+class _MixedInertia(AbstractInertia):
+    """Spatial bodies, point masses and scalar coordinates together. `blocks` has unit blocks for the rotations of
+    those that do not rotate.
+    """
+
+    blocks: BlockInertia
+    layout: Layout = eqx.field(static=True)
+
+    def product(self, v):
+        return self._through(self.blocks.product, v)
+
+    def solve(self, f):
+        return self._through(self.blocks.solve, f)
+
+    def root(self):
+        return _MixedInertia(self.blocks.root(), self.layout)
+
+    def transpose(self):
+        return _MixedInertia(self.blocks.transpose(), self.layout)
+
+    def _through(self, apply, v):
+        index = self.layout.velocity_index[:-1].ravel()
+        columns = v.reshape(v.shape[0], -1)
+        full = jnp.pad(columns, ((0, 1), (0, 0)))[index]
+        return apply(full)[self.layout.velocity_place].reshape(v.shape)
+
+
+def _join(blocks, dtype):
+    return jnp.concatenate([b.reshape(-1) for b in blocks]) if blocks else jnp.zeros(0, dtype)
+
+
+def _rotating(layout: Layout):
+    return [k for k, rotates in enumerate(layout.rotates) if rotates]
+
+
+def _all_bodies(layout: Layout):
+    return np.arange(layout.bodies)[:, None]
+
+
+def _is_inertial(group):
+    return isinstance(group.group.part, AbstractInertialConstraint)
+
+
+@eqx.filter_jit
+def _with_scalars(system, guess):
+    t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
+    layout = system.layout
+    for g in system._inertial:
+        scalars = g.group.body_index[:, -1]
+        unmet = g.residual(t, system.prepared_poses(q))[:, 0]
+        q = q.at[layout.pose_index[scalars, 0]].add(-unmet)
+        unmet = g.velocity(t, system.prepared_poses(q), system.all_velocities(u))[:, 0]
+        u = u.at[layout.velocity_index[scalars, 0]].add(-unmet)
+    return dataclasses.replace(guess, q=q, u=u)
