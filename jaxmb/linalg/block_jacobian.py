@@ -81,6 +81,11 @@ class JointOrder:
         """Whether every body has all its velocities, so that those of the bodies are a plain reshape of all."""
         return self.velocity_place.size == self.velocity_index[:-1].size
 
+    @property
+    def is_kept(self) -> np.ndarray:
+        """Whether each of all m rows is independent of the others."""
+        return self.kept.reshape(-1)[self.place]
+
     def of_first(self, rows: int) -> "JointOrder":
         """The same order with these rows kept at most."""
         return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
@@ -132,10 +137,20 @@ class BlockJacobian(AbstractJacobian):
 
     def dense(self):
         unit = jnp.eye(self.order.velocity_place.size, dtype=self.blocks.dtype)
-        return DenseJacobian(jax.vmap(self.product, in_axes=1, out_axes=1)(unit))
+        matrix, kept = jax.vmap(self.product, in_axes=1, out_axes=1)(unit), self.order.is_kept
+        return DenseJacobian(matrix, rows=None if kept.all() else jnp.asarray(np.flatnonzero(kept)))
 
     def of_first(self, rows):
         return BlockJacobian(self.blocks, self.order.of_first(rows))
+
+    def selected(self, rank, scale, level=None):
+        # The order of elimination leaves implied rows out.
+        del rank, scale, level
+        return self
+
+    @property
+    def active(self):
+        return jnp.asarray(self.order.is_kept, self.blocks.dtype)
 
     def _joint_rows(self, values):
         return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)

@@ -76,10 +76,6 @@ class Factor(eqx.Module):
     null_space: Float[Array, "n f"]
     rows: Int[Array, "r"] | None
 
-    def scatter_rows(self, kept: Float[Array, "r"]) -> Float[Array, "m"]:
-        """The values of all rows from those of the independent ones: zero for implied rows."""
-        return jnp.zeros(self.right_inverse.shape[1], kept.dtype).at[self.rows].set(kept)
-
 
 def full_pivot(
     A: Float[Array, "m n"],

@@ -21,11 +21,11 @@ from ..solvers._lanes import cond_of_any_lane
 from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
+from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
-from .orthogonal_projection import project_in_metric, project_normalized, projected
-from .restoration import SolvedState, restore_near
+from .orthogonal_projection import ProjectorConstraints, project_in_metric, project_normalized, projected
 from .vector_field import VectorField
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
@@ -179,7 +179,7 @@ class ProjectionTerm(AbstractManifoldTerm):
             )
             out = self._solved(t, y, projector, linearized_at.chart + iterations)
             return out._replace(failed=failed | out.failed)
-        out: Any = restore_near(self.system, t, y, linearized_at.factors, self.newton_tol)
+        out: Any = restore(self.system, t, y, linearized_at.factors, self.newton_tol)
         f = State(self.system.rates(t, out.q, out.u), out.udot)
         return ManifoldEvaluation(State(out.q, out.u), f, linearized_at.chart + out.iterations, out.failed, None)
 
@@ -210,7 +210,8 @@ class ProjectionTerm(AbstractManifoldTerm):
         gamma = -system.acceleration_residual(t, y.q, y.u, jnp.zeros_like(y.u))
         udot, multipliers = projector.solve(system.force(t, y.q, y.u), gamma)
         f = State(system.rates(t, y.q, y.u), udot)
-        return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
+        solved = SolvedState(ProjectorConstraints(y.q, projector), udot, multipliers)
+        return ManifoldEvaluation(y, f, chart, jnp.array(False), solved)
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)

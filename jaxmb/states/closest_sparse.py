@@ -219,7 +219,7 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
     projector, order = at.projector, at.projector.jacobian
     curved = _curvature(system, t, q, guess, fixed, at.multipliers)
     free = ~fixed
-    independent = order.scatter_rows(order.gather_rows(jnp.ones(system.acceleration_rows, q.dtype)))
+    independent = order.active
 
     # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
     join = lambda v, multipliers: jnp.concatenate([v, multipliers])
