@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_importers import HINGE, ROD, check_dynamics, file, kinds, part, rod
-from test_importers_xml import body, hinge, joint, link, model, robot
+from test_mjcf import HINGE, ROD, check_dynamics, file, kinds, part, rod
+from test_urdf_and_sdf import body, hinge, joint, link, model, robot
 
 import jaxmb as mb
 from jaxmb import importers

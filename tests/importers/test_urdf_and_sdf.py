@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from test_importers import kinds, part
+from test_mjcf import kinds, part
 
 import jaxmb as mb
 from jaxmb import importers

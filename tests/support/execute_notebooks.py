@@ -1,4 +1,4 @@
-"""Execute notebooks, and record in them what was executed: `python tests/execute_notebooks.py [name …]`.
+"""Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
 
 Without names all notebooks are executed, and the figure `work_precision` of the README is made. A notebook keeps the
 version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares them with the package
@@ -16,7 +16,7 @@ from nbclient import NotebookClient
 
 import jaxmb
 
-FOLDER = Path(__file__).parents[1] / "notebooks"
+FOLDER = Path(__file__).parents[2] / "notebooks"
 # The rounding errors of two machines have nothing in common, and errors of solutions their size.
 ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 MODULES = [
-    "test_planar_parts.py",
-    "test_simulate.py",
+    "parts/planar/test_planar_parts.py",
+    "simulate/test_simulate.py",
     "solvers/test_adams_accuracy.py",
     "solvers/test_manifold_term.py",
 ]

@@ -17,7 +17,7 @@ import pytest
 import test_contact
 import test_every_part as parts
 import test_gradient_roads as roads
-import test_jumps
+import test_impulse
 import test_registry
 from derivative_checks import Case, Machine, check
 
@@ -238,7 +238,7 @@ def jumps(**options):
         jnp.zeros_like(velocities).at[0, 1].set(jnp.where(t < p["on"], 0.0, p["push"]))
     )
     push = mb.Force("push", "rod", law, parameters={"on": 0.12, "push": 20.0})
-    system = mb.with_parameters(test_jumps.driven_arm(push), {"drive.when": 0.05})
+    system = mb.with_parameters(test_impulse.driven_arm(push), {"drive.when": 0.05})
 
     def observe(system, extra, rtol, adjoint):
         own = mb.parameters(system)

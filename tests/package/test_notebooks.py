@@ -47,7 +47,7 @@ def test_lint(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_outputs_are_those_of_the_cells(path):
-    """After a change of a cell or of the version: `python tests/execute_notebooks.py NAME`."""
+    """After a change of a cell or of the version: `python tests/support/execute_notebooks.py NAME`."""
     notebook = nbformat.read(path, as_version=4)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert notebook.metadata.jaxmb.version == mb.__version__
@@ -90,7 +90,7 @@ def test_what_counts_as_another_output():
 
 
 def test_the_figure_of_the_readme_shows_what_is_computed():
-    """After a change: `python tests/execute_notebooks.py work_precision`."""
+    """After a change: `python tests/support/execute_notebooks.py work_precision`."""
     with Image.open(FOLDER / "work_precision.png") as image:
         shown = json.loads(image.text["Description"])
     assert shown["jaxmb"] == mb.__version__ and shown["mechanism"] == "andrews"

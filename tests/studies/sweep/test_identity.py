@@ -50,7 +50,7 @@ def test_another_process_with_other_hashes_knows_all_of_them():
         "from jaxmb.studies.sweep.identity import identity_of_function as identity\n"
         "print(json.dumps({name: [identity(make())[0] for make in both] for name, both in s.CHANGES.items()}))"
     )
-    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(mb.__file__).parents[1])])
+    paths = os.pathsep.join([str(Path(swept_machines.__file__).parent), str(Path(mb.__file__).parents[1])])
     environment = os.environ | {"PYTHONPATH": paths, "PYTHONHASHSEED": "123", "JAX_ENABLE_X64": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == {name: [identity(make()) for make in both] for name, both in CHANGES.items()}
