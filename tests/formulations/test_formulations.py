@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_to_run_long
+from every_formulation import FORMULATIONS
 
 import jaxmb as mb
 from jaxmb.formulations import (
     AbstractFormulation,
     Multipliers,
-    NullSpace,
     Partitioned,
     Poincare,
     UdwadiaKalaba,
@@ -27,15 +27,6 @@ from jaxmb.linalg.elimination import eliminate, full_pivot
 from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
 
-FORMULATIONS = {
-    "partitioned": Partitioned(),
-    "multipliers": Multipliers(),
-    "null_space": NullSpace(),
-    "poincare": Poincare(),
-    "moore_penrose": UdwadiaKalaba(),
-    "inverses": UdwadiaKalaba("inverses"),
-    "singular_mass": UdwadiaKalaba("singular_mass"),
-}
 WITHOUT_INVERSE_OF_MASS = {name: FORMULATIONS[name] for name in ("partitioned", "null_space", "singular_mass")}
 N, RANK = 7, 4
 

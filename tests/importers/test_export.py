@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from test_mjcf import check_dynamics, random_states
+from model_files import check_dynamics, random_states
 
 import jaxmb as mb
 from jaxmb import importers, spatial

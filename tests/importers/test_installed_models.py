@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_mjcf import OFF, check_dynamics, random_states
+from model_files import OFF, check_dynamics, random_states
 
 import jaxmb as mb
 from jaxmb import contact, importers, spatial, terrain

@@ -3,8 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_mjcf import HINGE, ROD, check_dynamics, file, kinds, part, rod
-from test_urdf_and_sdf import body, hinge, joint, link, model, robot
+from model_files import HINGE, ROD, body, check_dynamics, file, hinge, joint, kinds, link, model, part, robot, rod
 
 import jaxmb as mb
 from jaxmb import importers

@@ -4,30 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from test_mjcf import kinds, part
+from model_files import INERTIAL, MASS, body, hinge, joint, kinds, link, model, part, robot
 
 import jaxmb as mb
 from jaxmb import importers
 from jaxmb.importers.description import quaternion, roll_pitch_yaw
-
-INERTIAL = (
-    '<inertial><origin xyz=".1 0 .02" rpy="0 .3 0"/><mass value="2"/>'
-    '<inertia ixx=".02" iyy=".05" izz=".04" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
-
-
-def robot(*elements):
-    return "<robot name='r'>\n" + "\n".join(elements) + "\n</robot>"
-
-
-def link(name, inside=INERTIAL):
-    return f"<link name='{name}'>{inside}</link>"
-
-
-def joint(name, parent, child, kind="revolute", inside="<axis xyz='0 1 0'/>"):
-    ends = f"<parent link='{parent}'/><child link='{child}'/><origin xyz='.3 0 .1' rpy='0 0 .5'/>"
-    return f"<joint name='{name}' type='{kind}'>{ends}{inside}</joint>"
-
 
 ARM = robot(
     link("world", ""),
@@ -48,13 +29,13 @@ def test_a_urdf_tree_is_what_mujoco_reads_of_it():
     data = mujoco.MjData(other)
     mujoco.mj_kinematics(other, data)
     assert [body.name for body in own.scene.bodies] == ["upper", "lower"]
-    for body in own.scene.bodies:
-        k = other.body(body.name).id
-        assert float(body.mass) == pytest.approx(other.body_mass[k], rel=1e-14)
-        np.testing.assert_allclose(body.position, data.xpos[k], atol=1e-14)
-        np.testing.assert_allclose(body.orientation, data.xquat[k], atol=1e-14)
+    for rigid in own.scene.bodies:
+        k = other.body(rigid.name).id
+        assert float(rigid.mass) == pytest.approx(other.body_mass[k], rel=1e-14)
+        np.testing.assert_allclose(rigid.position, data.xpos[k], atol=1e-14)
+        np.testing.assert_allclose(rigid.orientation, data.xquat[k], atol=1e-14)
         turn = roll_pitch_yaw((0.0, 0.3, 0.0))
-        np.testing.assert_allclose(body.inertia, turn @ np.diag([0.02, 0.05, 0.04]) @ turn.T, atol=1e-15)
+        np.testing.assert_allclose(rigid.inertia, turn @ np.diag([0.02, 0.05, 0.04]) @ turn.T, atol=1e-15)
     np.testing.assert_allclose(part(own, "shoulder").axis_a, roll_pitch_yaw((0, 0, 1.0)) @ [0, 1, 0], atol=1e-15)
 
 
@@ -178,22 +159,6 @@ def test_wrong_urdf(text, message):
 
 
 # SDF
-
-MASS = "<inertial><mass>1</mass><inertia><ixx>.02</ixx><iyy>.05</iyy><izz>.04</izz></inertia></inertial>"
-
-
-def model(*elements):
-    return "<sdf version='1.6'><model name='m'>\n" + "\n".join(elements) + "\n</model></sdf>"
-
-
-def body(name, pose="0 0 0 0 0 0", inside=MASS):
-    return f"<link name='{name}'><pose>{pose}</pose>{inside}</link>"
-
-
-def hinge(name, parent, child, pose="0 0 0 0 0 0", kind="revolute", axis="<xyz>0 1 0</xyz>"):
-    ends = f"<parent>{parent}</parent><child>{child}</child>"
-    return f"<joint name='{name}' type='{kind}'><pose>{pose}</pose>{ends}<axis>{axis}</axis></joint>"
-
 
 FOUR_BAR = model(
     body("crank", "0 0 0 0 -1.5708 0"),

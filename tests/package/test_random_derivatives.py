@@ -14,12 +14,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_contact
-import test_every_part as parts
-import test_gradient_roads as roads
-import test_impulse
-import test_registry
 from derivative_checks import Case, Machine, check
+from driven_arm import driven_arm
+from every_part import EXAMPLES, FUNCTIONS, Example, hold_2d, pin_2d, rubbing_3d
+from exports import OF_SCENES, exported
+from laws import FRICTION, LAWS, TERRAINS
+from sprung_pendulums import HANGING, double_pendulum, pendulum as sprung_pendulum
 
 import jaxmb as mb
 from jaxmb import formulations, lagrangian, manifold, mechanisms, planar, solvers, spatial
@@ -116,14 +116,14 @@ def at_one_instant(examples, formulation):
 
 
 def named(space, *names):
-    return [parts.EXAMPLES[f"{space}: {name}"] for name in names]
+    return [EXAMPLES[f"{space}: {name}"] for name in names]
 
 
 def on_the_ground():
     """Every terrain and law, each under a wheel of its own that has sunk in by two centimetres."""
     examples = []
-    normals, frictions = list(test_contact.LAWS.values()), list(test_contact.FRICTION.values())
-    for k, (name, ground) in enumerate(test_contact.TERRAINS.items()):
+    normals, frictions = list(LAWS.values()), list(FRICTION.values())
+    for k, (name, ground) in enumerate(TERRAINS.items()):
         x = 4.4
         height = float(ground.height(jnp.array([x]))) + 0.28
         body = planar.Body(
@@ -138,7 +138,7 @@ def on_the_ground():
             radius=0.3,
             damping=500.0,
         )
-        examples.append(parts.Example(part, [body], "radius"))
+        examples.append(Example(part, [body], "radius"))
     return examples
 
 
@@ -182,7 +182,7 @@ INSTANTS = {
         named("planar", "PointOnCurve", "Gear", "RackAndPinion", "Driver", "Driver of a distance"),
         Poincare(),
     ),
-    "planar velocities, laws and functions": ([*named("planar", "KnifeEdge"), *parts.FUNCTIONS], Multipliers()),
+    "planar velocities, laws and functions": ([*named("planar", "KnifeEdge"), *FUNCTIONS], Multipliers()),
     "planar forces": (PLANAR_FORCES, Multipliers()),
     "spatial joints": (
         named("spatial", "Spherical", "Revolute", "Universal", "Gimbal", "Cylindrical"),
@@ -194,7 +194,7 @@ INSTANTS = {
     ),
     "spatial points": (named("spatial", "Distance", "PointOnPlane", "PointOnLine", "Driver"), NullSpace()),
     "spatial rolling": (named("spatial", "KnifeEdge", "RollingDisk", "RollingSphere"), UdwadiaKalaba("singular_mass")),
-    "spatial friction": ([parts.rubbing_3d()], Partitioned()),
+    "spatial friction": ([rubbing_3d()], Partitioned()),
     "spatial forces": (SPATIAL_FORCES, Multipliers()),
     "ground": (on_the_ground(), Multipliers()),
 }
@@ -203,7 +203,7 @@ INSTANTS = {
 # Fronts
 
 
-def pendulum(seen, *, observe=None, scene=roads.double_pendulum, **options):
+def pendulum(seen, *, observe=None, scene=double_pendulum, **options):
     """A scene of `test_gradient_roads`, with its initial rate, and what is seen of its motion."""
     system, _, fix, rate = scene()
 
@@ -228,8 +228,8 @@ SEEN = ("rod.position", "rod.angular_velocity", "shank.velocity", "knee.force", 
 def event(**options):
     """The time of an event, and the state there."""
     seen = lambda sol: {"when": sol.ts[-1:], "q": sol.ys.q[-1], "u": sol.ys.u[-1]}
-    own = {"event": roads.HANGING, "saveat": None, "t1": 1.0} | options
-    return pendulum(("when", "q", "u"), observe=seen, scene=roads.pendulum, **own)
+    own = {"event": HANGING, "saveat": None, "t1": 1.0} | options
+    return pendulum(("when", "q", "u"), observe=seen, scene=sprung_pendulum, **own)
 
 
 def jumps(**options):
@@ -238,7 +238,7 @@ def jumps(**options):
         jnp.zeros_like(velocities).at[0, 1].set(jnp.where(t < p["on"], 0.0, p["push"]))
     )
     push = mb.Force("push", "rod", law, parameters={"on": 0.12, "push": 20.0})
-    system = mb.with_parameters(test_impulse.driven_arm(push), {"drive.when": 0.05})
+    system = mb.with_parameters(driven_arm(push), {"drive.when": 0.05})
 
     def observe(system, extra, rtol, adjoint):
         own = mb.parameters(system)
@@ -270,7 +270,7 @@ class Disc(planar.AbstractRigidBody):
 
 def body_of_a_user(**options):
     own = Disc("disc", radius=0.4, density=3.0, position=(0.5, 0.0), velocity=(0.0, 1.0), angular_velocity=2.0)
-    example = parts.Example(parts.pin_2d(own), [own], "point_b", (), (parts.hold_2d(own),))
+    example = Example(pin_2d(own), [own], "point_b", (), (hold_2d(own),))
     case = side_by_side([example], **options)
     machine = case.machines[0]
     machine.always, case.parameters, case.outputs = ["disc.radius", "disc.density"], 5, 6
@@ -548,14 +548,14 @@ def kinds_within(value):
 
 def left_out(module, kinds, found):
     """Names of the classes of these kinds that a module exports and that were not found."""
-    return {name for name in test_registry.exported(module, kinds) if getattr(module, name) not in found}
+    return {name for name in exported(module, kinds) if getattr(module, name) not in found}
 
 
 def test_every_part_and_law_stands_in_a_scene():
     examples = [example for own, _ in [*GROUPS.values(), *INSTANTS.values()] for example in own]
     found = kinds_within([[e.part, e.bodies, e.joints, e.forces] for e in examples]) | {mb.Gravity}
     for module in (planar, spatial, mb):
-        assert left_out(module, test_registry.OF_SCENES, found) == set()
+        assert left_out(module, OF_SCENES, found) == set()
     for module, kind in ((contact, AbstractNormalLaw), (contact, AbstractFrictionLaw), (terrain, AbstractTerrain)):
         assert left_out(module, kind, found) == set()
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_every_part import EXAMPLES
+from every_part import EXAMPLES
 
 import jaxmb as mb
 from jaxmb import planar, spatial

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_formulations import FORMULATIONS
+from every_formulation import FORMULATIONS
 
 import jaxmb as mb
 from jaxmb import planar, spatial

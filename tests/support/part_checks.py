@@ -8,6 +8,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from exports import PARTS, missing
+from rough_machines import SCENES
+
+from jaxmb.parts import fields
 
 # A joint is given in one of these ways in the world, which `resolve` turns into numbers fixed in its bodies.
 IN_THE_WORLD = ("point", "axes_W", "points_W", "axis", "axis_a_W", "axis_b_W", "axis_1_W", "axis_2_W", "axis_3_W")
@@ -126,3 +130,14 @@ def check_joint_stacks(setup):
     batch = jax.jit(jax.vmap(setup.residual))(stacked, poses)
     for k, part in enumerate((setup.part, other)):
         np.testing.assert_allclose(batch[k], setup.residual(part, poses[k]), rtol=0, atol=1e-14)
+
+
+def check_every_part_has_cases(module, quantities, *tables):
+    """Every part that `planar` or `spatial` exports stands in these tables, or in a machine whose joints are rough."""
+    # The cases of a driver are the quantities that it can drive.
+    (known,) = (own.of for own in fields.declarations(module.Driver).values() if own.kind == "choice")
+    assert set(quantities) == set(known)
+    systems = [scene() for scene in SCENES.values()]
+    dimension = module.Body("a", mass=1.0, inertia=1.0).dimension
+    laws = [g.group.part for own in systems if own.layout.space.dimension == dimension for g in own.nonideal]
+    assert missing(module, PARTS, *tables, ["Driver"], laws) == set()

@@ -2,16 +2,17 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_moving_pictures import motion_of
+from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar, spatial, terrain, viz
+from jaxmb.linalg.rotations import rotate
 from jaxmb.parts import contact
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
-from jaxmb.viz.motion import _default
 
 TS = np.linspace(0.0, 1.0, 5)
 
@@ -115,10 +116,6 @@ def test_in_space_the_angles_are_those_of_joints():
     motion = motion_of(system, [0.0, 1.0], np.tile(np.asarray(system.guess.q), (2, 1)), np.zeros((2, 6)))
     first, rate = viz.plot_motion(motion, "pin").axes[:2]
     assert list(drawn(first)) == list(drawn(rate)) == ["pin"]
-    assert _default(system) == [
-        *("nut.position", "nut.velocity", "pin.angle", "pin.angle_rate"),
-        *("pin.displacement", "pin.displacement_rate"),
-    ]
     axes = viz.plot_mechanism(motion).axes[0]
     bars = [np.stack(line.get_data_3d(), axis=1) for line in axes.lines]
     bars = [points for points in bars if len(points) == 2]
@@ -127,6 +124,32 @@ def test_in_space_the_angles_are_those_of_joints():
     assert axes.get_zlabel() == "z [m]"
     with pytest.raises(ValueError, match="at least 1"):
         viz.plot_mechanism(motion, frames=0)
+
+
+def test_a_motion_in_space_shows_places_of_bodies_and_coordinates_of_joints():
+    """Of a nut that turns at 0.3 rad/s and moves by 0.1 m/s along its axis."""
+    nut = spatial.Body("nut", mass=1.0, inertia=np.eye(3), position=PLACE)
+    pin = spatial.Cylindrical("pin", "ground", "nut", point=(0.0, 0.0, 0.0), axis=AXIS)
+    turn = lambda t: jnp.append(jnp.cos(0.15 * t), jnp.sin(0.15 * t) * AXIS)
+    q = np.stack([np.append(rotate(turn(t), jnp.asarray(PLACE)) + 0.1 * t * AXIS, turn(t)) for t in TS])
+    velocity = 0.1 * AXIS + np.cross(0.3 * AXIS, q[:, :3])
+    system = mb.Scene([nut], joints=[pin]).compile()
+    motion = motion_of(system, TS, q, np.column_stack([velocity, np.tile(0.3 * AXIS, (5, 1))]))
+    *panels, energy, _ = viz.plot_motion(motion).axes
+    shown = {axes.get_ylabel(): drawn(axes) for axes in panels}
+    of_body = ["nut x", "nut y", "nut z"]
+    expected = {
+        "position [m]": of_body,
+        "velocity [m/s]": of_body,
+        "angle [rad]": ["pin"],
+        "angular velocity [rad/s]": ["pin"],
+        "displacement [m]": ["pin"],
+        "rate of displacement [m/s]": ["pin"],
+    }
+    assert {label: list(lines) for label, lines in shown.items()} == expected
+    for label, rate in (("angle [rad]", 0.3 * TS), ("angular velocity [rad/s]", 0.3), ("displacement [m]", 0.1 * TS)):
+        np.testing.assert_allclose(shown[label]["pin"], rate, rtol=0, atol=1e-14)
+    assert energy.get_ylabel() == "energy [J]"
 
 
 def test_a_mechanism_of_the_plane_is_drawn_in_its_shapes():

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from every_part import SPACES, compiled as built
 from pages import Page
-from test_every_part import SPACES, compiled as built
+from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
@@ -21,13 +22,6 @@ from jaxmb.parts import contact
 from jaxmb.viz.solids import solids
 
 G, MASS, INERTIA, ARM = 9.81, 2.0, 0.3, 0.6
-
-
-def motion_of(system, ts, q, u):
-    """A trajectory through given states."""
-    ys = mb.State(jnp.asarray(q), jnp.asarray(u))
-    formulation = mb.formulations.Partitioned()
-    return mb.Trajectory(system, formulation, jnp.asarray(ts), ys, {}, mb.RESULTS.successful, None, None)
 
 
 def at_rest(system, ts=(0.0, 1.0)):

@@ -8,6 +8,7 @@ import pytest
 from part_checks import (
     Case,
     Setup,
+    check_every_part_has_cases,
     check_joint_holds,
     check_joint_rank,
     check_joint_reaction,
@@ -500,3 +501,7 @@ def test_errors_of_choices():
         driver("z")
     with pytest.raises(ValueError, match="'F': frame must be"):
         planar.PointForce("F", "a", force=X, frame="space")
+
+
+def test_every_part_meets_its_identities():
+    check_every_part_has_cases(planar, QUANTITIES, CASES, ROLLING, forces().values(), BODIES)

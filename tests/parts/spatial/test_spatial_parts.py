@@ -9,6 +9,7 @@ import pytest
 from part_checks import (
     Case,
     Setup,
+    check_every_part_has_cases,
     check_joint_holds,
     check_joint_rank,
     check_joint_reaction,
@@ -811,3 +812,7 @@ def test_errors_of_choices():
         spatial.Torque("J", "b", torque=Z, frame="space")
     with pytest.raises(ValueError, match="axis must be one of"):
         spatial.rod(1.0, 1.0, "w")
+
+
+def test_every_part_meets_its_identities():
+    check_every_part_has_cases(spatial, QUANTITIES, CASES, ROLLING, forces().values(), BODIES)
