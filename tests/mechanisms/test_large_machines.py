@@ -94,7 +94,8 @@ def test_no_dense_matrix_and_programs_of_one_size():
         sizes = {shape for text in texts for shape in re.findall(r"tensor<((?:\d+x)+)f64>", text)}
         assert max(math.prod(map(int, shape[:-1].split("x"))) for shape in sizes) < 200 * n
         lines.append([text.count("\n") for text in texts])
-    assert np.all(np.array(lines[1]) <= 1.5 * np.array(lines[0]))
+    # By 1.20, 1.19 and 1.13 when this was measured: the smaller tree needs fewer of the loops.
+    assert np.all(np.array(lines[1]) <= 1.25 * np.array(lines[0]))
 
 
 @pytest.mark.long

@@ -150,10 +150,11 @@ def test_a_hanging_chain_has_the_zeros_of_laguerre_and_in_the_limit_those_of_bes
         zeros = np.polynomial.laguerre.lagroots([0.0] * n + [1.0])
         np.testing.assert_allclose(found[n], np.sqrt(n * G * zeros), rtol=1e-9)
         assert len(linear.states) == 2 * n
-    # The error of n masses falls with n.
+    # The error of n masses falls as 1/n where n is large. From 6 to 12 the zeros themselves come nearer by the factors
+    # 0.521, 0.567 and 0.743: the third mode of 6 masses is not yet that of a chain.
     limit = jn_zeros(0, 3) * np.sqrt(G) / 2
     errors = [np.abs(found[n][:3] - limit) / limit for n in (6, 12)]
-    assert np.all(errors[1] < 0.8 * errors[0]) and errors[1][0] < 0.05
+    assert np.all(errors[1] < np.array([0.53, 0.58, 0.75]) * errors[0]) and errors[1][0] < 0.05
 
 
 def bars(theta, lengths=(1.0, 3.0, 2.5), base=2.5):
