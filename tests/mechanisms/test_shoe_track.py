@@ -11,7 +11,7 @@ from compiling import jit_to_run_long
 import jaxmb as mb
 from jaxmb import mechanisms
 from jaxmb.mechanisms import ride
-from jaxmb.mechanisms._shoe_track import _laid
+from jaxmb.mechanisms._shoe_track import laid
 
 SHOE, PITCH, HEIGHT, RADII = 36.0, 0.1524, 0.06, {"sprocket": 0.2, "idler": 0.2, "wheel": 0.305}
 TIMES = jnp.linspace(0.0, 1.0, 101)
@@ -55,7 +55,7 @@ def bodies(sol, kind):
 def test_a_taut_track_lies_around_its_discs(number):
     """Its pins are one pitch apart, and none of its shoes is deep in a disc or farther out than the hull of all."""
     sprocket, idler = np.array([2.006, 0.58]), np.array([-1.824, 0.46])
-    offset, pins = _laid(mechanisms.Shoes(number=number), sprocket, idler, WHEELS, 0.305)
+    offset, pins = laid(mechanisms.Shoes(number=number), sprocket, idler, WHEELS, 0.305)
     assert len(pins) == number
     sides = np.roll(pins, -1, axis=0) - pins
     np.testing.assert_allclose(np.linalg.norm(sides, axis=1), PITCH, rtol=0, atol=1e-6)

@@ -271,8 +271,8 @@ def test_bounds_of_probabilities_hold(count, directions, rough):
         noise = random.standard_normal(count)
         residuals = noise - basis @ (basis.T @ noise)
         own = series(residuals, predicted=30 * basis[:, -1] + residuals - noise)
-        chances = [chance for *_, chance in verdict._dependences(own, residuals, directions)]
-        chances.append(verdict._chi_squared(float(np.sum(residuals**2)), count - directions))
+        chances = [chance for *_, chance in verdict.dependences(own, residuals, directions)]
+        chances.append(verdict.chi_squared(float(np.sum(residuals**2)), count - directions))
         accused += np.array(chances) < 1e-2
     assert np.all(accused / draws < 1e-2)
 
