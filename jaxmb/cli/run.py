@@ -25,10 +25,9 @@ from .options import add_parameters
 from .picture import check_picture, show_motion
 from .subject import mechanism_of
 
-# What `run` does: saved times, tolerances of the table, and the fit of one parameter to every other saved time of the
+# What `run` does: saved times, and the fit of one parameter to every other saved time of the
 # first part of the motion, with noise, from a start that is off.
 _TIMES = 401
-_TOLERANCES = (1e-5, 1e-7, 1e-9)
 _FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
 
 
@@ -40,6 +39,10 @@ def add_to(commands: Any) -> None:
     command.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
     command.add_argument("--rtol", type=float, default=1e-9, help="relative tolerance of a step (default %(default)g)")
     command.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
+    tolerances = "tolerances at which error is measured against run time (default 1e-5 1e-7 1e-9)"
+    command.add_argument(
+        "--tolerances", type=float, nargs="+", metavar="RTOL", default=(1e-5, 1e-7, 1e-9), help=tolerances
+    )
     command.add_argument("--out", type=Path, help="folder for the motion and the figures (default jaxmb-output/NAME)")
     command.add_argument("--show", action="store_true", help="write a moving picture as well, and open it in a browser")
     command.set_defaults(command=_run)
@@ -64,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     print("\nError against run time:")
     chosen = {name: solver for name, solver in default_solvers().items() if name != "Tsit5"}
-    precision = work_precision(mechanism, solvers=chosen, tolerances=_TOLERANCES)
+    precision = work_precision(mechanism, solvers=chosen, tolerances=arguments.tolerances)
     print(precision)
 
     _fit(mechanism, trajectory)

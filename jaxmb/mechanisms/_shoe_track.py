@@ -72,7 +72,7 @@ def shoe_track(
     has; `friction` with its transition `speed`, and `damping`, of wheels and idler on shoes.
     """
     p, hull = prefix, f"{prefix}hull"
-    offset, pins = _laid(shoes, place + sprocket, place + idler, wheels, radius)
+    offset, pins = laid(shoes, place + sprocket, place + idler, wheels, radius)
     middle = np.array([-offset, 0.0])
     disc = lambda mass, radius: {"mass": mass, "inertia": planar.disc(mass, radius)}
     bodies = [
@@ -182,7 +182,7 @@ def _circulation(poses, speed, pitch):
     return jnp.concatenate([0.5 * (at_pin + before), rate[:, None]], axis=1)
 
 
-def _laid(shoes, sprocket, idler, wheels, radius):
+def laid(shoes, sprocket, idler, wheels, radius):
     """How far the idler stands behind its design position, and the pins of the taut loop, counter-clockwise."""
     radii = np.array([shoes.sprocket_radius, shoes.idler_radius, *[radius] * len(wheels)]) + shoes.height / 2
     # Around sprocket and idler shoes touch with their middle, and pins stand farther out.

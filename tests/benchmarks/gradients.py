@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "solvers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from stiff_problems import PROBLEMS, solve
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "solvers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from ode_problems import PROBLEMS, evaluations_at, solve, work_precision
 

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "solvers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from stiff_problems import PROBLEMS
 

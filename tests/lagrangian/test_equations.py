@@ -26,7 +26,6 @@ from jaxmb.lagrangian import (
 )
 from jaxmb.linalg import rotations
 from jaxmb.linalg.elimination import full_pivot
-from jaxmb.mechanisms import _wheeled
 
 ZERO = jnp.zeros(())
 
@@ -200,7 +199,7 @@ def test_a_frame_chosen_by_pivots_has_no_singularity_of_its_own():
     """Platforms in line, where the connection over their angles has none."""
     constrained = library("roller_racer", form="constraints").system
     q = jnp.array([0.1, 0.2, 0.3, 0.0])
-    wheels = lambda t, q, p: _wheeled.wheels(t, q, p)
+    wheels = constrained.constraints[0].matrix
     pivots = full_pivot(wheels(ZERO, q, constrained.parameters))
     frame = pivoted_frame(wheels, pivots.order, 2)
     system = LagrangianSystem(

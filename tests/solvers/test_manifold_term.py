@@ -151,8 +151,8 @@ def test_batch_with_charts_and_failures_equals_loop():
     batch = jit_as_users_do(jax.vmap(run))(rates)
     single = jit_as_users_do(run)
     loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[single(rate) for rate in rates])
-    # Rounding makes steps a little longer or shorter.
-    np.testing.assert_allclose(batch[0], loop[0], rtol=0, atol=1e-9)
+    # Rounding makes steps a little longer or shorter, which moved the states by 6e-12 where this was measured.
+    np.testing.assert_allclose(batch[0], loop[0], rtol=0, atol=1e-10)
     np.testing.assert_array_equal(batch[1], loop[1])
     np.testing.assert_array_equal(batch[2], loop[2])
 

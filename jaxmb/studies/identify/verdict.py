@@ -71,7 +71,7 @@ def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Ite
             chance, beyond = _fair_trials(residuals.size - above, residuals.size), size > _BEYOND_MEDIAN
         elif count > 0:
             size = float(np.sqrt(squares / count))
-            chance, beyond = _chi_squared(squares, count), size > _BEYOND
+            chance, beyond = chi_squared(squares, count), size > _BEYOND
         else:
             continue
         if beyond and chance * len(groups) < _LEVEL and (worst is None or size > worst[0]):
@@ -111,7 +111,7 @@ def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[
         square = float(np.mean(residuals**2))
         if square <= own.small**2 or residuals.size < 3:
             continue
-        for reason, share, chance in _dependences(own, residuals, directions):
+        for reason, share, chance in dependences(own, residuals, directions):
             # `share` of the mean square is no noise.
             matters = share > _SHARE and share * square > own.small**2
             if matters and chance * len(found) < _LEVEL:
@@ -123,7 +123,7 @@ def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[
         yield f"the residuals are no noise: {', '.join(told[:3])}{more}"
 
 
-def _dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
+def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
     """How residuals depend on others, the share of their mean square that does, and the probability for noise."""
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
@@ -169,7 +169,7 @@ def _offset(own: Series) -> str:
     )
 
 
-def _chi_squared(value: float, freedoms: int) -> float:
+def chi_squared(value: float, freedoms: int) -> float:
     """At least the probability that a sum of squares of normal variables is larger."""
     ratio = value / freedoms
     return float(np.exp(-0.5 * freedoms * (ratio - 1 - np.log(ratio)))) if ratio > 1 else 1.0

@@ -1,0 +1,147 @@
+"""The command line, run in this process."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import jaxmb as mb
+from jaxmb.cli import main
+from jaxmb.cli.commands import parser
+
+
+def test_mechanisms(capsys):
+    assert main(["mechanisms"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert tuple(line.split()[0] for line in lines) == mb.mechanisms.names()
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_run(capsys, tmp_path):
+    """A run prints errors against reference values and a fit next to the truth, and writes its files."""
+    words = ["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    for text in ("pendulum", "elliptic functions", "Error against run time", "Identifying bar.length", "true value 1"):
+        assert text in out
+    motion = mb.load(tmp_path / "motion.npz")
+    assert motion["t"][-1] == 1.0 and motion["bob.position"].shape == (motion["t"].size, 2)
+    for name in ("work_precision.png", "motion.png", "mechanism.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_of_a_lagrangian_system(capsys, tmp_path):
+    """Coordinates take the place of positions, and of the picture of the mechanism."""
+    assert main(["run", "roller_racer", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for text in (
+        "QuasiVelocityFrame",
+        "no constraints",
+        "DOP853",
+        "Identifying handle from coordinates",
+        "true value 0.2",
+    ):
+        assert text in out
+    assert mb.load(tmp_path / "motion.npz")["theta"][-1] == pytest.approx(6.2350455697, abs=1e-6)
+    assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
+
+
+def test_report(capsys, tmp_path, monkeypatch):
+    """Of a mechanism, and of a variant of it."""
+    monkeypatch.setattr("jaxmb.cli.report._VARIANTS", {"pendulum": ({"mass": 2.0},)})
+    words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("Adams", "Tsit5", "Dopri8"))
+    assert len(json.loads((tmp_path / "work_precision.json").read_text())["runs"]) == 3
+    # What partitioning costs, and the same with all coordinates.
+    costs = json.loads((tmp_path / "method_costs.json").read_text())["costs"]
+    assert {cost["bound"] for cost in costs} == {1e-3, 1e-5, 1e-7} and "multipliers, Baumgarte" in out
+    for cost in costs:
+        assert 0 < cost["error"] <= cost["bound"] and cost["evaluations"] > 0 and cost["flops"] > 0
+    assert "The same with mass=2.0:" in out
+    assert (tmp_path / "mass=2.0" / "method_costs.json").exists()
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["run", "pendulm"], "did you mean 'pendulum'"),
+        (["report", "pendulm"], "did you mean 'pendulum'"),
+        (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
+        (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
+        (["report", "costs", "pendulum"], "got 'costs' before it"),
+        (["run", "pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
+        (["run", "pendulum", "--set", "mass=heavy"], "pendulum cannot be built with --set mass='heavy'"),
+        (["run", "pendulum", "--set", "mass=[1, 2]"], "pendulum cannot be built with --set mass=[1, 2]"),
+        (["report", "n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
+        (["report", "train", "--set", "n={}"], "train cannot be built with --set n={}"),
+    ],
+)
+def test_wrong_words(words, message, capsys, tmp_path):
+    assert main([*words, "--out", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_report_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text("def scene(mass, length=1.0):\n    raise ValueError('called')\n")
+    words = ["report", f"{file}:scene", "--out", str(tmp_path / "out")]
+    for given, message in (
+        ([], "own.py:scene: missing a required argument: 'mass'; --set NAME=VALUE"),
+        (["--set", "mas=2"], "missing a required argument: 'mass'"),
+        (["--set", "mass=1", "--set", "lenth=2"], "got an unexpected keyword argument 'lenth'"),
+        (["--set", "mass=1"], "called"),
+    ):
+        assert main([*words, *given]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_no_traceback_of_wrong_values(capsys, tmp_path):
+    """One line, whatever the mechanism did with the value."""
+    assert main(["run", "four_bar", "--set", "speed=fast", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_where_to_write_is_checked_first(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(mb.mechanisms, "get", lambda *args, **kwargs: pytest.fail("built before the check"))
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    for out in (taken, taken / "deeper"):
+        assert main(["run", "pendulum", "--out", str(out)]) == 2
+        assert "is a file and not a folder" in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda *args: False)
+    assert main(["report", "pendulum", "--out", str(tmp_path / "new")]) == 2
+    assert "is not writable" in capsys.readouterr().err
+
+
+def test_interrupted(capsys, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mb.mechanisms, "get", interrupt)
+    assert main(["run", "pendulum"]) == 130
+    assert capsys.readouterr().err == "jaxmb: interrupted\n"
+
+
+def test_no_command(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    assert "usage: jaxmb" in capsys.readouterr().err
+
+
+def test_parameters_of_a_mechanism():
+    parse = parser().parse_args
+    assert dict(parse(["run", "tracked_vehicle", "--set", "units=2", "--set", "model=bodies"]).set) == {
+        "units": 2,
+        "model": "bodies",
+    }
+    with pytest.raises(SystemExit):
+        parse(["run", "pendulum", "--set", "mass"])
+
+
+def test_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "jaxmb", "--help"], capture_output=True, text=True, check=True)
+    assert "mechanisms" in done.stdout

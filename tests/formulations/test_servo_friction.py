@@ -1,0 +1,279 @@
+"""Scenes whose joints are not all ideal, and servo constraints."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rough_machines import GRAVITY, SCENES, manipulator, pendulum, sledge
+
+import jaxmb as mb
+from jaxmb import formulations, planar
+from jaxmb.formulations.formulation import accelerations
+from jaxmb.linalg.rotations import rotate, rotate_2d
+
+
+def random_state(system, seed):
+    rng = np.random.default_rng(seed)
+    guess = system.guess.q + 0.2 * rng.normal(size=system.nq)
+    state = mb.assemble(system, guess=mb.State(guess, jnp.asarray(rng.normal(size=system.nu))))
+    return state.q, state.u
+
+
+def test_sliding_block():
+    """Uphill it is slowed by weight and friction; N is that of the slope."""
+    system = sledge()
+    start = mb.assemble(system)
+    motion = mb.simulate(system, start, t1=0.3, rtol=1e-10)
+    speed = 3 - 9.81 * (np.sin(0.3) + 0.2 * np.cos(0.3)) * 0.3
+    # The friction is smoothed at 1e-4 of some m/s.
+    np.testing.assert_allclose(np.linalg.norm(motion["block"].velocity[-1]), speed, rtol=1e-8)
+    force = motion.reactions["rail"].force[-1]
+    np.testing.assert_allclose(np.linalg.norm(force), 2 * 9.81 * np.cos(0.3), rtol=1e-9)
+
+
+def test_friction_takes_the_energy():
+    """The energy that a swing loses is the work against the pin's friction, μ N r |ω|."""
+    system = pendulum()
+    start = mb.assemble(system)
+    times = np.linspace(0.0, 0.6, 61)
+    motion = mb.simulate(system, start, t1=0.6, rtol=1e-11, saveat=jnp.asarray(times))
+    # The pin carries the weight and what accelerates the arm.
+    bearing = 1.5 * np.linalg.norm(np.asarray(motion.accelerations)[:, :2] + np.array([0.0, 9.81]), axis=-1)
+    slip = 0.05 * np.asarray(motion["arm"].angular_velocity)
+    power = 0.3 * bearing * slip * np.tanh(slip / 1e-4)
+    # Simpson's rule, away from the start, where the slip grows through the transition.
+    h, p = times[1] - times[0], power[20:]
+    work = h / 3 * (p[0] + 4 * np.sum(p[1:-1:2]) + 2 * np.sum(p[2:-1:2]) + p[-1])
+    energy = np.asarray(motion.energy)
+    np.testing.assert_allclose(energy[20] - energy[-1], work, rtol=1e-7)
+    assert energy[20] - energy[-1] > 0.01
+
+
+def without_friction(system):
+    return eqx.tree_at(lambda s: s.nonideal, system, ())
+
+
+def test_program_is_reached_as_its_gains_say():
+    """Started off the program, the deviation decays as φ̈ + 6 φ̇ + 9 φ = 0: (φ0 + (φ̇0 + 3 φ0) t) e^(−3t)."""
+    system = manipulator()
+    start = mb.assemble(system)
+    times = np.linspace(0.0, 1.5, 7)
+    motion = mb.simulate(system, start, t1=1.5, rtol=1e-10, saveat=jnp.asarray(times))
+    lower = motion["lower"]
+    phi = np.asarray(lower.position[:, 1]) - 0.2 * np.sin(times)
+    rate = float(lower.velocity[0, 1]) - 0.2
+    expected = (phi[0] + (rate + 3 * phi[0]) * times) * np.exp(-3 * times)
+    assert abs(phi[0]) > 0.1
+    np.testing.assert_allclose(phi, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_formulation(name):
+    """The same accelerations and reactions on every road; friction works against the slip, and as a force of the
+    user's function.
+    """
+    system = SCENES[name]()
+    roads = [
+        formulations.Partitioned(),
+        formulations.Multipliers(),
+        formulations.NullSpace(),
+        formulations.Poincare(),
+        *map(formulations.UdwadiaKalaba, ("moore_penrose", "inverses", "singular_mass")),
+    ]
+
+    @jax.jit
+    def every(q, u):
+        return [accelerations(system, road, jnp.array(0.3), q, u) for road in roads]
+
+    for seed in range(3):
+        q, u = random_state(system, seed)
+        (first, multipliers), *others = every(q, u)
+        residual = system.acceleration_residual(0.3, q, u, first)
+        np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.max(np.abs(first)))
+        power = u @ system.nonideal_force(0.3, q, u, multipliers)
+        assert power < 0
+        for udot, own in others:
+            np.testing.assert_allclose(udot, first, rtol=1e-10, atol=1e-10 * np.max(np.abs(first)))
+            np.testing.assert_allclose(own, multipliers, rtol=1e-9, atol=1e-9 * np.max(np.abs(multipliers)))
+
+
+def newton_euler(system, motion):
+    """Mass times acceleration and rate of spin, less all forces and moments about the mass centres, world axes."""
+    names, planar_ = system.body_names, not system.spatial
+    d, parameters = (2 if planar_ else 3), {name: np.asarray(own) for name, own in mb.parameters(system).items()}
+
+    def turn(name, v):
+        own = motion[name]
+        return np.asarray(jax.vmap(rotate_2d)(own.angle, v) if planar_ else jax.vmap(rotate)(own.orientation, v))
+
+    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0] if planar_ else np.cross(a, b)
+    left = {}
+    for k, name in enumerate(names):
+        udot = np.asarray(motion.accelerations).reshape(len(motion.ts), len(names), -1)[:, k]
+        mass, inertia = parameters[f"{name}.mass"], parameters[f"{name}.inertia"]
+        if planar_:
+            spin = inertia * udot[:, 2]
+        else:
+            w = np.asarray(motion[name].angular_velocity)
+            spin = turn(name, udot[:, 3:] @ inertia + np.cross(w, w @ inertia))
+        left[name] = [mass * (udot[:, :d] - parameters["gravity.acceleration"]), spin]
+
+    def act(name, force, moment):
+        if name != "ground":
+            left[name][0] = left[name][0] - force
+            left[name][1] = left[name][1] - moment
+
+    for joint, (body_a, body_b, field) in JOINTS_OF[names].items():
+        place = np.zeros(d) if field is None else parameters[f"{joint}.{field}"]
+        point = np.asarray(motion[body_b].position) + turn(body_b, jnp.broadcast_to(place, (len(motion.ts), d)))
+        force, moment, _ = map(np.asarray, motion.reactions[joint])
+        for name, sign in ((body_a, -1), (body_b, 1)):
+            arm = 0.0 if name == "ground" else cross(point - np.asarray(motion[name].position), force)
+            act(name, sign * force, sign * (moment + arm))
+    for law, bodies in LAWS_OF[names].items():
+        wrenches = np.asarray(motion.forces[law])
+        assert wrenches.shape[1] == len(bodies) and np.max(np.abs(wrenches)) > 1e-3
+        for j, name in enumerate(bodies):
+            moment = wrenches[:, j, 2] if planar_ else wrenches[:, j, 3:]
+            act(name, wrenches[:, j, :d], moment if planar_ or name == "ground" else turn(name, moment))
+    return left
+
+
+# The bodies of joints, with the field of the point on the second, and those of the friction laws.
+JOINTS_OF = {
+    ("arm",): {"pin": ("ground", "arm", "point_b")},
+    ("upper", "lower"): {
+        "shoulder": ("ground", "upper", "point_b"),
+        "elbow": ("upper", "lower", "point_b"),
+        "tip": ("ground", "lower", None),
+    },
+    ("carriage", "arm"): {
+        "rail": ("ground", "carriage", "point_b"),
+        "hinge": ("carriage", "arm", "point_b"),
+        "swing": ("ground", "arm", None),
+    },
+}
+LAWS_OF = {
+    ("arm",): {"rub": ("ground", "arm")},
+    ("upper", "lower"): {"rub": ("upper", "lower")},
+    ("carriage", "arm"): {"rub": ("ground", "carriage"), "pin": ("carriage", "arm")},
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["pendulum", *(pytest.param(name, marks=pytest.mark.long) for name in ("manipulator", "carriage"))]
+)
+def test_the_laws_of_newton_and_euler_close_for_every_body(name):
+    """With the applied forces, friction among them, and the reactions."""
+    system = SCENES[name]()
+    states = [random_state(system, seed) for seed in range(2)]
+    ys = mb.State(*(jnp.stack(own) for own in zip(*states, strict=True)))
+    motion = mb.Trajectory(
+        system, formulations.Partitioned(), jnp.array([0.3, 0.3]), ys, {}, mb.RESULTS.successful, None, None
+    )
+    for force, moment in newton_euler(system, motion).values():
+        np.testing.assert_allclose(force, 0.0, atol=1e-9)
+        np.testing.assert_allclose(moment, 0.0, atol=1e-9)
+
+
+def test_control_is_the_least():
+    """Any other force on the velocities that keeps joints and program is larger in the metric of M⁻¹."""
+    system = without_friction(manipulator())
+    q, u = random_state(system, 5)
+    t = jnp.array(0.3)
+    _, multipliers = accelerations(system, formulations.Multipliers(), t, q, u)
+    control = system.constraint_force(t, q, u, multipliers)
+    A = system.jacobian(t, q, u)
+    inverse = lambda f: system.inertia(t, q, u).solve(f)
+    other = np.random.default_rng(0).normal(size=system.nu)
+    along = A @ inverse(jnp.asarray(other))
+    other = other - A.T @ jnp.linalg.solve(A @ jax.vmap(inverse)(A).T, along)
+    np.testing.assert_allclose(A @ inverse(other), 0.0, atol=1e-12)
+    larger = control + other
+    np.testing.assert_allclose(larger @ inverse(larger), control @ inverse(control) + other @ inverse(other))
+
+
+def test_function_of_the_reactions():
+    """`NonIdeal` with the law of `Friction`, and with forces along the joint's own, which the reaction balances."""
+    rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=(1.0, 0.0))
+    block = planar.Body("block", mass=2.0, inertia=1.0, position=(0.0, 0.0))
+
+    def rub(poses, velocities, reactions, t, p):
+        normal, slip = jnp.abs(reactions[-1, 1]), velocities[-1, 0]
+        along = -p["coefficient"] * normal * jnp.tanh(slip / 1e-4) + 0.0 * t
+        wrench = jnp.stack([along, p["lift"], 2.0 * p["lift"]])
+        return jnp.stack([-wrench, wrench])
+
+    laws = [
+        planar.Friction("rub", "rail", coefficient=0.3),
+        mb.NonIdeal("rub", "rail", rub, parameters={"coefficient": 0.3, "lift": 0.0}),
+        mb.NonIdeal("rub", "rail", rub, parameters={"coefficient": 0.3, "lift": 5.0}),
+    ]
+    systems = [mb.Scene([block], joints=[rail], forces=[GRAVITY, law]).compile() for law in laws]
+    q, u = jnp.array([0.4, 0.0, 0.0]), jnp.array([-0.7, 0.0, 0.0])
+    results = [accelerations(s, formulations.Multipliers(), jnp.array(0.0), q, u)[0] for s in systems]
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(results[0][0], 0.3 * 9.81, rtol=1e-14)
+    np.testing.assert_allclose(results[2][0], 0.3 * (9.81 - 5.0 / 2.0), rtol=1e-14)
+    assert mb.parameters(systems[1])["rub.coefficient"] == 0.3
+
+
+def test_gradients():
+    """Of a motion with a program and with friction: forward, reverse and central differences, compiled and in a
+    batch.
+    """
+    system = manipulator()
+    names = ["rub.coefficient", "rub.radius", "tip.amplitude", "tip.damping", "tip.stiffness", "lower.mass"]
+    start = jnp.array([float(mb.parameters(system)[name]) for name in names])
+
+    def loss(x, rtol, adjoint):
+        changed = mb.with_parameters(system, dict(zip(names, x, strict=True)))
+        state = mb.assemble(changed, rates={"lower.angle": 2.0, "upper.angle": -1.0}, throw=False)
+        motion = mb.simulate(changed, state, t1=0.3, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+        return jnp.sum(jnp.cos(jnp.arange(float(system.nq))) * motion.ys.q[-1])
+
+    batch = lambda f: jax.jit(jax.vmap(f, in_axes=(0, None)))
+    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    forward_and_value = batch(jax.jacfwd(twice, has_aux=True))
+    forward = forward_and_value(start[None], 1e-9)[0][0]
+    reverse = batch(jax.grad(lambda x, rtol: loss(x, rtol, None)))(start[None], 1e-9)[0]
+    scale = np.max(np.abs(forward))
+    assert np.all(np.abs(forward) > 1e-6 * scale)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)
+    h = 1e-3 * np.abs(start)
+    value = lambda k: np.array([forward_and_value((start + k * step)[None], 1e-12)[1][0] for step in np.diag(h)])
+    central = (8 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / (12 * h)
+    np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-7 * scale)
+
+
+def scene(*, joints=(), forces=()):
+    body = planar.Body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0))
+    return mb.Scene([body], joints=[pin, *joints], forces=forces).compile()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"'pim'.*pin"):
+        scene(forces=[planar.Friction("rub", "pim", coefficient=0.1, radius=0.1)])
+    with pytest.raises(ValueError, match="radius"):
+        scene(forces=[planar.Friction("rub", "pin", coefficient=0.1)])
+    with pytest.raises(ValueError, match="coefficient must be non-negative"):
+        scene(forces=[planar.Friction("rub", "pin", coefficient=-0.1, radius=0.1)])
+    with pytest.raises(ValueError, match=r"not determined.*pin, twin"):
+        twin = planar.Revolute("twin", "ground", "arm", point=(0.0, 0.0))
+        scene(joints=[twin], forces=[planar.Friction("rub", "pin", coefficient=0.1, radius=0.1)])
+    with pytest.raises(ValueError, match="constraint between positions"):
+        mb.Servo(planar.KnifeEdge("blade", "arm"))
+    angle = functools.partial(planar.Driver, body_a="ground", body_b="arm", quantity="angle", parameters={})
+    with pytest.raises(ValueError, match="stiffness must be non-negative"):
+        scene(joints=[mb.Servo(angle("turn", motion=lambda t, p: t), stiffness=-1.0)])
+    with pytest.raises(ValueError, match="Unknown joint 'turn'"):
+        program = mb.Servo(angle("turn", motion=lambda t, p: t))
+        scene(joints=[program], forces=[planar.Friction("rub", "turn", coefficient=0.1, radius=0.1)])
+    with pytest.raises(ValueError, match=r"accelerations prescribed by.*turn.*contradict"):
+        both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
+        scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])

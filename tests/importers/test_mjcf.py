@@ -1,0 +1,542 @@
+"""Machines from MJCF: every row of the table of what is exact, approximate and refused."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from model_files import HINGE, OFF, ROD, check_dynamics, file, kinds, part, random_states, rod
+from scipy.integrate import solve_ivp
+
+import jaxmb as mb
+from jaxmb import importers, shapes
+from jaxmb.formulations import Multipliers, accelerations
+
+mujoco = pytest.importorskip("mujoco")
+
+
+def small_tree():
+    inner = rod(
+        "arm",
+        '<joint name="elbow" axis="0 1 1" damping=".3" stiffness="2" springref="10" armature=".02" ref="5"/>',
+        '<site name="tip" pos=".3 0 0"/>'
+        + rod("hand", '<joint name="reach" type="slide" axis="1 0 .2" stiffness="50" armature=".3" ref=".1"/>'),
+    )
+    bodies = f'<site name="hook" pos="1 1 1"/><body name="base" pos="0 0 1"><freejoint/>{ROD}{inner}</body>'
+    more = """<tendon><fixed name="cord" stiffness="3" damping=".2"><joint joint="elbow" coef=".5"/><joint joint="reach"
+        coef="-.3"/></fixed><spatial name="rope" stiffness="3" springlength=".3"><site site="tip"/><site site="hook"/>
+        </spatial></tendon><actuator><position name="servo" joint="elbow" kp="10" kv="1" gear="2"/><motor name="pull"
+        tendon="cord" gear="3"/><velocity name="speed" joint="reach" kv="2"/></actuator>"""
+    return file(bodies, more, '<option gravity="0 1 -9"/>')
+
+
+@pytest.mark.long
+def test_a_small_tree_moves_as_in_mujoco():
+    """Hinge, slide and free joints, springs, dampers, armature, reference values, tendons and actuators."""
+    check_dynamics(importers.mjcf(small_tree()))
+
+
+def test_armature_moves_as_in_mujoco():
+    """Of a hinge, of a slide, of a tendon along both, and of one between points; with it a machine has its mass.
+
+    A spring winds up through full turns of the hinge.
+    """
+    hinge = '<joint name="hip" axis="0 1 1" armature=".02" damping=".1" ref="7"/>'
+    slide = '<joint name="reach" type="slide" axis="1 0 .2" armature=".3" ref=".1"/>'
+    fixed = '<fixed name="cord" armature=".4" stiffness="3" springlength="1"><joint joint="hip" coef=".5"/>'
+    fixed += '<joint joint="reach" coef="2"/></fixed>'
+    straight = '<spatial name="line" armature=".6"><site site="far"/><site site="tip"/></spatial>'
+    hand = rod("hand", slide + '<site name="tip" pos=".1 .2 0"/>', pos=".4 0 0")
+    body = rod("arm", hinge, hand) + '<site name="far" pos="0 1 .5"/>'
+    model = importers.mjcf(file(body, f"<tendon>{fixed}{straight}</tendon>"))
+    system = check_dynamics(model, 3, scale=6.0)
+    assert system.nu == 2 * 6 + 4 and not any("rotor" in own.name for own in model.scene.bodies)
+    assert float(jnp.sum(system.mass)) == pytest.approx(float(np.sum(model.locate.model.body_mass)), rel=1e-14)
+
+
+def joint(name, kind="hinge", axis="0 0 1", more=""):
+    return f'<joint name="{name}" type="{kind}" axis="{axis}" {more}/>'
+
+
+# Joints on one link, by what they are like.
+SUCCESSIONS = {
+    "three skew hinges apart": joint("k1", axis="0 0 1", more='pos=".1 .05 0" ref="9"')
+    + joint("k2", axis="1 0 .2", more='pos="0 -.05 .07" range="-50 50" stiffness="1"')
+    + joint("k3", axis=".3 1 0", more='damping=".1" ref="-4"'),
+    "a planar walker": joint("x", "slide", "1 0 0", 'damping=".3" ref=".2"')
+    + joint("z", "slide", "0 0 1", 'ref="1.2" stiffness="3"')
+    + joint("y", "hinge", "0 1 0", 'pos="0 0 .1" armature=".02"'),
+    "three slides": joint("s1", "slide", "1 0 0", 'damping=".1"')
+    + joint("s2", "slide", "0 1 0")
+    + joint("s3", "slide", "0 .2 1", 'stiffness="2" ref=".3"'),
+    "a slide and a hinge": joint("n1", "slide", "1 0 0", 'damping=".1"') + joint("n2", axis="0 1 .3", more='ref="20"'),
+    "a hinge and two slides": joint("o1", axis="1 1 0", more='ref="10"')
+    + joint("o2", "slide", "0 1 .3", 'ref=".1" stiffness="4"')
+    + joint("o3", "slide", "1 0 .3"),
+    "two skew hinges apart": joint("l1", axis="0 0 1", more='pos=".1 .05 0" damping=".1"')
+    + joint("l2", axis="1 0 .2", more='stiffness="1" ref="9"'),
+    "two hinges that meet": joint("u1", axis="1 0 0", more='damping=".1" armature=".01"')
+    + joint("u2", axis="0 1 0", more='stiffness="1" ref="9"'),
+    "three hinges that meet": joint("g1", axis="1 0 0", more='armature=".01"')
+    + joint("g2", axis="0 0 1", more='ref="5" stiffness="1" range="-60 70"')
+    + joint("g3", axis="0 1 0", more='damping=".2"'),
+    "a pin that turns and slides": joint("c1", axis="1 0 0", more='damping=".1"')
+    + joint("c2", "slide", "-1 0 0", 'stiffness="9" ref=".1"'),
+    "all six": joint("a1", "slide", "1 0 0", 'damping=".2"')
+    + joint("a2", "slide", "0 1 0")
+    + joint("a3", "slide", "0 0 1", 'armature=".1"')
+    + joint("a4", axis="1 0 0", more='stiffness="2"')
+    + joint("a5", axis="0 1 0", more='range="-60 60"')
+    + joint("a6", axis="0 0 1", more='damping=".1"'),
+    "slides and a ball": joint("b1", "slide", "1 0 0", 'damping=".2"')
+    + joint("b2", "slide", "0 0 1")
+    + joint("b3", "ball", more='damping=".1"'),
+}
+MOTORS = ("x", "y", "k2", "k3", "s3", "n1", "n2", "o1", "o3", "g2", "c2", "a1", "a5", "b1")
+
+
+def successions(names):
+    bodies = "".join(rod(f"body {k}", SUCCESSIONS[name], pos=f"0 {k} 0") for k, name in enumerate(names))
+    motors = "".join(f'<motor name="m {own}" joint="{own}" gear="2"/>' for own in MOTORS if f'name="{own}"' in bodies)
+    servo = '<position name="servo" joint="k1" kp="3" kv=".1"/>' if 'name="k1"' in bodies else ""
+    return importers.mjcf(file(bodies, f"<actuator>{motors}{servo}</actuator>"), ignore="limits")
+
+
+def test_joints_in_succession_move_as_in_mujoco():
+    """With motors, a servo, a spring and a damper on their coordinates."""
+    model = successions(["three skew hinges apart"])
+    check_dynamics(model, 3, scale=0.5)
+    assert model.coordinates["k3"] == "k1 k2 k3.angle_3"
+    assert any("Joints 'k1', 'k2', 'k3' in succession are the Composite 'k1 k2 k3'" in note for note in model.notes)
+    assert not any("counts in half a turn" in note for note in model.notes)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("names", [list(SUCCESSIONS)[1:6], list(SUCCESSIONS)[6:]])
+def test_all_joints_in_succession_move_as_in_mujoco(names):
+    check_dynamics(successions(names), scale=0.5)
+
+
+def test_equalities_of_tendons_are_those_of_mujoco():
+    """Sums of coordinates, polynomials of one, and lengths where they are neither."""
+    bodies = rod("a", joint("i", axis="0 1 0", more='ref="20"')) + rod("b", joint("j", axis="0 1 0"), pos="0 1 0")
+    bodies += rod("c", joint("k", "slide", "1 0 0", 'ref=".1"'), '<site name="tip"/>', pos="0 2 0")
+    along = {"t1": {"i": 2, "j": 3, "k": -0.5}, "t2": {"k": 2}, "t3": {"i": 2}, "t4": {"k": 2, "j": -1}}
+    on_joints = lambda own: "".join(f'<joint joint="{name}" coef="{c}"/>' for name, c in own.items())
+    tendons = "".join(f'<fixed name="{name}">{on_joints(own)}</fixed>' for name, own in along.items())
+    tendons += '<spatial name="s"><site site="o"/><site site="tip"/></spatial>'
+    ties = {
+        "e1": ('tendon1="t1" polycoef=".3 0 0 0 0"', "JointCoupling", 2.0),
+        "e2": ('tendon1="t3" tendon2="t2" polycoef=".1 .2 .3 .4 .5"', "JointCoupling", 2.0),
+        "e3": ('tendon1="t1" tendon2="t4" polycoef=".1 .7 0 0 0"', "JointCoupling", 2.0),
+        "e4": ('tendon1="t3" tendon2="t4" polycoef=".1 .7 .2 0 0"', "JointCoupling", 1.0),
+        "e5": ('tendon1="s" polycoef=".1 0 0 0 0"', "JointDriver", 1.0),
+        "e6": ('tendon1="t2" polycoef=".1 0 0 0 0"', "JointDriver", 2.0),
+    }
+    equalities = "".join(f'<tendon name="{name}" {own}/>' for name, (own, *_) in ties.items())
+    more = f"<tendon>{tendons}</tendon><equality>{equalities}</equality>"
+    imported = importers.mjcf(file(f'<site name="o" pos="0 1 1"/>{bodies}', more))
+    model = imported.locate.model
+    data = mujoco.MjData(model)
+    for q, v in random_states(model, 3, scale=0.4):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(model, data)
+        values = {own: q[k] for k, own in enumerate("ijk")}
+        values = {imported.coordinates[own]: value for own, value in values.items()}
+        values |= {f"{model.tendon(k).name}.length": data.ten_length[k] for k in range(model.ntendon)}
+        for name, (_, kind, scale) in ties.items():
+            own = part(imported, name)
+            assert own.kind == kind
+            if kind == "JointDriver":
+                found = values[own.coordinate] - own.value
+            else:
+                found, powers = values[own.coordinate] - own.zero, own.coefficients.reshape(len(own.other), -1)
+                for other, zero, row in zip(own.other, own.other_zero.reshape(-1), powers, strict=True):
+                    found = found - np.polyval(row[::-1], values[other] - zero)
+            theirs = data.efc_pos[(data.efc_type == 0) & (data.efc_id == model.equality(name).id)]
+            np.testing.assert_allclose(scale * found, theirs, rtol=1e-12, atol=1e-14)
+    assert part(imported, "e1").other == ("j.angle", "k.displacement")
+
+
+# The rows of the table
+
+
+@pytest.mark.parametrize(
+    "joints, more, name, fields",
+    [
+        ('<joint name="hip" axis="0 2 0"/>', "", "hip", {"axis_a": [0, 1, 0]}),
+        ('<joint name="hip" type="slide" axis="1 0 0"/>', "", "hip", {"axis_a": [1, 0, 0]}),
+        ('<joint name="hip" type="ball"/>', "", "hip", {}),
+        ('<joint name="hip" stiffness="2" springref="90"/>', "", "hip spring", {"stiffness": 2, "free": np.pi / 2}),
+        ('<joint name="hip" damping=".5"/>', "", "hip spring", {"damping": 0.5, "stiffness": 0}),
+        ('<joint name="hip" armature=".1"/>', "", "hip armature", {"inertia": 0.1}),
+        (
+            HINGE,
+            '<tendon><fixed name="cord" armature=".3"><joint joint="hip" coef="2"/></fixed></tendon>',
+            "cord armature",
+            {"inertia": 0.3},
+        ),
+        (
+            HINGE,
+            '<equality><connect name="loop" body1="a" anchor=".3 0 0"/></equality>',
+            "loop",
+            {"point_b": [0.6, 0, 0]},
+        ),
+        (HINGE, '<equality><weld name="loop" body1="a"/></equality>', "loop", {"orientation": [1, 0, 0, 0]}),
+        (
+            HINGE,
+            '<equality><joint name="loop" joint1="hip" polycoef=".2 0 0 0 0"/></equality>',
+            "loop",
+            {"value": 0.2},
+        ),
+        (HINGE, '<actuator><motor name="m" joint="hip" gear="3"/></actuator>', "m", {"gear": 3, "gain": [1, 0, 0]}),
+        (
+            joint("hip", "slide", "1 0 0", 'stiffness="2" springref=".3"') + joint("turn", axis="0 1 0"),
+            '<actuator><motor name="m" joint="hip" gear="3"/></actuator>',
+            "hip spring",
+            {"stiffness": 2, "free": 0.3},
+        ),
+        (
+            HINGE,
+            '<actuator><position name="m" joint="hip" kp="5" kv="2"/></actuator>',
+            "m",
+            {"gain": [5, 0, 0], "bias": [0, -5, -2]},
+        ),
+        (
+            HINGE,
+            '<actuator><velocity name="m" joint="hip" kv="2"/></actuator>',
+            "m",
+            {"gain": [2, 0, 0], "bias": [0, 0, -2]},
+        ),
+        (
+            HINGE,
+            '<tendon><fixed name="t"><joint joint="hip" coef=".4"/></fixed></tendon>',
+            "t",
+            {"coefficients": [0.4]},
+        ),
+    ],
+)
+def test_what_is_exact(joints, more, name, fields):
+    model = importers.mjcf(file(rod("a", joints), more))
+    own = part(model, name)
+    for field, value in fields.items():
+        np.testing.assert_allclose(getattr(own, field), value, rtol=0, atol=1e-15)
+    said = "Equalities hold exactly|up to half a turn|in succession are the Composite"
+    assert all(re.search(said, note) for note in model.notes)
+
+
+def test_inertia_names_and_frames():
+    inside = '<geom type="sphere" size=".02"/><site name="eye" pos="1 0 0"/>'
+    fixed = f'<body name="sensor" pos="0 0 .1" euler="0 0 90">{inside}</body>'
+    model = importers.mjcf(file(rod("a", HINGE, fixed) + '<body name="wall"><geom type="box" size="1 1 1"/></body>'))
+    reference = mujoco.MjModel.from_xml_string(file(rod("a", HINGE, fixed)))
+    (body,) = model.scene.bodies
+    assert body.name == "a" and float(body.mass) == pytest.approx(reference.body_subtreemass[1], rel=1e-14)
+    frames = {frame.name: frame for frame in model.scene.frames}
+    assert {name: frame.body for name, frame in frames.items()} == {"sensor": "a", "eye": "a", "wall": "ground"}
+    np.testing.assert_allclose(frames["eye"].position, [0, 1, 0.1], atol=1e-15)
+    assert model.coordinates == {"hip": "hip.angle"}
+
+
+@pytest.mark.parametrize(
+    "joints, more, name, kind, note",
+    [
+        ('<joint name="hip" frictionloss=".2"/>', "", "hip friction", "JointFriction", "joints at rest creep: 'hip'"),
+        ('<joint name="hip" range="-30 40"/>', "", "hip stop", "JointStop", "Limits are compliant stops"),
+        (
+            HINGE,
+            '<actuator><motor name="m" joint="hip" ctrlrange="-1 1"/></actuator>',
+            "m",
+            "JointActuator",
+            "clipped to their ranges.*'m'",
+        ),
+        (
+            HINGE,
+            '<equality><connect name="l" body1="a" anchor=".3 0 0" solref=".1 1"/></equality>',
+            "l",
+            "Spherical",
+            "their solref and solimp have no effect",
+        ),
+        (
+            joint("hip", axis="1 0 0") + joint("h2", axis="0 1 0") + joint("h3"),
+            "",
+            "hip h2 h3",
+            "Composite",
+            "counts in half a turn, between the angles at which the three axes lie in one plane: 'h2'",
+        ),
+    ],
+)
+def test_what_is_approximated_is_said(joints, more, name, kind, note):
+    model = importers.mjcf(file(rod("a", joints), more))
+    assert kinds(model)[name] == kind
+    assert any(re.search(note, said) for said in model.notes)
+
+
+def test_mocap_bodies_move_as_prescribed():
+    text = file('<body name="hand" mocap="true" pos="0 0 1"/>' + rod("a", HINGE))
+    model = importers.mjcf(text)
+    assert kinds(model)["hand motion"] == "Fixed"
+    np.testing.assert_array_equal(part(model, "hand motion").point_a, [0, 0, 1])
+    assert any("Mocap bodies are held by a joint" in note and "'hand'" in note for note in model.notes)
+
+
+TWICE = joint("p1", axis="0 1 0") + joint("p2", "slide", "1 0 0") + joint("p3", axis="0 1 0", more='pos="1 0 0"')
+FOUR = "".join(joint(f"h{k}", axis=axis) for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1", "1 1 0")))
+FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis="0 0 1")
+
+
+@pytest.mark.parametrize(
+    "joints, more, head, message",
+    [
+        (TWICE, "", "", "Joints in succession to 'a' are degenerate, hinge 'p1', hinge 'p3' are parallel hinges"),
+        (joint("s1", "slide") + joint("s2", "slide"), "", "", "slide 's1', slide 's2' slide in directions that depend"),
+        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' turn in more ways than the three"),
+        (FLAT, "", "", "the axes of the hinges 'f1', 'f2', 'f3' lie in one plane in the middle of the range of 'f2'"),
+        (
+            HINGE,
+            '<tendon><spatial name="t"><site site="o"/><geom geom="drum"/><site site="s"/></spatial></tendon>',
+            "",
+            "Tendon 't' wraps around shapes or pulleys",
+        ),
+        (
+            HINGE,
+            '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>',
+            "",
+            "Actuator 'm' has dynamics of its own",
+        ),
+        (
+            HINGE,
+            '<actuator><general name="m" site="s" gear="0 0 1 0 0 0"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of site",
+        ),
+        (
+            HINGE,
+            '<actuator><adhesion name="m" body="a" ctrlrange="0 1"/></actuator>',
+            "",
+            "Actuator 'm' acts by way of body",
+        ),
+        (HINGE, "", '<option density="1"/>', "A fluid is not modelled"),
+        ('<joint name="hip" type="ball" armature=".1"/>', "", "", "armature of the ball joint 'hip'"),
+        ('<joint name="hip" type="ball" limited="true" range="0 30"/>', "", "", "limits of the ball joint 'hip'"),
+        ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
+        ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
+        (HINGE, '<actuator><motor name="m" joint="hip" delay=".1" nsample="2"/></actuator>', "", "'m' has delays"),
+        (
+            HINGE,
+            '<tendon><spatial name="t" stiffness="1" springlength=".1 .2"><site site="o"/><site site="s"/></spatial>'
+            "</tendon>",
+            "",
+            "The spring of tendon 't' has a slack range",
+        ),
+        (
+            HINGE,
+            '<actuator><plugin joint="hip" plugin="mujoco.pid"><config key="kp" value="1"/></plugin></actuator>',
+            '<extension><plugin plugin="mujoco.pid"/></extension>',
+            "Plugins are not known; remove them from the file",
+        ),
+    ],
+)
+def test_what_is_refused_is_named(joints, more, head, message):
+    text = file(
+        '<site name="o"/><geom name="drum" type="sphere" size=".01"/>'
+        + rod("a", joints, '<site name="s" pos=".1 0 0"/>'),
+        more,
+        head,
+    )
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+
+
+def test_flexible_bodies_are_refused():
+    grid = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" mass="1" dim="2">'
+    text = file(rod("a", HINGE) + f'{grid}<edge equality="true"/></flexcomp>')
+    with pytest.raises(ValueError, match="Deformable bodies") as error:
+        importers.mjcf(text)
+    assert "is of type flex (ignore='loops' leaves it out)" in str(error.value)
+
+
+def test_files_that_are_included(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "bar.xml").write_text(f"<mujocoinclude>{rod('a', HINGE)}</mujocoinclude>")
+    (tmp_path / "machine.xml").write_text(file('<include file="parts/bar.xml"/>'))
+    found, expected = importers.mjcf(tmp_path / "machine.xml"), importers.mjcf(file(rod("a", HINGE)))
+    assert kinds(found) == kinds(expected)
+    assert float(part(found, "a").mass) == float(part(expected, "a").mass)
+
+
+def test_collisions_are_refused_unless_left_out():
+    text = f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{rod("a", "<freejoint/>")}</worldbody></mujoco>'
+    with pytest.raises(ValueError, match=r"Shapes of 1 bodies may collide \(a.*ignore='collisions' leaves it out"):
+        importers.mjcf(text)
+    model = importers.mjcf(text, ignore="collisions")
+    assert "Left out, as ignore='collisions' asks: collisions." in model.notes
+    (plane,), (bar, *ends) = model.shapes["ground"], model.shapes["a"]
+    assert isinstance(plane, shapes.Ground) and bar.radius == 0.03 and [ball.radius for ball in ends] == [0.03, 0.03]
+    assert model.shapes == model.collision_shapes
+
+
+def test_a_fluid_is_left_out():
+    text = file(rod("a", HINGE), "", '<option density="1.2" viscosity=".1"/>')
+    found = importers.mjcf(text, ignore="fluid")
+    assert "Left out, as ignore='fluid' asks: fluid." in found.notes and set(kinds(found)) == {"hip", "gravity"}
+
+
+EXPLICIT = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+
+
+@pytest.mark.parametrize(
+    "shape, word, message",
+    [
+        ('<geom name="g" size="0"/>', "pictures", "size 0 must be positive"),
+        ('<geom name="g" size="0" contype="1" conaffinity="1"/>', "collisions", "size 0 must be positive"),
+        (
+            '<geom name="g" type="hfield" hfield="hills" contype="1" conaffinity="1"/>',
+            "collisions",
+            "The file 'hills.png' of the height field 'hills' is missing",
+        ),
+    ],
+)
+def test_numbers_of_shapes_do_not_matter_where_they_are_ignored(shape, word, message):
+    """Also of shapes that a sensor names."""
+    hills = '<asset><hfield name="hills" file="hills.png" size="1 1 1 1"/></asset>'
+    more = '<sensor><framepos objtype="geom" objname="g"/></sensor>'
+    text = file(f'<body name="a"><joint name="hip"/>{EXPLICIT}{shape}</body>', more, hills if "hfield" in shape else "")
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+    found = importers.mjcf(text, ignore=word)
+    assert set(kinds(found)) == {"hip", "gravity"} and not found.shapes
+    assert "Not read, since they do not act on the motion: 1 sensors." in found.notes
+
+
+def test_pictures_are_left_out():
+    text = file(rod("a", HINGE))
+    assert importers.mjcf(text).shapes and not importers.mjcf(text, ignore="pictures").shapes
+
+
+def test_elements_are_left_out_by_kind_or_by_name():
+    text = file(rod("a", '<joint name="hip" range="-30 40" damping=".1"/>'))
+    assert "hip stop" in kinds(importers.mjcf(text))
+    assert set(kinds(importers.mjcf(text, ignore=("limits", "damping")))) == {"hip", "gravity"}
+    assert set(kinds(importers.mjcf(text, ignore="hip"))) == {"hip", "gravity"}
+    with pytest.raises(ValueError, match="Unknown element 'limit'; did you mean 'limits'"):
+        importers.mjcf(text, ignore="limit")
+
+
+# Files that are wrong
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("<mujoco><worldbody><body><joint type='hing'/></body></worldbody></mujoco>", "hing"),
+        ("<mujoco><worldbody><body name='a'><joint name='j'/></body></worldbody></mujoco>", "mass and inertia"),
+        ("<mujoco><include file='nowhere.xml'/></mujoco>", "nowhere.xml"),
+        (
+            "<mujoco><asset><mesh name='m' file='m.stl'/></asset><worldbody><body name='a'><joint name='j'/>"
+            "<geom type='mesh' mesh='m'/></body></worldbody></mujoco>",
+            "The mass of body 'a' comes from mesh 'm', whose file is missing",
+        ),
+        ("nowhere.xml", "nowhere.xml does not exist"),
+        ("<mujoco/>", "There is no moving link"),
+    ],
+)
+def test_wrong_mjcf(text, message):
+    with pytest.raises(ValueError, match=message):
+        importers.mjcf(text)
+
+
+def test_missing_meshes_of_pictures_are_said():
+    text = file(
+        '<body name="a"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+        '<geom type="mesh" mesh="m"/></body>',
+        '<asset><mesh name="m" file="m.stl"/></asset>',
+    )
+    assert "Mesh files are missing, so the picture lacks them: m." in importers.mjcf(text).notes
+
+
+def test_degrees_and_compiler_options_are_those_of_mujoco():
+    body = rod("a", '<joint name="hip" axis="0 1 0" ref="90" springref="45" stiffness="1"/>')
+    degrees = importers.mjcf(file(body))
+    numbers = body.replace("90", f"{np.pi / 2!r}").replace("45", f"{np.pi / 4!r}")
+    radians = importers.mjcf(file(numbers, head='<compiler angle="radian"/>'))
+    for own in (degrees, radians):
+        assert float(part(own, "hip spring").free) == pytest.approx(np.pi / 4)
+
+
+def test_names_that_stand_twice():
+    model = importers.mjcf(file(rod("a.1", '<joint name="a_1"/>')))
+    assert [body.name for body in model.scene.bodies] == ["a_1"]
+    assert model.coordinates == {"a_1": "a_1 joint.angle"}
+    assert any("a.1 → a_1" in note and "a_1 → a_1 joint" in note for note in model.notes)
+
+
+def test_keyframes_are_states():
+    text = file(rod("a", HINGE), '<keyframe><key name="up" qpos="1.5" qvel="2"/></keyframe>')
+    model = importers.mjcf(text)
+    state = model.states["up"]
+    np.testing.assert_allclose(state.u[3:], [0, 2, 0], atol=1e-15)
+    np.testing.assert_allclose(state.q[3:], [np.cos(0.75), 0, np.sin(0.75), 0], atol=1e-15)
+
+
+# Loops, angles and filters along a motion
+
+
+@pytest.mark.long
+def test_a_loop_that_cannot_be_closed():
+    """Two sites that no position brings together, and two couplings that contradict each other."""
+    apart = '<site name="far" pos="5 0 0"/>' + rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>')
+    closing = '<equality><connect name="loop" site1="tip" site2="far"/></equality>'
+    twice = "".join(f'<joint name="c{k}" joint1="hip" polycoef=".{k} 0 0 0 0"/>' for k in (1, 2))
+    for text, joint in ((file(apart, closing), "loop"), (file(rod("a", HINGE), f"<equality>{twice}</equality>"), "c2")):
+        with pytest.raises(ValueError, match=f"cannot be assembled.*{joint}"):
+            mb.assemble(importers.mjcf(text).scene.compile())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("limits, angle", [("", 9.0), ('range="-60 220"', 3.5), ('range="-200 200"', -3.4)])
+def test_springs_and_servos_of_hinges_count_through_full_turns(limits, angle):
+    joint = f'<joint name="hip" axis="0 1 0" stiffness="2" damping=".1" ref="20" springref="-70" {limits}/>'
+    servo = '<actuator><position name="m" joint="hip" kp="5" kv=".3" gear="2"/></actuator>'
+    imported = importers.mjcf(file(rod("a", joint), servo), ignore=("limits", "collisions"))
+    model, system, state = imported.locate.model, imported.scene.compile(), imported.state([angle], [2.0])
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = angle, 2.0
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    mujoco.mj_forward(model, data)
+    udot, _ = accelerations(system, Multipliers(), 0.0, state.q, state.u)
+    assert float(udot[4]) == pytest.approx(data.qacc[0], rel=1e-9)
+    assert not any("turn" in note for note in imported.notes)
+
+
+@pytest.mark.long
+def test_a_servo_whose_control_is_filtered_moves_as_in_mujoco():
+    """MuJoCo's accelerations and rates of the activation, integrated by SciPy."""
+    servo = (
+        '<actuator><position name="m" joint="hip" kp="5" kv=".3" gear="2" timeconst=".1" ctrlrange="-1 1"/></actuator>'
+    )
+    imported = importers.mjcf(file(rod("a", '<joint name="hip" axis="0 1 0" range="-170 170"/>'), servo), ignore=OFF)
+    model = imported.locate.model
+    data = mujoco.MjData(model)
+
+    def right(t, y):
+        data.qpos, data.qvel, data.act, data.ctrl = y[0], y[1], y[2], 3.0 * np.sin(2 * t)
+        mujoco.mj_forward(model, data)
+        return [*data.qvel, *data.qacc, *data.act_dot]
+
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    # Until its control is clipped, and from there on.
+    clipped = 0.5 * np.arcsin(1 / 3)
+    y, expected = [0.4, 0.0, -0.3], []
+    for span in ((0.0, clipped), (clipped, 0.5)):
+        y = solve_ivp(right, span, y, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        expected.append(y)
+    system = imported.scene.compile()
+    state = mb.assemble(system, fix={"hip.angle": 0.4, "m.activation": -0.3})
+    ts = np.array([clipped, 0.5])
+    control = mb.Series(np.linspace(0.0, 0.5, 501), 3.0 * np.sin(2 * np.linspace(0.0, 0.5, 501)), "cubic")
+    motion = mb.simulate(
+        system, state, t1=0.5, saveat=ts, rtol=1e-10, jumps=ts[:1], inputs={imported.controls["m"]: control}
+    )
+    found = np.stack([motion["hip"].angle, motion["hip"].angle_rate, motion["m"].activation], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)

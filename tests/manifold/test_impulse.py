@@ -1,0 +1,284 @@
+"""Drivers and forces with kinks and jumps that are announced."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from driven_arm import AFTER, BEFORE, END, INERTIA, MASS, WHEN, A, B, G, driven_arm
+from scipy.integrate import solve_ivp
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.manifold.impulse import find_jumps
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return driven_arm()
+
+
+def angle_of_rod(before=BEFORE, after=AFTER):
+    """The rod's angle and rate at the jump and in the end, in minimal coordinates."""
+    moment, coupling = INERTIA + MASS * B**2, MASS * A * B
+
+    def rates(t, y, rate, start):
+        arm = start + rate * t
+        return [y[1], (coupling * rate**2 * np.sin(arm - y[0]) - MASS * G * B * np.cos(y[0])) / moment]
+
+    solve = lambda y, span, *args: solve_ivp(rates, (0.0, span), y, args=args, rtol=1e-12, atol=1e-13).y[:, -1]
+    angle, rate = solve([0.0, 0.0], WHEN, before, 0.0)
+    # Its moment of momentum about the elbow does not jump.
+    rate = rate - coupling * np.cos(before * WHEN - angle) * (after - before) / moment
+    return np.array([angle, rate]), solve([angle, rate], END - WHEN, after, before * WHEN)
+
+
+def run(arm, values=None, **options):
+    system = arm if values is None else mb.with_parameters(arm, values)
+    start = mb.assemble(system, rates={"rod.angle": 0.0})
+    options = {"jumps": [WHEN], "saveat": [WHEN, END], "rtol": 1e-10} | options
+    return mb.simulate(system, start, t1=END, **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"manifold": mb.manifold.Projection()}, marks=pytest.mark.long),
+        pytest.param({"solver": mb.solvers.Hermite()}, marks=pytest.mark.long),
+        pytest.param({"solver": diffrax.Dopri8()}, marks=pytest.mark.long),
+    ],
+)
+def test_a_jump_of_a_driver_is_an_impulse(arm, options):
+    motion = run(arm, **options)
+    found = np.stack([motion["rod"].angle, motion["rod"].angular_velocity], axis=1)
+    np.testing.assert_allclose(found, np.stack(angle_of_rod()), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(motion["arm"].angular_velocity, AFTER, rtol=0, atol=1e-9)
+    assert np.all(motion.constraint_violation.velocity < 1e-9)
+
+
+@pytest.mark.long
+def test_derivatives_over_a_jump(arm):
+    def end(x, adjoint):
+        values = {"drive.before": x[0], "drive.after": x[1]}
+        return run(arm, values, adjoint=adjoint, saveat=None, max_steps=512)["rod"].angle[-1]
+
+    x, h = jnp.array([BEFORE, AFTER]), 1e-4
+    forward = jax.jit(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode())))(x)
+    reverse = jax.jit(jax.grad(lambda x: end(x, None)))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    oracle = lambda *x: angle_of_rod(*x)[1][0]
+    before = (oracle(BEFORE + h, AFTER) - oracle(BEFORE - h, AFTER)) / (2 * h)
+    after = (oracle(BEFORE, AFTER + h) - oracle(BEFORE, AFTER - h)) / (2 * h)
+    np.testing.assert_allclose(forward, [before, after], rtol=0, atol=1e-6)
+
+
+def test_a_force_that_is_switched_on():
+    """Exact in few steps, where a jump that nobody announces is found by steps that are too long."""
+    law = lambda poses, velocities, t, p: jnp.stack([jnp.where(t < 0.3, 0.0, 2.0), 0.0 * t, 0.0 * t])[None]
+    system = mb.Scene([planar.PointMass("body", mass=1.0)], forces=[mb.Force("push", "body", law)]).compile()
+    ends = [mb.simulate(system, mb.assemble(system), t1=1.0, jumps=jumps) for jumps in ([0.3], None)]
+    np.testing.assert_allclose(ends[0]["body"].position[-1, 0], 0.7**2, rtol=0, atol=1e-13)
+    assert ends[0].stats["num_steps"] < 0.5 * ends[1].stats["num_steps"]
+
+
+@pytest.mark.long
+def test_members_of_a_batch_jump_each_at_its_time(arm):
+    def end(when):
+        return run(arm, {"drive.when": when}, jumps=when[None], saveat=None, rtol=1e-8, max_steps=256)["rod"].angle[-1]
+
+    times = jnp.array([0.3, WHEN])
+    together = jax.jit(jax.vmap(end))(times)
+    np.testing.assert_allclose(together[1], angle_of_rod()[1][0], rtol=0, atol=1e-6)
+    assert abs(together[0] - together[1]) > 1e-2
+
+
+PROGRAMS = {
+    "jump of the rate": lambda t, p: jnp.where(t < 0.6, 0.4 * t, 0.24 + 2.5 * (t - 0.6)),
+    "kink of the rate": lambda t, p: jnp.where(t < 0.6, 0.0 * t, (t - 0.6) ** 2),
+    "smooth and steep": lambda t, p: 0.1 * jnp.tanh(100.0 * (t - 0.6)),
+}
+
+
+@pytest.mark.parametrize("case", PROGRAMS)
+def test_a_jump_that_is_not_announced_is_warned_of(case):
+    body = planar.Body("arm", mass=1.0, inertia=0.1)
+    drive = planar.Driver("drive", "ground", "arm", quantity="angle", motion=PROGRAMS[case])
+    system = mb.Scene([body], joints=[drive]).compile()
+    run = lambda: mb.simulate(system, mb.assemble(system), t1=1.0, rtol=1e-5)
+    if case == "smooth and steep":
+        run()
+    else:
+        with pytest.warns(UserWarning, match=r"'drive' prescribes has a jump or a kink at t = 0.6,.*jumps=\[0.6\]"):
+            run()
+
+
+REFUSED = {
+    "NaN": ({"jumps": [np.nan]}, "jumps must not be NaN"),
+    "endless": ({"jumps": [np.inf]}, "jumps must be a vector of finite times"),
+    "one number": ({"jumps": 0.3}, "jumps must be a vector of finite times"),
+    "words": ({"jumps": ["soon"]}, "jumps must be an array of real numbers"),
+    "without impulses": ({"manifold": mb.manifold.Baumgarte()}, "a constrained system needs manifold="),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_jumps_that_are_refused(arm, case):
+    changes, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message):
+        run(arm, **changes)
+
+
+# States between steps
+
+
+@pytest.mark.long
+def test_states_at_a_jump_are_those_after_it(arm):
+    """Of a run over the jump, and of one back to its start, saved and between steps."""
+    start = mb.assemble(arm, rates={"rod.angle": 0.0})
+    both: Any = {"jumps": jnp.array([WHEN]), "rtol": 1e-9, "max_steps": 512}
+    saved: Any = lambda *ts: {"saveat": diffrax.SaveAt(ts=jnp.array(ts), dense=True)}
+    forward = mb.simulate(arm, start, t1=END, **both, **saved(0.0, WHEN, END))
+    end = jax.tree.map(lambda y: y[-1], forward.ys)
+    back = mb.simulate(arm, end, t0=END, t1=0.0, **both, **saved(END, WHEN, 0.0))
+    np.testing.assert_array_equal(back.ts, [END, WHEN, 0.0])
+    np.testing.assert_allclose(back["rod"].angular_velocity[-1], 0.0, rtol=0, atol=1e-7)
+    (angle, after), _ = angle_of_rod()
+    # Before the jump no impulse has turned the rod: its moment of momentum about the elbow is the same.
+    before = after + MASS * A * B * np.cos(BEFORE * WHEN - angle) * (AFTER - BEFORE) / (INERTIA + MASS * B**2)
+    for motion in (forward, back):
+        between = motion.at(jnp.array([np.nextafter(WHEN, 0.0), WHEN, np.nextafter(WHEN, 1.0)]))
+        np.testing.assert_allclose(between.u[:, 5], [before, after, after], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(between.u[:, 2], [BEFORE, AFTER, AFTER], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(motion["rod"].angular_velocity[1], after, rtol=0, atol=1e-6)
+        assert np.all(motion.constraint_violation.velocity < 1e-9)
+        assert np.all(np.isnan(motion.at(2 * END).q)) and np.all(np.isfinite(motion.at(jnp.array([0.0, END])).q))
+
+
+@pytest.mark.long
+def test_derivatives_at_a_jump(arm):
+    def rate(x, adjoint):
+        values, dense = {"drive.before": x[0], "drive.after": x[1]}, diffrax.SaveAt(dense=True)
+        return run(arm, values, adjoint=adjoint, saveat=dense, max_steps=256).at(WHEN).u[5]
+
+    x, h = jnp.array([BEFORE, AFTER]), 1e-4
+    forward = jax.jit(jax.jacfwd(lambda x: rate(x, diffrax.ForwardMode())))(x)
+    reverse = jax.jit(jax.grad(lambda x: rate(x, None)))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    oracle = lambda *x: angle_of_rod(*x)[0][1]
+    before = (oracle(BEFORE + h, AFTER) - oracle(BEFORE - h, AFTER)) / (2 * h)
+    after = (oracle(BEFORE, AFTER + h) - oracle(BEFORE, AFTER - h)) / (2 * h)
+    np.testing.assert_allclose(forward, [before, after], rtol=0, atol=1e-6)
+
+
+# The search for jumps that nobody announced
+
+
+def motion_of(t, p):
+    wave = p["amplitude"] * jnp.sin(p["frequency"] * t) + p["step"] * jnp.tanh(p["steepness"] * (t - 0.55))
+    kink = lambda when, rate: jnp.where(t < when, 0.0 * t, rate * (t - when))
+    return wave + kink(p["first"], p["rate"]) + kink(p["second"], p["rate"])
+
+
+NUMBERS = {
+    "amplitude": 0.0,
+    "frequency": 3.0,
+    "step": 0.0,
+    "steepness": 300.0,
+    "first": 9.0,
+    "second": 9.0,
+    "rate": 1.0,
+}
+
+
+@pytest.fixture(scope="module")
+def two_driven():
+    bodies = [planar.Body(name, mass=1.0, inertia=0.1) for name in ("a", "b")]
+    turn = lambda name: planar.Driver(
+        f"turn {name}", "ground", name, quantity="angle", motion=motion_of, parameters=NUMBERS
+    )
+    return mb.Scene(bodies, joints=[turn("a"), turn("b")]).compile()
+
+
+SMOOTH = {"amplitude": 1.0}
+KINKED = SMOOTH | {"first": 1 / 3}
+# The numbers of both drivers, the restarts, and the jumps: the row of which driver, and when.
+SEARCHED = {
+    "none": (SMOOTH, SMOOTH, [], []),
+    "fast": ({"amplitude": 1.0, "frequency": 150.0}, {"step": 0.1}, [], []),
+    "one": (KINKED, SMOOTH, [], [("a", 1 / 3)]),
+    "behind a steep step": ({"step": 0.1}, KINKED, [], [("b", 1 / 3)]),
+    "behind a fast driver": ({"amplitude": 5.0, "frequency": 60.0}, KINKED, [], [("b", 1 / 3)]),
+    "behind a driver a million times as fast": ({"amplitude": 1e7}, KINKED, [], [("b", 1 / 3)]),
+    "on a fast driver": ({"amplitude": 0.1, "frequency": 60.0, "first": 0.7}, SMOOTH, [], [("a", 0.7)]),
+    "beside a restart": (KINKED, SMOOTH, [0.3, 0.5], [("a", 1 / 3)]),
+    "at a restart": (KINKED, SMOOTH, [1 / 3], []),
+    "between many restarts": (KINKED, SMOOTH, np.linspace(0.05, 0.95, 19), [("a", 1 / 3)]),
+    "two rows": (KINKED, SMOOTH | {"first": 0.8}, [], [("a", 1 / 3), ("b", 0.8)]),
+    "one of two is known": (KINKED | {"second": 0.8}, SMOOTH, [1 / 3], [("a", 0.8)]),
+    "both of two": (KINKED | {"second": 0.8}, SMOOTH, [0.5], [("a", 1 / 3), ("a", 0.8)]),
+    "small": (KINKED | {"rate": 1e-3}, SMOOTH, [], [("a", 1 / 3)]),
+    "late": (KINKED | {"first": 1 - 1e-4}, SMOOTH, [], [("a", 1 - 1e-4)]),
+}
+
+
+@pytest.mark.parametrize("case", SEARCHED)
+def test_every_row_is_searched_between_all_restarts(two_driven, case):
+    *numbers, restarts, expected = SEARCHED[case]
+    values = {
+        f"turn {name}.{key}": value
+        for name, own in zip("ab", numbers, strict=True)
+        for key, value in (NUMBERS | own).items()
+    }
+    system = mb.with_parameters(two_driven, values)
+    names = [*system.rows[: system.velocity_rows], *system.rows]
+    for ends in ((0.0, 1.0), (1.0, 0.0)):
+        jumps = find_jumps(system, system.guess.q, *ends, restarts)
+        found = sorted({(float(jump.t), names[jump.row][0][-1]) for jump in jumps})
+        # To the last digit, since a restart elsewhere would miss it.
+        assert found == [(when, name) for name, when in expected]
+
+
+def test_a_jump_between_announced_ones_is_warned_of(arm):
+    with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.6, .*jumps=\[0.3, 0.6\]"):
+        run(arm, jumps=[0.3])
+
+
+@pytest.mark.long
+def test_a_jump_between_restarts_of_an_input_is_warned_of():
+    system = driven_arm(planar.Torque("push", "rod", torque=0.0))
+    system = mb.with_inputs(system, {"push.torque": mb.Series([0.0, 0.2, 2.0], [0.0, 1.0, 1.0], "held")})
+    with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.6, .*jumps=\[0.6\]"):
+        run(system, jumps=None)
+
+
+@pytest.mark.long
+def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
+    """The cart starts at once beside a shaft that swings fast: unannounced, its impulse on the pendulum is lost."""
+    start = lambda t, p: jnp.where(t < 0.5, 0.2 * t, 0.1 + 1.2 * (t - 0.5))
+    swing = lambda t, p: 0.1 * jnp.tanh(300.0 * (t - 0.7))
+    bodies = [
+        planar.Body("cart", mass=2.0, inertia=0.1),
+        planar.Body("pendulum", mass=1.0, inertia=1 / 12, position=(0.0, -0.5)),
+        planar.Body("shaft", mass=0.1, inertia=0.01, position=(3.0, 0.0)),
+    ]
+    joints = [
+        planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0)),
+        planar.Revolute("pin", "cart", "pendulum", point=(0.0, 0.0)),
+        planar.Revolute("axle", "ground", "shaft", point=(3.0, 0.0)),
+        planar.Driver("drive", "ground", "cart", quantity="x", motion=start),
+        planar.Driver("swing", "ground", "shaft", quantity="angle", motion=swing),
+    ]
+    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
+    state = mb.assemble(system, fix={"pendulum.angle": 0.1}, rates={"pendulum.angle": 0.0})
+    with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.5, .*jumps=\[0.5\]"):
+        missed = mb.simulate(system, state, t1=1.0)
+    found = mb.simulate(system, state, t1=1.0, jumps=jnp.array([0.5]))["pendulum"].angle[-1]
+    field = lambda t, y: [y[1], -1.5 * G * np.sin(y[0])]
+    angle, rate = solve_ivp(field, (0.0, 0.5), [0.1, 0.0], rtol=1e-12, atol=1e-13).y[:, -1]
+    # The pin jumps by one metre a second: about it the moment of momentum of the pendulum changes.
+    after = solve_ivp(field, (0.0, 0.5), [angle, rate - 1.5 * np.cos(angle)], rtol=1e-12, atol=1e-13).y[0, -1]
+    np.testing.assert_allclose(found, after, rtol=0, atol=1e-6)
+    assert abs(missed["pendulum"].angle[-1] - after) > 0.1

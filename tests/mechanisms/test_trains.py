@@ -1,0 +1,523 @@
+"""Trains: draft gears, chains of vehicles of any length, and the cost of them."""
+
+import dataclasses
+import functools
+import os
+import time
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import trains as oracle
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.bodies.joint_graph import joint_order
+from jaxmb.formulations import Multipliers, Poincare, accelerations
+from jaxmb.manifold import Partition, Projection
+from jaxmb.mechanisms.train import coupler_forces
+
+# A draft gear that is a linear spring.
+LINEAR = functools.partial(planar.DraftGear, stiffness=2e7, unloading=1.0, preload=0.0, slack=0.0, travel=10.0)
+BARE = {"suspension": 0.0, "resistance": 0.0, "brake": 0.0, "speed": 0.0, "coupler_height": 0.0}
+
+
+def gear(**numbers):
+    return planar.DraftGear("gear", "a", "b", free_length=1.0, **numbers)
+
+
+# The draft gear
+
+
+def test_draft_gear_is_that_of_an_independent_model():
+    s, rate = np.meshgrid(np.linspace(-0.16, 0.16, 641), [-20.0, -0.01, -1e-5, 0.0, 1e-12, 0.003, 1.0])
+    for numbers, same in (
+        ({}, {}),
+        ({"slack": 0.0, "unloading": 1.0, "damping": 1e4}, {"slack": 0.0, "eta": 1.0, "c": 1e4}),
+        ({"smoothing": 1e-6, "slack": 1e-9}, {"width": 1e-6, "slack": 1e-9}),
+    ):
+        expected = oracle.draft_gear(s, rate, **same)
+        np.testing.assert_allclose(gear(**numbers).tension(s, rate), expected, rtol=1e-12, atol=1e-6)
+
+
+@pytest.mark.parametrize("preload", [0.0, 5e4])
+def test_area_of_a_cycle_is_what_friction_takes(preload):
+    k, eta, slack, stroke = 1e7, 0.4, 0.02, 0.08
+    part = gear(stiffness=k, unloading=eta, slack=slack, preload=preload)
+    angle = np.linspace(0.0, 2 * np.pi, 200001)
+    for sign in (1, -1):
+        s = sign * (slack + 0.5 * stroke * (1 - np.cos(angle)))
+        rate = sign * 0.5 * stroke * np.sin(angle)
+        area = np.trapezoid(part.tension(s, 1e2 * rate), s)
+        assert area == pytest.approx((1 - eta) * (0.5 * k * stroke**2 + preload * stroke), rel=0.01)
+
+
+def test_draft_gear_without_slack_and_friction_is_a_spring():
+    s = np.linspace(-0.1, 0.1, 81)
+    np.testing.assert_allclose(LINEAR("c", "a", "b").tension(s, 3.0), 2e7 * s, rtol=1e-13, atol=1e-8)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-300, 1e-12, -1e3, 1e6])
+@pytest.mark.parametrize("extension", [0.0, 0.02, -0.02, 1e-300, 0.13, -1e3])
+def test_derivatives_of_the_tension_are_finite_everywhere(extension, rate):
+    value = lambda part, s, v: part.tension(s, v)
+    out = jax.grad(value, argnums=(0, 1, 2))(gear(), jnp.asarray(extension), jnp.asarray(rate))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(out))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"slack": -0.01}, "slack must be non-negative"),
+        ({"unloading": 1.5}, "unloading .* at most 1"),
+        ({"transition_speed": 0.0}, "transition_speed must be positive"),
+        ({"smoothing": 0.0}, "smoothing must be positive"),
+        ({"travel": 0.0}, "travel must be positive"),
+    ],
+)
+def test_numbers_of_draft_gears_are_checked(numbers, message):
+    with pytest.raises(ValueError, match=f"'coupler1': {message}"):
+        mb.mechanisms.train(n=2, coupler=functools.partial(planar.DraftGear, **numbers))
+
+
+@pytest.mark.parametrize("make", [mb.mechanisms.train, mb.mechanisms.longitudinal_train])
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"n": 0}, "n ≥ 1"),
+        ({"mass": (1.0, 2.0, 3.0)}, r"mass must be a number or one for each of 4 vehicles, got shape \(3,\)"),
+        ({"resistance": 3.0}, "resistance must be"),
+        ({"brake_rise": 0.0}, "brake_rise must be positive"),
+    ],
+)
+def test_numbers_of_trains_are_checked(make, numbers, message):
+    with pytest.raises(ValueError, match=message):
+        make(**numbers)
+
+
+# Trains with draft gears
+
+
+def test_frequencies_of_a_free_chain():
+    n, k, m = 20, 2e7, 8e4
+    system = mb.mechanisms.train(n=n, coupler=LINEAR, **BARE).system
+    along = np.arange(0, 3 * n, 3)
+    stiffness = -jax.jacfwd(lambda q: system.force(0.0, q, system.guess.u))(system.guess.q)[np.ix_(along, along)]
+    found = np.sqrt(np.linalg.eigvalsh(stiffness / m)[1:])
+    np.testing.assert_allclose(found, 2 * np.sqrt(k / m) * np.sin(np.arange(1, n) * np.pi / (2 * n)), rtol=1e-9)
+
+
+def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
+    n, k, m, pull = 100, 2e7, 8e4, 3e5
+    mechanism = mb.mechanisms.train(n=n, coupler=LINEAR, pull=pull, **BARE)
+    times = np.arange(1, 601) * 0.01
+    sol = mb.simulate(mechanism.system, mechanism.state, t1=6.0, rtol=1e-8, atol=1e-9, saveat=times)
+    force = coupler_forces(sol)[:, 50]
+    assert 50 / np.sqrt(k / m) == pytest.approx(3.162, abs=1e-3)
+    assert np.interp(0.5 * pull, force[times < 3.5], times[times < 3.5]) == pytest.approx(3.273, abs=2e-3)
+    assert np.mean(force[(times > 5) & (times < 6)]) == pytest.approx(3.003e5, rel=0.01)
+    np.testing.assert_allclose(sol.linear_momentum[:, 0], pull * times, rtol=1e-12)
+
+
+def test_relative_coordinates_are_the_straight_motion_of_the_train():
+    rng = np.random.default_rng(0)
+    n, mass = 5, 8e4 * (1 + 0.3 * rng.random(5))
+    relative = mb.mechanisms.longitudinal_train(n=n, mass=mass, pull=1e5, grade=0.01).system
+    plane = mb.mechanisms.train(n=n, mass=mass, pull=1e5, grade=0.01, coupler_height=0.0).system
+    y, w = 0.05 * rng.normal(size=n), 0.2 * rng.normal(size=n)
+    absolute = lambda first, rest: np.cumsum(np.concatenate([[first], -rest]))
+    x, v = absolute(y[0], y[1:] + 13.0), absolute(w[0], w[1:])
+    still = lambda values: jnp.asarray(np.stack([values, 0 * values, 0 * values], axis=1).ravel())
+    found, _ = accelerations(relative, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
+    expected, _ = accelerations(plane, Multipliers(), 1.0, still(x), still(v))
+    np.testing.assert_allclose(absolute(found[0], np.asarray(found[1:])), expected[::3], rtol=0, atol=1e-11)
+    # Half the tensions of its neighbours, and its own.
+    S = np.concatenate([[0.0], relative.tensions(mb.State(jnp.asarray(y), jnp.asarray(w))), [0.0]])
+    bare = mb.mechanisms.longitudinal_train(n=n, mass=mass, resistance=(0, 0, 0), brake=0.0).system
+    found, _ = accelerations(bare, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
+    own = -S[1:-1] * (1 / mass[:-1] + 1 / mass[1:]) + S[:-2] / mass[:-1] + S[2:] / mass[1:]
+    np.testing.assert_allclose(found[1:], own, rtol=0, atol=1e-12 * np.max(np.abs(own)))
+
+
+def test_slow_and_fast_collisions():
+    """Vehicles that meet at a nanometre or a hundred metres a second, their slack open, shut or in between."""
+    system = mb.mechanisms.longitudinal_train(n=4, brake=0.0, resistance=(0, 0, 0)).system
+    run = jax.jit(lambda state: mb.simulate(system, state, t1=1.0, rtol=1e-9, throw=False))
+    for speed in (0.0, 1e-9, 1e-3, 100.0):
+        for y in ((0.0, 0.0, 0.0), (0.02, -0.02, 0.02), (-0.02, 0.0225, -0.0225)):
+            state = mb.State(jnp.array([0.0, *y]), speed * jnp.array([0.0, 0.0, -1.0, 0.0]))
+            sol = run(state)
+            assert sol.result == mb.RESULTS.successful
+            energy = lambda y: system.kinetic_energy(0.0, y.q, y.u) + system.potential_energy(0.0, y.q)
+            end = jax.tree.map(lambda x: x[-1], sol.ys)
+            assert energy(end) <= energy(state) + 1e-6 * (1e-3 + system.kinetic_energy(0.0, state.q, state.u))
+            np.testing.assert_allclose(np.sum(np.cumsum([end.u[0], *-end.u[1:]])), 2 * speed, rtol=1e-9, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def collision():
+    """Largest force of a coupler while two vehicles run into two at rest, from numbers of the first draft gear."""
+    mechanism = mb.mechanisms.longitudinal_train(
+        n=4, speed=(0.0, 0.0, 3.0, 3.0), extension=(0.01, -0.02, 0.02), brake=0.0, resistance=(0, 0, 0)
+    )
+
+    def peak(numbers, rtol, **options):
+        system = mb.with_parameters(mechanism.system, numbers)
+        sol = mb.simulate(
+            system, mechanism.state, t1=0.3, rtol=rtol, saveat=jnp.linspace(0.0, 0.3, 61), throw=False, **options
+        )
+        tensions = jax.vmap(system.tensions)(sol.ys)[:, 1]
+        # Not `jnp.min`: XLA may compute a number twice, rounded differently, and its derivative divides by the count
+        # of numbers equal to the smallest.
+        return -tensions[jnp.argmin(tensions)]
+
+    return peak, {
+        f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"]
+        for name in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition_speed")
+    }
+
+
+def test_derivatives_of_the_largest_force_in_a_collision(collision):
+    peak, numbers = collision
+    along = lambda numbers, rtol: peak(numbers, rtol, adjoint=diffrax.ForwardMode())
+    derivatives = jax.jit(jax.jacfwd(along))
+    forward, exact = derivatives(numbers, 1e-10), derivatives(numbers, 1e-12)
+    # Where a step crosses the kink of a draft gear depends on rounding, and so on the program: both agree as far as
+    # the tolerance lets them.
+    value, reverse = jax.jit(jax.value_and_grad(peak))(numbers, 1e-12)
+    tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
+    assert 1e5 < value < 1e7
+    for name, number in numbers.items():
+        h = 1e-5 * number
+        central = lambda h, name=name, number=number: (
+            (tight(numbers | {name: number + h}) - tight(numbers | {name: number - h})) / (2 * h)
+        )
+        # Richardson's extrapolation: the stop bends the force over a millimetre.
+        difference = (4 * central(h) - central(2 * h)) / 3
+        np.testing.assert_allclose(exact[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
+        np.testing.assert_allclose(forward[name], difference, rtol=1e-5, atol=5e-6 * value / number, err_msg=name)
+
+
+# Trains with hinges and drawbars
+
+
+@functools.cache
+def hinged(n, **numbers):
+    mass = 8e4 * (1 + 0.3 * np.random.default_rng(n).random(n))
+    return mb.mechanisms.train(n=n, coupler=planar.Revolute, mass=mass, inertia=16 * mass, **numbers)
+
+
+def by_blocks(system):
+    """The system with its joints in an order of elimination, also where a dense matrix is faster."""
+    return dataclasses.replace(system, elimination=joint_order(system))
+
+
+def random_state(system, rng, pitch=0.2):
+    q = np.asarray(system.guess.q) + np.tile([0.0, 0.0, 1.0], system.nq // 3) * pitch * rng.normal(size=system.nq)
+    return jnp.asarray(q), jnp.asarray(rng.normal(size=system.nu))
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 50])
+def test_hinge_forces_are_those_of_one_matrix_of_all(n):
+    system = by_blocks(hinged(n).system)
+    solve = jax.jit(lambda q, u: (accelerations(system, Multipliers(), 0.1, q, u), system.force(0.1, q, u)))
+    rng = np.random.default_rng(n)
+    for _ in range(3):
+        q, u = random_state(system, rng)
+        (udot, multipliers), force = solve(q, u)
+        arrays = (np.asarray(x).reshape(n, 3) for x in (q, u, force))
+        inertias = (np.asarray(system.mass), np.asarray(system.moments_of_inertia))
+        expected, forces = oracle.hinged_accelerations(*arrays, *inertias)
+        np.testing.assert_allclose(udot.reshape(n, 3), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, rtol=0, atol=1e-12 * np.max(np.abs(forces)))
+
+
+def mixed_chains():
+    """Joints of one, two and three rows between the ground and bodies in no order, and a chain of its own."""
+    bodies = [planar.Body(name, mass=1.0 + k, inertia=0.1, position=(k, 0.1 * k)) for k, name in enumerate("abcdef")]
+    bodies.append(planar.PointMass("p", mass=0.5, position=(7.0, 1.0)))
+    joints = [
+        planar.Fixed("weld", "c", "a", point=(1.0, 0.3)),
+        planar.Distance("rod", "b", "a", length=1.0),
+        planar.Revolute("pin", "ground", "b", point=(0.7, 0.1)),
+        planar.PointOnLine("slot", "c", "ground", point=(2.5, 0.3), axis=(1.0, 0.0)),
+        planar.Revolute("own", "e", "d", point=(3.5, 0.2)),
+        planar.Distance("last", "p", "e"),
+        planar.KnifeEdge("blade", "d"),
+    ]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def hanging_spheres():
+    bodies = [
+        spatial.Body(f"b{k}", mass=1.0 + k, inertia=(0.2, 0.3, 0.4 + 0.02 * k), position=(k, 0.0, 0.0))
+        for k in range(4)
+    ]
+    joints = [spatial.Spherical("s0", "ground", "b0", point=(-0.5, 0.0, 0.0))]
+    joints += [spatial.Spherical(f"s{k}", f"b{k - 1}", f"b{k}", point=(k - 0.5, 0.1, 0.0)) for k in range(1, 4)]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.parametrize("build", [mixed_chains, hanging_spheres])
+def test_any_joints_in_chains(build):
+    system = build()
+    rng = np.random.default_rng(0)
+    structured = by_blocks(system)
+
+    @jax.jit
+    def solve(q, u, v):
+        cases = (structured, Multipliers()), (structured, Poincare()), (system, Multipliers())
+        blocks = structured.structured_jacobian(0.0, q, u)
+        products = [
+            [A.product(v), A.transpose_product(A.product(v)), A.matrix]
+            for A in (blocks.dense(), system.structured_jacobian(0.0, q, u))
+        ]
+        products.append([blocks.product(v), blocks.transpose_product(blocks.product(v)), products[0][2]])
+        return [accelerations(*case, 0.0, q, u) for case in cases], products
+
+    for _ in range(3):
+        q = system.normalize(system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
+        for found in solve(q, *jnp.asarray(rng.normal(size=(2, system.nu)))):
+            for case in found[:-1]:
+                for a, b in zip(case, found[-1], strict=True):
+                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
+
+
+def test_a_chain_in_space_moves_as_by_partitioning():
+    system = hanging_spheres()
+    cases = (system, Partition()), (system, Projection()), (by_blocks(system), Projection())
+    expected, *ends = [
+        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys for system, manifold in cases
+    ]
+    for end in ends:
+        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-7)
+        assert np.max(np.abs(system.coordinate_residual(0.3, end.q[-1]))) <= 1e-13
+
+
+def undamped(coupler):
+    return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
+
+
+@pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, Projection())])
+def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
+    system = undamped(coupler).system
+    rng = np.random.default_rng(1)
+    push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=18) * np.tile([0.3, 0.3, 0.02], 6)))
+    state = mb.assemble(system, push)
+    sol = mb.simulate(system, state, t1=10.0, rtol=1e-11, manifold=manifold, saveat=diffrax.SaveAt(t0=True, t1=True))
+    change = sol.energy - sol.energy[0]
+    assert np.max(np.abs(change)) <= 1e-9 * sol.kinetic_energy[0]
+    if manifold is not None:
+        assert np.max(np.abs(jax.vmap(lambda y: system.position_residual(0.0, y.q))(sol.ys))) <= 1e-13
+        assert np.max(np.abs(jax.vmap(lambda y: system.velocity_residual(0.0, y.q, y.u))(sol.ys))) <= 1e-13
+
+
+@pytest.fixture(scope="module")
+def long_chain():
+    return mb.mechanisms.get("rod_chain", n=16)
+
+
+def test_long_chains_need_no_choice(long_chain):
+    """The same motion by both solvers' defaults, by blocks."""
+    assert "sparse elimination" in str(long_chain.system)
+    ends = []
+    for solver in (None, diffrax.Tsit5()):
+        sol = mb.simulate(long_chain.system, long_chain.state, t1=0.1, rtol=1e-9, solver=solver)
+        assert isinstance(sol.formulation, Multipliers)
+        assert np.all(sol.constraint_violation.position <= 1e-13)
+        ends.append(sol.ys)
+    np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-6)
+
+
+def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
+    names = ("link3.mass", "link9.inertia", "pin5.point_a", "pin16.point_b")
+    numbers = {name: mb.parameters(long_chain.system)[name] for name in names}
+    direction = {"link3.mass": 0.05, "link9.inertia": 1e-5, "pin5.point_a": (0.01, 0.02), "pin16.point_b": (0.02, 0.01)}
+    direction = {name: jnp.asarray(value) for name, value in direction.items()}
+
+    def tip(numbers, rtol, **options):
+        system = mb.with_parameters(long_chain.system, numbers)
+        state = mb.manifold.project(system, 0.0, long_chain.state)
+        sol = mb.simulate(system, state, t1=0.2, rtol=rtol, throw=False, **options)
+        return jnp.sum(sol["link16"].position[-1]) + 0.1 * sol["link16"].angular_velocity[-1]
+
+    along = lambda h, rtol, **options: tip(jax.tree.map(lambda x, dx: x + h * dx, numbers, direction), rtol, **options)
+    forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: along(h, rtol, adjoint=diffrax.ForwardMode()), (h,), (1.0,)))
+    reverse = jax.jit(jax.grad(lambda h: along(h, 1e-10)))
+    _, push = forward(0.0, 1e-10)
+    np.testing.assert_allclose(reverse(0.0), push, rtol=1e-10)
+    value, h = lambda h: forward(h, 1e-12)[0], 1e-3
+    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(push, difference, rtol=1e-7)
+
+
+def ring(*more, bodies=4):
+    """Bodies on a line with pins between neighbours, and more joints."""
+    line = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(k, 0.0)) for k in range(bodies)]
+    pins = [planar.Revolute(f"pin{k}", f"b{k}", f"b{k + 1}", point=(k + 0.5, 0.0)) for k in range(bodies - 1)]
+    return mb.Scene(line, joints=[*pins, *more]).compile()
+
+
+def redundant():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pins = [planar.Revolute(name, "ground", "body", point=(x, 0.0)) for name, x in (("left", -1.0), ("right", 1.0))]
+    return mb.Scene([body], joints=pins).compile()
+
+
+def pendulum_on_paper():
+    kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2)
+    rod = mb.lagrangian.Holonomic("rod", lambda t, q, p: q @ q - 1.0)
+    return mb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[rod], q=(1.0, 0.0))
+
+
+def turning_pendulum():
+    """In velocities along axes that turn and move, with a mass matrix that depends on the position."""
+    kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2) + 0.5 * q[0] ** 2 * v[1] ** 2
+    rod = mb.lagrangian.Holonomic("rod", lambda t, q, p: q @ q - 1.0)
+    axes = lambda t, q, p: jnp.array([[jnp.cos(q[1]), -jnp.sin(q[1])], [jnp.sin(q[1]), jnp.cos(q[1])]])
+    kinematics = mb.lagrangian.QuasiVelocityFrame(axes, 2, lambda t, q, p: jnp.array([0.1, 0.2]) * jnp.cos(t))
+    return mb.lagrangian.LagrangianSystem(
+        kinetic=kinetic, constraints=[rod], kinematics=kinematics, q=(1.0, 0.0), u=(0.0, 0.3)
+    )
+
+
+def dry_friction():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pin = planar.Revolute("pin", "ground", "body", point=(1.0, 0.0))
+    return mb.Scene([body], joints=[pin], forces=[planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)]).compile()
+
+
+def skater():
+    return mb.mechanisms.get("appell_hamel").system
+
+
+@pytest.mark.parametrize(
+    ("build", "options", "message"),
+    [
+        (redundant, {}, r"only 3 are independent.*Partition\(\)"),
+        (pendulum_on_paper, {"solver": mb.solvers.Hermite()}, r"Projection with Hermite needs a scene.*Partition\(\)"),
+        (dry_friction, {"solver": mb.solvers.Hermite()}, "Projection with Hermite takes constraints that are ideal"),
+        (ring, {"formulation": Poincare()}, r"Projection with Adams finds accelerations by Multipliers\(\)"),
+        (skater, {}, "linear in velocities"),
+        (lambda: mb.mechanisms.get("spherical_four_bar").system, {}, "inverse of the mass matrix"),
+    ],
+)
+def test_projection_with_adams_refuses(build, options, message):
+    system = build()
+    with pytest.raises(ValueError, match=message):
+        mb.simulate(system, system.guess, t1=1.0, **({"manifold": Projection()} | options))
+
+
+LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
+TWIN = planar.Distance("twin", "b0", "b1", point_a=(0.0, 1.0))
+FOOT = planar.Revolute("foot", "ground", "b1", point=(1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: ring(LOOP),
+        lambda: ring(TWIN, bodies=2),
+        lambda: ring(FOOT),
+        pendulum_on_paper,
+        turning_pendulum,
+        dry_friction,
+    ],
+)
+def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
+    """Loops, branches and systems without joints: the same motion as by partitioning, with its derivatives."""
+    system = build()
+    assert system.elimination is None
+    rng = np.random.default_rng(0)
+    push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=system.nu)))
+    state = mb.assemble(system, push)
+
+    def end(u, manifold, adjoint):
+        start = mb.manifold.project(system, 0.0, mb.State(state.q, state.u * u))
+        y = mb.simulate(system, start, t1=0.3, rtol=1e-10, manifold=manifold, adjoint=adjoint).ys
+        return jnp.concatenate([y.q[0], y.u[0]])
+
+    forward = lambda manifold: jax.jit(
+        lambda u: jax.jvp(lambda u: end(u, manifold, diffrax.ForwardMode()), (u,), (1.0,))
+    )
+    expected, dexpected = forward(Partition())(1.0)
+    found, dfound = forward(Projection())(1.0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-6)
+    weights = jnp.asarray(rng.normal(size=found.size))
+    reverse = jax.jit(jax.grad(lambda u: weights @ end(u, Projection(), None)))(1.0)
+    np.testing.assert_allclose(reverse, weights @ dfound, rtol=1e-9)
+
+
+def test_partitioning_of_a_long_chain_still_works(long_chain):
+    """With either formulation when it is asked for."""
+    run = lambda **options: mb.simulate(long_chain.system, long_chain.state, t1=0.02, rtol=1e-9, **options).ys
+    expected = run()
+    for formulation in (None, Multipliers()):
+        end = run(manifold=Partition(), formulation=formulation)
+        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-6)
+
+
+# Cost
+
+
+def largest(jaxpr):
+    """The size of the largest array of a program, inner ones included."""
+    sizes = [int(np.prod(v.aval.shape)) for e in jaxpr.eqns for v in e.outvars]
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                sizes.append(largest(inner))
+    return max(sizes, default=0)
+
+
+@pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute, planar.Distance])
+def test_program_and_memory_of_long_trains(coupler):
+    """As many instructions for any number of vehicles, and no array that grows faster than it."""
+
+    def measure(n):
+        mechanism = mb.mechanisms.train(n=n, coupler=coupler)
+        right_hand_side = lambda system, q, u: accelerations(system, Multipliers(), 0.1, q, u)[0]
+        arguments = mechanism.system, mechanism.state.q, mechanism.state.u
+        lines = jax.jit(right_hand_side).lower(*arguments).as_text().count("\n")
+        return lines, largest(jax.make_jaxpr(right_hand_side)(*arguments).jaxpr)
+
+    (few, small), (many, large) = measure(40), measure(160)
+    assert few == many
+    assert large <= 4.2 * small
+
+
+@pytest.mark.long
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="needs a machine for itself: no tests beside it")
+@pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute])
+def test_time_of_long_trains(coupler):
+    """Ten times as many vehicles take ten times as long; the bound leaves room for caches that overflow.
+
+    Those are shared with whatever else runs, which makes times of long trains several times as long: the shortest
+    count, of so many that something else has time to pass.
+    """
+    runs = {}
+    for n in (1000, 10000):
+        mechanism = mb.mechanisms.train(n=n, coupler=coupler)
+
+        @jax.jit
+        def several(system, q, u, repeats=100000 // n):
+            again = lambda _, u: u + 1e-9 * accelerations(system, Multipliers(), 0.1, q, u)[0]
+            return jax.lax.fori_loop(0, repeats, again, u)
+
+        runs[n] = functools.partial(several, mechanism.system, mechanism.state.q, mechanism.state.u)
+        runs[n]().block_until_ready()
+
+    times = dict.fromkeys(runs, np.inf)
+    for _ in range(500):
+        for n, run in runs.items():
+            start = time.perf_counter()
+            run().block_until_ready()
+            times[n] = min(times[n], (time.perf_counter() - start) * n / 100000)
+    assert times[10000] <= 12 * times[1000]

@@ -1,0 +1,114 @@
+"""Every notebook runs from top to bottom, prints what it shows, and is fit to be committed; so are the README's figure
+and example.
+"""
+
+import json
+import re
+
+import nbformat
+import numpy as np
+import pytest
+from compiling import flags_to_run_long
+from execute_notebooks import FOLDER, difference, digest, executed, printed
+from PIL import Image
+
+import jaxmb as mb
+
+ROOT = FOLDER.parent
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LARGEST = 2 * 2**20
+# Those that run longer than they compile.
+RUN_LONG = {"04_vehicles"}
+# What a notebook must not hold: paths of somebody's machine, downloads, and shell commands.
+FORBIDDEN = re.compile(
+    r"/(home|root|tmp|Users|work|workspace)/|[A-Z]:\\\\|https?://|urllib|requests|^[!%](?!matplotlib inline)", re.M
+)
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_lint(path):
+    assert path.stat().st_size < LARGEST
+    notebook = nbformat.read(path, as_version=4)
+    assert notebook.cells[0].cell_type == "markdown" and notebook.cells[0].source.startswith("# ")
+    assert any("jax_enable_x64" in cell.source for cell in notebook.cells)
+    assert notebook.metadata.kernelspec.name == "python3"
+    for cell in notebook.cells:
+        texts = [cell.source]
+        for output in cell.get("outputs", []):
+            assert output.output_type != "error"
+            texts += [output.get("text", ""), output.get("data", {}).get("text/plain", "")]
+        for text in texts:
+            assert not FORBIDDEN.search(text), f"{path.name}: {FORBIDDEN.search(text)!r}"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_outputs_are_those_of_the_cells(path):
+    """After a change of a cell or of the version: `python tests/support/execute_notebooks.py NAME`."""
+    notebook = nbformat.read(path, as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert notebook.metadata.jaxmb.version == mb.__version__
+    assert notebook.metadata.jaxmb.executed == {cell.id: digest(cell.source) for cell in cells}
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    assert all("execution" not in cell.metadata for cell in cells)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+# Of the kernel's own files, which this package does not touch.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_runs_and_prints_what_it_shows(path, monkeypatch):
+    if path.stem in RUN_LONG:
+        for name, value in flags_to_run_long().items():
+            monkeypatch.setenv(name, value)
+    stored, new = nbformat.read(path, as_version=4), executed(path)
+    for before, after in zip(stored.cells, new.cells, strict=True):
+        if after.cell_type == "code" and "varies" not in after.metadata.get("tags", []):
+            found = difference(printed(before), printed(after))
+            assert found is None, f"{path.name}, cell {after.id}: {found}"
+
+
+def test_what_counts_as_another_output():
+    shown = "fit: 0.49986 ± 2.2e-04\nenergy drifts by 3e-15, 120 steps"
+    for same in (
+        "fit: 0.49985 ± 2.4e-04\nenergy drifts by 8e-14, 121 steps",
+        "fit:  0.4999 ± 1.9e-03\n energy drifts by 0.0, 118 steps",
+    ):
+        assert difference(shown, same) is None
+    for other in (
+        shown.replace("0.49986", "0.55"),
+        shown.replace("2.2e-04", "2.2e-01"),
+        shown.replace("3e-15", "3e-06"),
+        shown.replace("120", "150"),
+        shown.replace("steps", "evaluations"),
+        shown + "\nmore",
+    ):
+        assert difference(shown, other) is not None
+
+
+def test_the_figure_of_the_readme_shows_what_is_computed():
+    """After a change: `python tests/support/execute_notebooks.py work_precision`."""
+    with Image.open(FOLDER / "work_precision.png") as image:
+        shown = json.loads(image.text["Description"])
+    assert shown["jaxmb"] == mb.__version__ and shown["mechanism"] == "andrews"
+    assert {run["solver"] for run in shown["runs"]} == {"Adams", "Tsit5", "Dopri8"}
+    tolerances = [1e-4, 1e-8]
+    solvers = {"Adams": mb.solvers.Adams()}
+    now = mb.report.work_precision(mb.mechanisms.get("andrews"), solvers=solvers, tolerances=tolerances, repeats=1)
+    for run in now.runs:
+        (before,) = (old for old in shown["runs"] if (old["solver"], old["rtol"]) == (run.solver, run.rtol))
+        # Programs that are compiled in another way may round a step to the other side of its bound.
+        assert run.evaluations == pytest.approx(before["evaluations"], rel=0.02)
+        assert before["error"] / 3 < run.error < 3 * before["error"]
+
+
+def test_readme_example(capsys):
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    exec(code.group(1), {})
+    promised = [float(number) for number in code.group(1).rsplit("#", 1)[1].split()]
+    printed = [float(number) for number in capsys.readouterr().out.split()]
+    np.testing.assert_allclose(printed, promised, rtol=0, atol=1e-6)

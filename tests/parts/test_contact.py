@@ -1,0 +1,295 @@
+"""Terrains, and the contact of bodies with them."""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+from laws import BUMP, FRICTION, JANOSI, LAWS, TERRAINS
+from oracles import tracked_vehicle as oracle
+from scipy.integrate import quad
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.mechanisms._wheel_contact import WheelContact
+from jaxmb.parts import contact, terrain
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
+
+
+def three_wheels(kind=planar.Contact, **changes):
+    """Contact of three bodies with a bump."""
+    options = {
+        "terrain": BUMP,
+        "normal": contact.Linear(8e5),
+        "friction": contact.Coulomb(0.7, transition_speed=0.3),
+        "radius": 0.305,
+        "damping": 2e4,
+    }
+    return kind("road", ("a", "b", "c"), **(options | changes))
+
+
+# Terrains
+
+
+@pytest.mark.parametrize("name", TERRAINS)
+def test_heights_and_slopes_are_continuous(name):
+    """And curvatures but for those of the bump at its ends."""
+    of = TERRAINS[name]
+    height = lambda x: of.height(x[None])
+    slope = jax.grad(height)
+    x = jnp.linspace(2.5, 6.5, 4001)
+    values = [np.asarray(jax.vmap(f)(x)) for f in (height, slope, jax.grad(slope))]
+    h = float(x[1] - x[0])
+    # Jumps would show as differences that do not become small with the distance.
+    curvature = np.max(np.abs(values[2])) + 1.0
+    assert np.max(np.abs(np.diff(values[1]))) <= 1.1 * h * curvature
+    if name != "bump":
+        assert np.max(np.abs(np.diff(values[2]))) <= 100 * h * curvature
+    np.testing.assert_allclose(
+        np.diff(values[0]) / h, 0.5 * (values[1][1:] + values[1][:-1]), rtol=0, atol=h * curvature
+    )
+
+
+def test_bump_is_that_of_the_vehicle():
+    x = np.linspace(3.5, 6.0, 101)
+    height, slope = oracle.bump(x)
+    np.testing.assert_allclose(jax.vmap(BUMP.height)(x[:, None]), height, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(jax.vmap(jax.grad(BUMP.height))(x[:, None])[:, 0], slope, rtol=0, atol=1e-14)
+
+
+def test_spline_goes_through_its_points_and_follows_parabolas():
+    x = np.array([-1.0, 0.0, 0.3, 1.0, 1.5, 2.5])
+    at = lambda part, x: jax.vmap(part.height)(jnp.asarray(x)[:, None])
+    wild = np.sin(7 * x)
+    spline = terrain.Spline(x=x, heights=wild)
+    np.testing.assert_allclose(at(spline, x), wild, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(at(spline, [-3.0, 4.5])[0], wild[0] - 2 * (wild[1] - wild[0]), rtol=1e-13)
+    parabola = lambda x: 0.3 - 0.2 * x + 0.5 * x**2
+    between = np.linspace(0.0, 1.5, 31)
+    np.testing.assert_allclose(
+        at(terrain.Spline(x=x, heights=parabola(x)), between), parabola(between), rtol=0, atol=1e-14
+    )
+    with pytest.raises(ValueError, match="must ascend"):
+        terrain.Spline(x=[0.0, 0.0, 1.0], heights=[0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match="same length"):
+        terrain.Spline(x=[0.0, 1.0], heights=[0.0, 0.0])
+    with pytest.raises(ValueError, match="length must be positive"):
+        terrain.Bump(start=0.0, length=0.0, peak=0.1)
+
+
+# Laws
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_energy_is_the_work_of_the_normal_force(name):
+    law = LAWS[name]
+    work, _ = quad(lambda depth: float(law.force(jnp.array(depth))), 0.0, 0.03, epsabs=0.0, epsrel=1e-10)
+    np.testing.assert_allclose(law.energy(jnp.array(0.03)), work, rtol=1e-9)
+
+
+def test_bekker_is_pressure_times_area():
+    law, z = LAWS["soft soil"], 0.04
+    np.testing.assert_allclose(law.force(jnp.array(z)), 0.05 * (2e3 / 0.3 + 8e5) * z**0.7, rtol=1e-14)
+
+
+@pytest.mark.parametrize("slip", [1e-9, 1e-4, 0.02, 1.0, -3.0])
+def test_laws_of_friction(slip):
+    vector = lambda x: jnp.array([x, 0.0])
+    coulomb = contact.Coulomb(0.7, transition_speed=0.3)
+    force = coulomb.force(jnp.array(2e3), jnp.array(1.0), vector(slip), vector(4.0))
+    np.testing.assert_allclose(force, [-0.7 * 2e3 * np.tanh(slip / 0.3), 0.0], rtol=1e-13)
+    # The mean of the shear stress over the patch.
+    speed = lambda v: np.hypot(v, 0.05)
+    ratio = abs(slip) / (0.5 * (speed(4.0) + speed(4.0 - slip) + speed(slip)))
+    mean, _ = quad(lambda s: -np.expm1(-ratio * 0.4 * s / 0.02), 0.0, 1.0, epsrel=1e-13)
+    force = JANOSI.force(jnp.array(2e3), jnp.array(1.0), vector(slip), vector(4.0))
+    np.testing.assert_allclose(force, [-np.sign(slip) * (3e3 * 0.1 + 2e3 * np.tan(0.5)) * mean, 0.0], rtol=1e-9)
+
+
+# Contact
+
+
+def states(rng, space, k):
+    poses = np.asarray(rng.normal(size=(k, space.pose_size)))
+    poses[:, space.dimension - 1] = rng.uniform(0.2, 0.45, size=k)
+    poses[:, 0] = rng.uniform(3.9, 5.6, size=k)
+    if space is SPACE:
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return jnp.asarray(poses), jnp.asarray(rng.normal(size=(k, space.velocity_size)))
+
+
+def test_wheels_of_the_tracked_vehicle():
+    """Spring with the slope's share, damping that sets in linearly, traction at the rim: as in the model's equations,
+    deep in the ground, at its surface and far above.
+    """
+    part = three_wheels(WheelContact).resolve(PLANE, jnp.zeros((3, 3)))
+    q = np.array([[4.3, 0.2, 0.4], [5.0, 0.4071, 0.1], [4.5, 30.0, 0.0]])
+    v = np.array([[1.0, 0.3, -1.0], [0.3, 0.2, 0.5], [1.0, -1.0, 0.0]])
+    ground, slope = oracle.bump(q[:, 0])
+    depth, share = oracle.plus(0.305 + ground - q[:, 1])
+    traction = -0.7 * 8e5 * depth * np.tanh((v[:, 0] + 0.305 * v[:, 2]) / 0.3)
+    normal = 8e5 * depth * share
+    expected = np.stack(
+        [
+            traction - normal * slope,
+            normal - 2e4 * np.clip(depth / 0.01, 0, 1) * v[:, 1],
+            0.305 * traction,
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(
+        part.wrenches(PLANE, jnp.asarray(q), jnp.asarray(v), 0.0), expected, rtol=1e-9, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize(
+    "space, kind, law",
+    [(PLANE, planar.Contact, "soft soil"), (PLANE, WheelContact, "linear"), (SPACE, spatial.Contact, "hertz")],
+    ids=["plane", "wheels", "space"],
+)
+def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, kind, law):
+    rng = np.random.default_rng(1)
+    poses, velocities = states(rng, space, 3)
+    rates = jax.vmap(space.rates)(poses, velocities)
+    places = {} if kind is WheelContact else {"centres": jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))}
+    build = lambda **options: three_wheels(kind, normal=LAWS[law], **places, **options).resolve(space, poses)
+    smooth = contact.Coulomb(0.0, transition_speed=1.0)
+    elastic, rough = build(friction=smooth, damping=0.0), build(friction=JANOSI, damping=3e3)
+    energy, rate = jax.jvp(lambda q: elastic.energy(space, q, 0.0), (poses,), (rates,))
+    power = lambda part: jnp.sum(part.wrenches(space, poses, velocities, 0.0) * velocities)
+    assert energy > 1.0
+    np.testing.assert_allclose(power(elastic), -rate, rtol=1e-10)
+    assert power(rough) + rate < -1.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("friction", FRICTION)
+def test_derivatives_are_finite_where_laws_have_kinks(friction, law):
+    """At the surface, far off it, and without slip or speed."""
+    part = three_wheels(normal=LAWS[law], friction=FRICTION[friction]).resolve(PLANE, jnp.zeros((3, 3)))
+    poses, still = jnp.array([[0.0, 0.305, 0.0], [1.0, 1e4, 0.0], [2.0, 0.2, 0.0]]), jnp.zeros((3, 3))
+    wrenches = lambda *args: (part.wrenches(PLANE, *args, 0.0),) * 2
+    jacobians, value = jax.jit(jax.jacfwd(wrenches, (0, 1), has_aux=True))(poses, still)
+    assert all(np.all(np.isfinite(jacobian)) for jacobian in jacobians)
+    np.testing.assert_array_equal(value[:, [0, 2]], 0.0)
+
+
+def test_one_terrain_for_all_bodies_is_one_parameter():
+    wheel = lambda name, x: planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.3))
+    bodies = [wheel(name, x) for name, x in (("a", 4.3), ("b", 4.6), ("c", 4.9))]
+    system = mb.Scene(bodies, forces=[three_wheels()]).compile()
+    known = mb.parameters(system)
+    assert {name: float(known[name]) for name in known if "terrain" in name} == {
+        "road.terrain.start": 4.0,
+        "road.terrain.length": 1.5,
+        "road.terrain.peak": pytest.approx(0.12),
+    }
+    assert "road.friction.transition_speed" in known and "road.normal.stiffness" in known
+    q = system.guess.q
+    lift = jax.jit(lambda peak: mb.with_parameters(system, {"road.terrain.peak": peak}).force(0.0, q, 0.0 * q)[1::3])
+    assert np.all(lift(0.13) - lift(0.12) > 100.0)
+    with pytest.raises(ValueError, match=r"road\.terrain\.peak"):
+        mb.with_parameters(system, {"road.terrain.height": 0.2})
+
+
+def test_ball_rolls_down_a_slope():
+    """After its slip has settled a ball gains 5/7 g sin α along the slope, and stays as deep in the ground."""
+    angle, radius, mass = 0.2, 0.1, 2.0
+    stiffness, g = 1e5, 9.81
+    normal = np.array([-np.sin(angle), 0.0, np.cos(angle)])
+    start = (radius - mass * g * np.cos(angle) / stiffness) * normal
+    ball = spatial.Body("ball", mass=mass, inertia=0.4 * mass * radius**2 * np.eye(3), position=start)
+    ground = spatial.Contact(
+        "floor",
+        "ball",
+        terrain=terrain.Slope(np.tan(angle)),
+        normal=contact.Linear(stiffness),
+        friction=contact.Coulomb(0.5, transition_speed=0.02),
+        radius=radius,
+        smoothing=1e-9,
+    )
+    system = mb.Scene([ball], forces=[ground, mb.Gravity((0.0, 0.0, -g))]).compile()
+    sol = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=jnp.array([0.3, 0.5]), rtol=1e-9)
+    motion = sol["ball"]
+    gain = 5 / 7 * g * np.sin(angle) * np.array([-np.cos(angle), 0.0, -np.sin(angle)])
+    np.testing.assert_allclose((motion.velocity[1] - motion.velocity[0]) / 0.2, gain, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(motion.position @ normal, start @ normal, rtol=0, atol=1e-9)
+    # Friction is what the applied force reports along the slope.
+    down = np.array([-np.cos(angle), 0.0, -np.sin(angle)])
+    np.testing.assert_allclose(sol.forces["floor"][:, 0, :3] @ down, -2 / 7 * mass * g * np.sin(angle), rtol=1e-6)
+    with pytest.raises(ValueError, match="floor"):
+        sol.forces["flor"]
+
+
+def test_point_bounces_without_loss():
+    """It lands, leaves and lands again at the times of free fall and of half an oscillation on the spring."""
+    mass, stiffness, height, g = 2.0, 1e5, 0.5, 9.81
+    point = planar.PointMass("point", mass=mass, position=(0.0, height))
+    ground = planar.Contact("floor", "point", terrain=terrain.Flat(), normal=contact.Linear(stiffness), smoothing=1e-7)
+    system = mb.Scene([point], forces=[ground, mb.Gravity((0.0, -g))]).compile()
+    omega, fall = np.sqrt(stiffness / mass), np.sqrt(2 * height / g)
+    # On the spring y + g/ω² oscillates from g/ω² with speed −g fall, until it is there again.
+    contact_time = 2 / omega * (np.pi / 2 + np.arctan(g / (g * fall * omega)))
+    period = 2 * fall + contact_time
+    times = jnp.array([0.5 * period, period, 3 * period])
+    sol = mb.simulate(system, mb.assemble(system), t1=float(times[-1]), saveat=times, rtol=1e-12)
+    np.testing.assert_allclose(sol["point"].position[1:, 1], height, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(sol["point"].velocity[1:, 1], 0.0, atol=1e-4)
+    np.testing.assert_allclose(sol.energy, mass * g * height, rtol=1e-8)
+    depth = g / omega**2 + np.hypot(g / omega**2, g * fall / omega)
+    np.testing.assert_allclose(sol["point"].position[0, 1], -depth, rtol=1e-5)
+
+
+def primitives(part):
+    wrenches = lambda q, v: part.resolve(PLANE, jnp.zeros((3, 3))).wrenches(PLANE, q, v, 0.0)
+    return str(jax.make_jaxpr(wrenches)(jnp.zeros((3, 3)), jnp.zeros((3, 3))))
+
+
+@pytest.mark.long
+def test_derivatives_through_an_impact_converge():
+    """A disc bounces off a floor whose level is a parameter: what it gains in height is twice that of the floor."""
+    floor = planar.Contact(
+        "floor", ("disc",), radius=0.2, terrain=terrain.Flat(level=0.0), normal=contact.Linear(4e4), smoothing=1e-4
+    )
+    disc = planar.Body("disc", mass=2.0, inertia=0.04, position=(0.0, 0.3), velocity=(0.0, -3.0))
+    system = mb.Scene([disc], forces=[floor]).compile()
+    state = mb.assemble(system)
+
+    def height(level, rtol, adjoint=None):
+        moved = mb.with_parameters(system, {"floor.terrain.level": level})
+        return mb.simulate(moved, state, t1=0.15, rtol=rtol, adjoint=adjoint)["disc"].position[-1, 1]
+
+    reverse = jit_quickly(jax.grad(height))
+    forward = jit_quickly(jax.jacfwd(lambda level, rtol: height(level, rtol, diffrax.ForwardMode())))
+    for rtol in (1e-8, 1e-10):
+        slope = reverse(jnp.zeros(()), rtol)
+        assert abs(slope - 2.0) < 1e4 * rtol
+        np.testing.assert_allclose(forward(jnp.zeros(()), rtol), slope, rtol=1e-9)
+
+
+def test_nothing_of_friction_without_friction():
+    assert "tanh" in primitives(three_wheels())
+    assert "tanh" not in primitives(three_wheels(friction=None))
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"terrain": 0.0}, "terrain must be a law from jaxmb.terrain"),
+        ({"normal": 8e5}, "normal must be a law from jaxmb.contact"),
+        ({"friction": 0.7}, "friction must be a law from jaxmb.contact"),
+        ({"radius": (0.1, 0.2)}, r"radius must have shape \(\) or \(3,\)"),
+        ({"centres": (0.1, 0.2, 0.3)}, r"centres must have shape \(2,\) or \(3, 2\)"),
+        ({"radius": -0.1}, "radius must be non-negative"),
+        ({"smoothing": 0.0}, "smoothing must be positive"),
+        ({"normal": contact.Linear(-1.0)}, "normal.stiffness must be positive"),
+        ({"friction": dataclasses.replace(JANOSI, length=0.0)}, "friction.length must be positive"),
+    ],
+)
+def test_bad_input(changes, message):
+    with pytest.raises(ValueError, match=f"'road': {message}"):
+        three_wheels(**changes).resolve(PLANE, jnp.zeros((3, 3)))

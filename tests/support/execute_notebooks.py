@@ -1,0 +1,108 @@
+"""Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
+
+Without names all notebooks are executed, and the figure `work_precision` of the README is made. A notebook keeps the
+version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares them with the package
+and with the cells, and in its long tests what is printed with what a new execution prints. Cells with the tag `varies`
+print what differs between machines and runs, such as times, and are not compared.
+"""
+
+import hashlib
+import re
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+import jaxmb
+
+FOLDER = Path(__file__).parents[2] / "notebooks"
+# The rounding errors of two machines have nothing in common, and errors of solutions their size.
+ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
+
+
+def digest(source: str) -> str:
+    """The identity of a cell's source."""
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
+
+
+def executed(path: Path) -> nbformat.NotebookNode:
+    """The notebook after a new execution, with the record of it."""
+    notebook = nbformat.read(path, as_version=4)
+    resources = {"metadata": {"path": str(path.parent)}}
+    NotebookClient(notebook, timeout=1800, kernel_name="python3", resources=resources, record_timing=False).execute()
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for cell in cells:
+        cell.outputs = _tidy(cell.outputs)
+        cell.metadata.pop("execution", None)
+    notebook.metadata = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+        "jaxmb": {"version": jaxmb.__version__, "executed": {cell.id: digest(cell.source) for cell in cells}},
+    }
+    return notebook
+
+
+def _tidy(outputs):
+    """What was printed in pieces as one output, without the error stream: progress, and what compilers log."""
+    out = []
+    for output in outputs:
+        if output.get("name") == "stdout" and out and out[-1].get("name") == "stdout":
+            out[-1].text += output.text
+        elif output.get("name") != "stderr":
+            out.append(output)
+    return out
+
+
+def printed(cell: nbformat.NotebookNode) -> str:
+    """The text of a cell's outputs, without figures."""
+    texts = [output.text for output in cell.outputs if output.get("name") == "stdout"]
+    texts += [
+        output.data["text/plain"]
+        for output in cell.outputs
+        if output.output_type in ("execute_result", "display_data") and set(output.data) == {"text/plain"}
+    ]
+    return "\n".join(texts)
+
+
+def difference(stored: str, new: str) -> str | None:
+    """The first pair of lines that do not say the same; None if all do.
+
+    Words are to be equal, integers and other numbers to 5 %, numbers with an exponent, which are mostly errors, within
+    a factor of 20.
+    """
+    lines = [[" ".join(line.split()) for line in text.strip().splitlines()] for text in (stored, new)]
+    for a, b in zip(*lines, strict=False):
+        words = [_NUMBER.sub("#", line) for line in (a, b)]
+        numbers = [_NUMBER.findall(line) for line in (a, b)]
+        if words[0] != words[1] or not all(map(_agree, *numbers)):
+            return f"stored: {a}\nnew:    {b}"
+    return None if len(lines[0]) == len(lines[1]) else f"{len(lines[0])} lines stored, {len(lines[1])} new"
+
+
+def _agree(a: str, b: str) -> bool:
+    x, y = float(a), float(b)
+    size = max(abs(x), abs(y))
+    if size <= ROUNDING:
+        return True
+    if "e" in a.lower() and "e" in b.lower() and x * y > 0:
+        return size <= OF_ERRORS * min(abs(x), abs(y))
+    return abs(x - y) <= OF_VALUES * size
+
+
+def main(names: list[str]) -> None:
+    known = {path.stem: path for path in sorted(FOLDER.glob("*.ipynb"))}
+    for name in names or [*known, "work_precision"]:
+        print(name, flush=True)
+        if name == "work_precision":
+            jaxmb.report.work_precision(jaxmb.mechanisms.get("andrews")).figure(FOLDER / f"{name}.png")
+        else:
+            nbformat.write(executed(known[name]), known[name])
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    main(sys.argv[1:])

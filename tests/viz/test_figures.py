@@ -1,0 +1,185 @@
+"""Figures show what moves, by name, and mechanisms in the shapes of their parts."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from trajectories import motion_of
+
+import jaxmb as mb
+from jaxmb import planar, spatial, terrain, viz
+from jaxmb.linalg.rotations import rotate
+from jaxmb.parts import contact
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
+
+TS = np.linspace(0.0, 1.0, 5)
+
+
+def sliding(**slide):
+    """A piston whose mass centre moves along x, on a slide through the origin."""
+    piston = planar.Body("piston", mass=2.0, inertia=0.1, position=(0.3, 0.0))
+    joint = {"body_a": "ground", "body_b": "piston", "point": (0.0, 0.0), "axis": (1.0, 0.0)} | slide
+    system = mb.Scene([piston], joints=[planar.Prismatic("slide", **joint)]).compile()
+    x = 0.3 + 0.1 * np.sin(TS)
+    return motion_of(
+        system,
+        TS,
+        np.column_stack([x, np.zeros((5, 2))]),
+        np.column_stack([0.1 * np.cos(TS), np.zeros((5, 2))]),
+    )
+
+
+@pytest.fixture(scope="module")
+def piston():
+    return sliding()
+
+
+def drawn(axes):
+    return {line.get_label(): line.get_ydata() for line in axes.lines}
+
+
+def test_a_sliding_piston_shows_its_place_and_its_stroke(piston):
+    """Its height and angle stay zero and are left out; the displacement counts from the given pose."""
+    position, velocity, displacement, rate, energy, residual = viz.plot_motion(piston).axes
+    assert list(drawn(position)) == list(drawn(velocity)) == ["piston x"]
+    np.testing.assert_allclose(drawn(position)["piston x"], 0.3 + 0.1 * np.sin(TS))
+    np.testing.assert_allclose(drawn(displacement)["slide"], 0.1 * np.sin(TS), atol=1e-15)
+    np.testing.assert_allclose(drawn(rate)["slide"], 0.1 * np.cos(TS))
+    labels = ["position [m]", "velocity [m/s]", "displacement [m]", "rate of displacement [m/s]", "energy [J]"]
+    assert [axes.get_ylabel() for axes in (position, velocity, displacement, rate, energy)] == labels
+    assert list(drawn(residual)) == ["position", "velocity [1/s]"]
+    np.testing.assert_allclose(drawn(energy)["sum"], (0.1 * np.cos(TS)) ** 2)
+
+
+def test_a_constant_rate_is_shown_and_a_body_at_rest_is_not():
+    bodies = [planar.Body(name, mass=1.0, inertia=0.1) for name in ("wheel", "stone")]
+    system = mb.Scene(bodies).compile()
+    q, u = np.zeros((5, 6)), np.zeros((5, 6))
+    q[:, 2], u[:, 2] = 3.0 * TS, 3.0
+    angle, rate, _ = viz.plot_motion(motion_of(system, TS, q, u)).axes
+    assert list(drawn(angle)) == list(drawn(rate)) == ["wheel"]
+    np.testing.assert_allclose(drawn(rate)["wheel"], 3.0)
+
+
+def test_quantities_are_chosen_by_name(piston):
+    (one,) = viz.plot_motion(piston, "slide.displacement").axes
+    np.testing.assert_allclose(drawn(one)["slide"], 0.1 * np.sin(TS), atol=1e-15)
+    # All of a part that describes its motion, also what stays at zero.
+    found = [list(drawn(axes)) for axes in viz.plot_motion(piston, ["piston", "energy"]).axes]
+    assert found == [["piston x", "piston y"]] * 2 + [["piston"]] * 2 + [["kinetic", "potential", "sum"]]
+    force, residuals = viz.plot_motion(piston, ["residuals", "slide.force"]).axes
+    assert force.get_ylabel() == "force [N]" and list(drawn(force)) == ["slide x", "slide y"]
+    assert residuals.get_yscale() == "log"
+    with pytest.raises(ValueError, match=r"Unknown body, joint or quantity 'slid'; did you mean 'slide'"):
+        viz.plot_motion(piston, ["slid"])
+    with pytest.raises(ValueError, match="two times or more"):
+        viz.plot_motion(dataclasses.replace(piston, ts=piston.ts[:1]))
+
+
+def test_a_slide_is_drawn_at_the_body_that_slides(piston):
+    """The joint's point is at the origin when the piston is 0.3 m away, and no bar leads back to there."""
+    picture = piston.system.picture(piston.ts, piston.ys)
+    np.testing.assert_allclose(picture.parts["slide"].points[1], 0.0, atol=1e-15)
+    ends = picture.paths["slide"].points
+    np.testing.assert_allclose(ends[:, 0], 0.0, atol=1e-15)
+    np.testing.assert_allclose(ends[:, 1, 0], 0.3 + 0.1 * np.sin(TS))
+    ((body, sleeve),) = picture.shapes
+    assert body == "piston" and np.allclose(sleeve.position, 0.0)
+    # A sleeve on the ground stays where it was given.
+    fixed = sliding(body_a="piston", body_b="ground", point=(0.5, 0.0))
+    still = fixed.system.picture(fixed.ts, fixed.ys)
+    np.testing.assert_allclose(still.parts["slide"].points[1], (0.5, 0.0, 0.0))
+
+
+AXIS = np.array([0.6, 0.0, 0.8])
+# Beside the axis.
+PLACE = 2.0 * AXIS + (0.0, 0.1, 0.0)
+
+
+@pytest.mark.parametrize("kind", [spatial.Prismatic, spatial.Cylindrical, spatial.Screw])
+def test_slides_in_space_are_drawn_at_the_body_that_slides(kind):
+    """At the point of the line next to the mass centre."""
+    options = {"pitch": 0.01} if kind is spatial.Screw else {}
+    poses = np.array([[0, 0, 0, 1, 0, 0, 0], [*PLACE, 0.5, 0.5, 0.5, 0.5]], float)
+    joint = kind("slide", "ground", "nut", point=(0.0, 0.0, 0.0), axis=AXIS, **options).resolve(SPACE, poses)
+    shown = joint.pictured(SPACE)
+    np.testing.assert_allclose(SPACE.point(poses[1], shown.point_b), 2.0 * AXIS, atol=1e-12)
+    np.testing.assert_allclose(shown.residual(SPACE, poses, 0.0), 0.0, atol=1e-12)
+
+
+def test_in_space_the_angles_are_those_of_joints():
+    nut = spatial.Body("nut", mass=1.0, inertia=np.eye(3), position=PLACE)
+    pin = spatial.Cylindrical("pin", "ground", "nut", point=(0.0, 0.0, 0.0), axis=AXIS)
+    system = mb.Scene([nut], joints=[pin]).compile()
+    motion = motion_of(system, [0.0, 1.0], np.tile(np.asarray(system.guess.q), (2, 1)), np.zeros((2, 6)))
+    first, rate = viz.plot_motion(motion, "pin").axes[:2]
+    assert list(drawn(first)) == list(drawn(rate)) == ["pin"]
+    axes = viz.plot_mechanism(motion).axes[0]
+    bars = [np.stack(line.get_data_3d(), axis=1) for line in axes.lines]
+    bars = [points for points in bars if len(points) == 2]
+    for ends in ([PLACE, 2.0 * AXIS], [(0.0, 0.0, 0.0), 2.0 * AXIS]):
+        assert any(np.allclose(bar, ends, atol=1e-12) for bar in bars)
+    assert axes.get_zlabel() == "z [m]"
+    with pytest.raises(ValueError, match="at least 1"):
+        viz.plot_mechanism(motion, frames=0)
+
+
+def test_a_motion_in_space_shows_places_of_bodies_and_coordinates_of_joints():
+    """Of a nut that turns at 0.3 rad/s and moves by 0.1 m/s along its axis."""
+    nut = spatial.Body("nut", mass=1.0, inertia=np.eye(3), position=PLACE)
+    pin = spatial.Cylindrical("pin", "ground", "nut", point=(0.0, 0.0, 0.0), axis=AXIS)
+    turn = lambda t: jnp.append(jnp.cos(0.15 * t), jnp.sin(0.15 * t) * AXIS)
+    q = np.stack([np.append(rotate(turn(t), jnp.asarray(PLACE)) + 0.1 * t * AXIS, turn(t)) for t in TS])
+    velocity = 0.1 * AXIS + np.cross(0.3 * AXIS, q[:, :3])
+    system = mb.Scene([nut], joints=[pin]).compile()
+    motion = motion_of(system, TS, q, np.column_stack([velocity, np.tile(0.3 * AXIS, (5, 1))]))
+    *panels, energy, _ = viz.plot_motion(motion).axes
+    shown = {axes.get_ylabel(): drawn(axes) for axes in panels}
+    of_body = ["nut x", "nut y", "nut z"]
+    expected = {
+        "position [m]": of_body,
+        "velocity [m/s]": of_body,
+        "angle [rad]": ["pin"],
+        "angular velocity [rad/s]": ["pin"],
+        "displacement [m]": ["pin"],
+        "rate of displacement [m/s]": ["pin"],
+    }
+    assert {label: list(lines) for label, lines in shown.items()} == expected
+    for label, rate in (("angle [rad]", 0.3 * TS), ("angular velocity [rad/s]", 0.3), ("displacement [m]", 0.1 * TS)):
+        np.testing.assert_allclose(shown[label]["pin"], rate, rtol=0, atol=1e-14)
+    assert energy.get_ylabel() == "energy [J]"
+
+
+def test_a_mechanism_of_the_plane_is_drawn_in_its_shapes():
+    ball = planar.Body("ball", mass=1.0, inertia=0.1, position=(0.0, 0.4))
+    floor = planar.Contact(
+        "floor", "ball", terrain=terrain.Bump(start=0.25, length=1.0, peak=0.3), normal=contact.Linear(1e4), radius=0.1
+    )
+    spring = planar.SpringDamper("spring", "ground", "ball", stiffness=1.0, point_a=(0.0, 1.0))
+    system = mb.Scene([ball], forces=[floor, spring]).compile()
+    q = np.column_stack([TS, 0.4 + 0 * TS, 0 * TS])
+    axes = viz.plot_mechanism(motion_of(system, TS, q, np.zeros((5, 3))), frames=2).axes[0]
+    assert axes.get_title() == "t = 0, 1 s"
+    discs = [patch.get_xy() for patch in axes.patches if np.allclose(np.ptp(patch.get_xy(), axis=0), 0.2, atol=2e-3)]
+    centres = [0.5 * (disc.min(axis=0) + disc.max(axis=0)) for disc in discs]
+    np.testing.assert_allclose(centres, [(0.0, 0.4), (1.0, 0.4)], atol=2e-3)
+    *springs, path, end = axes.lines
+    np.testing.assert_allclose(np.column_stack(path.get_data()), q[:, :2])
+    assert end.get_label() == "ball"
+    for line, x in zip(springs, (0.0, 1.0), strict=True):
+        points = np.column_stack(line.get_data())
+        np.testing.assert_allclose(points[[0, -1]], [(0.0, 1.0), (x, 0.4)], atol=1e-12)
+    (ground,) = axes.collections
+    assert np.max(ground.get_paths()[0].vertices[:, 1]) == pytest.approx(0.3, abs=0.05)
+
+
+def test_discs_in_contact_are_drawn_as_wheels():
+    others = {"radii": [0.2, 0.0], "centres": [(0.3, 0.1), (0.0, 0.0)]}
+    part = planar.DiscContact("touch", ["a", "b", "c"], normal=contact.Linear(1e3), radius=0.5, **others)
+    resolved = part.resolve(PLANE, np.zeros((3, 3)))
+    discs = [(k, shape) for k, shape in resolved.shapes(PLANE, 0.01) if shape.primitive == "cylinder"]
+    assert [k for k, _ in discs] == [0, 1]
+    np.testing.assert_allclose([shape.scale[0] for _, shape in discs], [0.5, 0.2])
+    np.testing.assert_allclose([shape.position for _, shape in discs], [(0, 0, 0), (0.3, 0.1, 0.0)])
