@@ -429,13 +429,13 @@ class RigidBodySystem(AbstractSystem):
         values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))
         return values[coordinate.field][coordinate.member]
 
-    def holding(self, values, rates, t, in_blocks):
+    def holding(self, values, rates, t):
         held = held_groups(self._measured, self.joint_coordinates(), values, rates, t)
         rows = sum(g.rows for g in held)
         ranks = dataclasses.astuple(self.ranks)
         more = Ranks(*(rank + rows for rank in ranks))
         out = dataclasses.replace(self, constraints=(*self.constraints, *held), ranks=more, elimination=None)
-        if self.elimination is None or not in_blocks:
+        if self.elimination is None:
             return out
         return dataclasses.replace(out, elimination=joint_order_with_more(out, self, self.elimination))
 

@@ -18,8 +18,7 @@ from jaxtyping import Array
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.rotations import cross, unrotate
 from ..states.assembly import violated_joints
-from ..states.closest import tolerance
-from ..states.closest_sparse import largest_residual, meet_sparse
+from ..states.closest import largest_residual, meet_in_blocks, tolerance
 from ..states.redundancy import (
     ZERO,
     Group,
@@ -116,7 +115,7 @@ def _analyse(system):
     """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
     still = np.zeros(system.nu, bool)
-    q = meet_sparse(system, t, q, still) if system.position_rows else system.normalize(q)
+    q = meet_in_blocks(system, t, q, still) if system.position_rows else system.normalize(q)
     at = _evaluated(system, t, q)
     residual = largest_residual(at.unmet, at.row_norms[: system.position_rows])
     return q, residual, at

@@ -165,7 +165,7 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without a chart; the independent `rows`, or None where
+    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None where
     all of the `first` ones, default all rows, are independent and no pivots were searched for.
     """
 

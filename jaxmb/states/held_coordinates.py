@@ -12,7 +12,6 @@ from .._types import Scalar, VectorLike
 from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import unknown
 from ..system import AbstractSystem
-from .closest import eliminates_by_blocks
 
 
 def prescribe(
@@ -83,4 +82,4 @@ def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[st
     if not values:
         return system
     rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
-    return system.holding(values, rates, t, in_blocks=eliminates_by_blocks(system))
+    return system.holding(values, rates, t)

@@ -87,11 +87,9 @@ class AbstractSystem(AbstractEquation):
         """The value of one of `joint_coordinates`; an angle known up to full turns is in (−π, π]."""
         raise ValueError("This system has no joints between bodies, and so no coordinates of joints.")
 
-    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar, in_blocks: bool) -> Self:
-        """The same system with coordinates of joints held at values, which change at some rates, from t on; with an
-        order of elimination if blocks are asked for.
-        """
-        del values, rates, t, in_blocks
+    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
+        """The same system with coordinates of joints held at values, which change at some rates, from t on."""
+        del values, rates, t
         return self
 
     # Parameters

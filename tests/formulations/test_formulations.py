@@ -23,7 +23,7 @@ from jaxmb.formulations import (
     pivoted_jacobian,
 )
 from jaxmb.formulations.formulation import solve_constrained
-from jaxmb.linalg.elimination import eliminate, full_pivot
+from jaxmb.linalg.elimination import full_pivot
 from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
 
