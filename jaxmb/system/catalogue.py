@@ -53,6 +53,10 @@ class AbstractSystem(AbstractEquation):
     has_bodies: ClassVar[bool] = False
 
     @property
+    def nz(self) -> int:
+        return self.state_ends[-1] if self.state_ends else 0
+
+    @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
         parts = self.friction_parts
         return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
