@@ -32,8 +32,14 @@ from ..system.padded_rows import binding_velocities, position_rows, velocity_row
 # Rows are independent if every pivot of the elimination (a squared distance between rows of unit norm) exceeds this. A
 # row of n four-bars with its crank held has a pivot of 0.7 / n³, and 5e-14 where 333 of them are held twice.
 _INDEPENDENT = 1e-12
-# Implied rows get this share of the largest entry of the diagonal as a pivot.
-_SHIFT = 1e-13
+# Implied rows get a share of the largest entry of the diagonal as a pivot: this multiple of the largest residual, as in
+# the method of Levenberg and Marquardt, and at least this power of eps, 1e-11 in double precision.
+#
+# Away from the constraints implied rows contradict each other in the square of the distance, and multipliers are that
+# over the pivot, with errors of eps over the pivot again. Bennett's linkage from poses that are off by 1e-9 to 1e-1
+# ended at residuals of 1e-12 to 1 where all pivots were 1e-13, and ends below 1e-14 with these.
+_OF_RESIDUAL = 1e-3
+_LEAST = 0.7
 # Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
 # this share.
 _ITERATIONS = 100
@@ -51,9 +57,11 @@ def meet_sparse(
     system: AbstractSystem, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
 ) -> Float[Array, "nq"]:
     """The configuration to which Gauss–Newton with step halving leads from a guess, without motion along fixed
-    velocities; without derivative. Implied rows are allowed: the normal equations are regularised at rounding level.
+    velocities; without derivative. Implied rows are allowed: the normal equations are regularised in the measure of the
+    residuals.
     """
     scale = system.velocity_scale()
+    least = float(jnp.finfo(start.dtype).eps) ** _LEAST
     metric, at_rest = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2)), jnp.zeros_like(scale)
 
     def squares(q):
@@ -62,8 +70,9 @@ def meet_sparse(
     def correct(q):
         residual = system.position_residual(t, q)
         jacobian = binding_velocities(system, t, q, at_rest)
-        factor = jacobian.gram(metric).eliminate(_SHIFT)
-        multipliers = factor.substitute(jacobian.gather_rows(position_rows(system, t, q)))
+        largest = largest_residual(residual, jacobian.row_norms(scale)[: system.position_rows])
+        factor = jacobian.gram(metric).eliminate(jnp.clip(_OF_RESIDUAL * largest, least, _OF_RESIDUAL))
+        multipliers = factor.refined(jacobian.gather_rows(position_rows(system, t, q)))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         # Rotations by more than about a radian leave the region where the linearisation is valid.
         longest = jnp.max(jnp.abs(step) / scale)
@@ -72,8 +81,9 @@ def meet_sparse(
         moved = jax.vmap(lambda a: displaced(system, t, q, a * step))(lengths)
         sizes = jax.vmap(squares)(moved)
         best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
-        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
-        return moved[best], jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
+        before = jnp.sum(residual**2)
+        step = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
+        return jnp.where(sizes[best] < before, moved[best], q), step
 
     small = float(jnp.finfo(start.dtype).eps) ** 0.75
     far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
