@@ -85,7 +85,8 @@ def _scopes(models, notes):
     out: list[str] = []
     for model in models:
         name = model.attributes.get("name", "model")
-        own = next(own for own in (name, *(f"{name} {k}" for k in itertools.count(2))) if f"{own}::" not in out)
+        tries = itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
+        own = next(own for own in tries if f"{own}::" not in out)
         if own != name:
             notes.say("Models have other names, since those of the file are not unique: {}.", f"{name} → {own}")
         out.append(f"{own}::")
