@@ -170,7 +170,7 @@ class BlockGram(AbstractPositiveDefinite):
         forces = self.jacobian.on_velocities(jnp.where(kept, x, 0.0))
         return jnp.where(kept, self.jacobian.on_joints(self.inertia.solve(forces)), x)
 
-    def eliminate(self, shift=0.0):
+    def eliminate(self, share=None):
         order, blocks = self.jacobian.order, self.jacobian.blocks
         joints, k, r, v = blocks.shape
         scaled = jnp.where(order.kept[:, None, :, None], blocks, 0.0)
@@ -193,19 +193,22 @@ class BlockGram(AbstractPositiveDefinite):
             across = jnp.where(hub_is_row[:, None, None], across.swapaxes(1, 2), across)
             stored = stored.at[order.hub_places].set(across, unique_indices=True, mode="promise_in_bounds")
         stored = stored + jnp.asarray(_identities(order, size), blocks.dtype)
-        if shift:
+        shift = 0.0
+        if share is not None:
             own = stored[:joints]
             largest = jnp.max(jnp.diagonal(own, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
-            stored = stored.at[:joints].set(own + shift * largest * jnp.eye(size, dtype=blocks.dtype)[None])
+            shift = share * largest
+            stored = stored.at[:joints].set(own + shift * jnp.eye(size, dtype=blocks.dtype)[None])
         factor = eliminate_blocks(stored, order.nodes)
         # The first stored blocks are those on the diagonal.
-        return BlockGramFactor(self, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
+        return BlockGramFactor(self, shift, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
 
 
 class BlockGramFactor(AbstractPositiveFactor):
     """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
 
     matrix: BlockGram
+    shift: Any
     factor: BlockFactor
     diagonal: Float[Array, "nodes b"]
 
