@@ -46,14 +46,13 @@ def _fields_of_parts(cls: type) -> tuple[str, ...]:
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
-    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by their names."""
+    """The paths of keys to the internal states of a part, by their names."""
     found = {}
-    for prefix, own in (((), part), *inner_parts(part)):
-        for name, declared in declarations(type(own)).items():
-            if declared.kind == "internal" and getattr(own, name) is not None:
-                found[name] = (*prefix, name)
-            elif declared.kind == "internals":
-                found |= {key: (*prefix, name, key) for key in getattr(own, name)}
+    for name, declared in declarations(type(part)).items():
+        if declared.kind == "internal" and getattr(part, name) is not None:
+            found[name] = (name,)
+        elif declared.kind == "internals":
+            found |= {key: (name, key) for key in getattr(part, name)}
     return found
 
 
