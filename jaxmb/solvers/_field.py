@@ -5,11 +5,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
+
+from .._compat import any_of_batch
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -57,7 +58,7 @@ def probed_derivatives(
     wrong = jnp.abs(change - expected)
     rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
     contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
-    lax.cond(eqxi.unvmap_any(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
+    lax.cond(any_of_batch(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
     return jax.tree.map(lambda x: x[0], both)
 
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._compat import cond_of_any_lane, sequential_vmap
 from ._damping import eigenvalues
 from ._field import Derivatives, Field, derivatives, filled, linearized
-from ._lanes import cond_of_any_lane
 from ._linearization import AbstractLinearization
 
 _MAX_ITERATIONS = 10
@@ -156,7 +156,7 @@ def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free fr
 
 
 # Members of a batch are treated one after the other; see `jaxmb.linalg`.
-@jax.custom_batching.sequential_vmap
+@sequential_vmap
 def _lapack_inverse(matrix):
     return jnp.linalg.inv(matrix)
 

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._compat import cond_of_any_lane, direction_of
 from ._damping import eigenvalues
 from ._evaluation import field_jacobian, freeze
 from ._field import Field, filled, linearized
-from ._lanes import cond_of_any_lane
 from ._linearization import AbstractLinearization
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 
@@ -133,7 +133,7 @@ def structured(term: Any, t: Any, y: Float[Array, " n"], like: Any, args: Any) -
     jacobian = field_jacobian(term, t, y, like, args)
     if jacobian is None:
         return None
-    direction = jnp.asarray(term.direction).astype(y.dtype)
+    direction = jnp.asarray(direction_of(term)).astype(y.dtype)
     spectrum = lax.complex(*[jnp.zeros(_ARNOLDI, y.dtype)] * 2)
     return freeze(StructuredLinearization(jacobian, direction, spectrum, jnp.array(0, jnp.int32)))
 

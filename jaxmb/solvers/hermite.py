@@ -13,6 +13,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._compat import direction_of
 from ._damping import is_resolved
 from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
 from ._field import derivatives, probed_derivatives
@@ -235,7 +236,7 @@ class Hermite(AbstractMultistep):
         known = eqx.filter_eval_shape(structured, terms, t, flat, y, args)
         if known is not None:
             zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), known)
-            first = zeros.direction + jnp.asarray(terms.direction).astype(flat.dtype), jnp.asarray(1, jnp.int32)
+            first = zeros.direction + jnp.asarray(direction_of(terms)).astype(flat.dtype), jnp.asarray(1, jnp.int32)
             return eqx.tree_at(lambda matrix: (matrix.direction, matrix.renewals), zeros, first)
         none = jnp.zeros((flat.size, free.size), flat.dtype)
         spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
