@@ -4,6 +4,7 @@ diffrax wraps the terms of a solver so that time always increases; derivatives h
 States are raveled: one vector of all components.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -14,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._compat import direction_of, inner_term, unwrapped
-from .manifold_term import AbstractFieldJacobian, AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):
@@ -109,10 +110,17 @@ def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Ev
     return _raveled(term, out, flat.dtype)
 
 
-def field_jacobian(term: Any, t: Any, flat: Array, like: PyTree[Array], args: Args) -> AbstractFieldJacobian | None:
-    """The derivative of a vector field that knows its structure, in the direction of time of the term; else None."""
-    manifold = _manifold(term)
-    return None if manifold is None else manifold.jacobian(t * direction_of(term), unravel_like(like, flat), args)
+def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[[Array], Any]:
+    """`y -> (J, direction)` for raveled states, a pytree: the derivative of a vector field that knows its structure, in
+    the time of the term, and the direction of that time; None instead of both if the term knows none.
+    """
+    return eqx.Partial(_jacobian, term, t, like, args)
+
+
+def _jacobian(term, t, like, args, flat):
+    manifold, direction = _manifold(term), direction_of(term)
+    own = None if manifold is None else manifold.jacobian(t * direction, unravel_like(like, flat), args)
+    return None if own is None else (own, jnp.asarray(direction))
 
 
 def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: Args) -> Any:
