@@ -14,6 +14,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from ._compat import steps_of
 from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
@@ -332,8 +333,7 @@ def _distance(a, b):
 @eqx.filter_jit
 def _between(system, interpolation, ts):
     # Before a jump a step ends at the number before it, and the next one starts at the number after it.
-    starts, fixed = lax.stop_gradient((interpolation.ts, ts))
-    direction = jnp.asarray(interpolation.direction, fixed.dtype)
+    (starts, direction), fixed = lax.stop_gradient((steps_of(interpolation), ts))
     beyond = direction * next_number(fixed, direction)
     jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
     ts = after_jumps(ts, jumps, interpolation.t0, interpolation.t1)

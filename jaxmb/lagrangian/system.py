@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._compat import with_values
 from .._types import State, VectorLike
 from ..parts.fields import as_jax
 from ..system.equation import Ranks
@@ -113,12 +114,9 @@ class LagrangianSystem(AbstractLagrangian):
 
     def with_signals(self, signals):
         inputs = self.inputs | inputs_of(self, signals)
-        out = object.__new__(type(self))
-        for field in dataclasses.fields(self):
-            object.__setattr__(out, field.name, getattr(self, field.name))
-        object.__setattr__(out, "inputs", inputs)
-        object.__setattr__(out, "drift_free", self.drift_free and not any(own.binds for own in inputs.values()))
-        return out
+        drift_free = self.drift_free and not any(own.binds for own in inputs.values())
+        same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return with_values(self, same | {"inputs": inputs, "drift_free": drift_free})
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:

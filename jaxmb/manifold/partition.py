@@ -12,13 +12,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from .._compat import cond_of_any_lane
 from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels
 from ..linalg.elimination import eliminate, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
-from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractEquation
 from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
 from .chart import (

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._compat import WrappedSolver, cond_of_any_lane, direction_of
 from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
@@ -17,8 +18,6 @@ from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
-from ..solvers._lanes import cond_of_any_lane
-from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import SolvedState, restore
@@ -240,7 +239,7 @@ class ProjectedSolver(WrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        direction = getattr(terms, "direction", 1)
+        direction = direction_of(terms)
         if made_jump is not False:
             y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)

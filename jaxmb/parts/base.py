@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._compat import with_values
 from .._types import Scalar
 from ..linalg.arrays import namespace
 from . import checks, fields
@@ -100,10 +101,7 @@ class AbstractPart(eqx.Module):
 
     def with_fields(self, **values: Any) -> Self:
         """A copy with some fields replaced."""
-        out = object.__new__(type(self))
-        for field, value in (fields.values_of(self) | values).items():
-            object.__setattr__(out, field, value)
-        return out
+        return with_values(self, fields.values_of(self) | values)
 
 
 @functools.cache
