@@ -89,13 +89,22 @@ class Trajectory(eqx.Module):
     closer: "Trajectory | None" = None
 
     def __getitem__(self, name: str) -> Any:
-        names = self.system.motion_names()
-        if name in names:
+        if name in self.system.motion_names():
             return self._motion(name)
-        parts = dict.fromkeys(known.split(".")[0] for known in self.system.quantities())
-        if name in parts:
+        if name in self:
             return PartMotion(self, name)
-        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, (*names, *parts))
+        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, self)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names that `trajectory[name]` takes."""
+        parts = (known.split(".")[0] for known in self.system.quantities())
+        return iter(dict.fromkeys((*self.system.motion_names(), *parts)))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """`trajectory[name]`, or the default if there is no such name."""
+        if name not in self:
+            return default
+        return self[name]
 
     @_of_each_member
     def _motion(self, name):

@@ -45,6 +45,46 @@ def test_views_by_name_are_mappings(motion):
             motion.reactions["knee"]
 
 
+def test_motions_are_looked_up_by_name(motion):
+    assert list(motion) == ["rod", "pin"]
+    assert "rod" in motion and "pin" in motion and "knee" not in motion
+    assert motion.get("knee") is None and motion.get("rod") is not None
+
+
+@pytest.mark.parametrize(
+    ("lookup", "message"),
+    [
+        (lambda system, motion: motion["rud"], "Unknown body, joint or frame 'rud'; did you mean 'rod'?"),
+        (
+            lambda system, motion: mb.with_parameters(system, {"rod.mas": 1.0}),
+            "Unknown parameter 'rod.mas'; did you mean 'rod.mass'?",
+        ),
+        (
+            lambda system, motion: mb.assemble(system, fix={"rod.angel": 1.0}),
+            "Unknown coordinate 'rod.angel'; did you mean 'rod.angle'?",
+        ),
+        (
+            lambda system, motion: mb.Scene(
+                [planar.Body("rod", mass=1.0, inertia=1.0)], joints=[planar.Revolute("pin", "ground", "rodd")]
+            ),
+            "Revolute 'pin': Unknown body 'rodd'; did you mean 'rod'?",
+        ),
+    ],
+)
+def test_unknown_names_are_errors_of_keys_and_of_values(pendulum, motion, lookup, message):
+    for kind in (KeyError, ValueError, mb.UnknownNameError):
+        with pytest.raises(kind) as raised:
+            lookup(pendulum, motion)
+        assert str(raised.value) == message
+
+
+def test_unknown_names_in_functions_of_the_user_keep_their_message(pendulum):
+    with pytest.raises(mb.UnknownNameError, match=r"^Unknown parameter 'rod.mas'; did you mean 'rod.mass'"):
+        mb.design(
+            pendulum, {"m": 1.0}, lambda v: dict(mb.parameters(mb.with_parameters(pendulum, {"rod.mas": v["m"]})))
+        )
+
+
 def test_unknown_arguments_of_parts():
     with pytest.raises(TypeError, match=r"SpringDamper has no argument 'k'; it takes .*stiffness, damping"):
         planar.SpringDamper("spring", "ground", "rod", k=3.0)  # pyright: ignore
