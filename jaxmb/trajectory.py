@@ -72,7 +72,8 @@ class Trajectory(eqx.Module):
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a `BodyMotion`,
     and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in
-    generalized coordinates it is that of a coordinate, shape (times,).
+    generalized coordinates `trajectory["theta"]` is a coordinate and `trajectory["theta_rate"]` its rate, shape
+    (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
     that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
@@ -92,7 +93,7 @@ class Trajectory(eqx.Module):
         if name in self.system.motion_names():
             return self._motion(name)
         if name in self:
-            return PartMotion(self, name)
+            return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
         raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, self)
 
     def __iter__(self) -> Iterator[str]:
@@ -112,7 +113,7 @@ class Trajectory(eqx.Module):
 
     def quantity(self, name: str) -> Array:
         """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` of a body, `"A.force"` of a
-        joint; in generalized coordinates `"theta"`, `"theta.rate"`, and `"A.force"` of a constraint.
+        joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a constraint.
         """
         known = self.system.quantities()
         if name not in known:
@@ -301,8 +302,8 @@ class PartMotion:
         self._trajectory, self._name = trajectory, name
 
     def __dir__(self) -> list[str]:
-        known = (name.split(".") for name in self._trajectory.system.quantities())
-        return [field for part, field in known if part == self._name]
+        known = (name.partition(".") for name in self._trajectory.system.quantities())
+        return [field for part, _, field in known if part == self._name]
 
     def __getattr__(self, field: str) -> Array:
         if field.startswith("_") or field not in dir(self):
