@@ -264,7 +264,7 @@ def _check_names(scene: Scene):
             own = part.bodies
             for name in own:
                 if name not in known:
-                    raise ValueError(f"{part.label}: {unknown('body', name, known)}")
+                    raise unknown("body", name, known, part.label)
             twice = [name for name in own if own.count(name) > 1]
             if twice and (twice[0] != GROUND or set(own) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
@@ -278,7 +278,7 @@ def _check_sources(part, what, known):
         sources = part.sources if isinstance(part, AbstractOfSources) else (part.joint_name,)
     for name in sources:
         if name not in known or name == part.name:
-            raise ValueError(f"{part.label}: {unknown(what, name, known)}")
+            raise unknown(what, name, known, part.label)
 
 
 def _check_rotation(part, components, own, layout, poses):

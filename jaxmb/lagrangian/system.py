@@ -139,6 +139,10 @@ def _names(coordinates: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if len(names) != count or len(set(names)) != count:
         raise ValueError(f"{count} coordinates need as many names, all different; got {names}.")
     for name in names:
+        if f"{name}_rate" in names:
+            raise ValueError(
+                f"'{name}_rate' is the name of the rate of {name!r}; choose another one for the coordinate."
+            )
         if name in _TAKEN:
             raise ValueError(f"In a saved motion {name!r} is something else; choose another name for the coordinate.")
         if any(character in name for character in _NOT_IN_FILES) or name.startswith("."):

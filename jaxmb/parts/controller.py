@@ -130,7 +130,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
                 )
             if quantity not in allowed:
                 listed = [self._called(f"{source}.{own}") for own in allowed]
-                raise ValueError(f"{self.label}: {unknown('quantity', self._called(name), listed)}")
+                raise unknown("quantity", self._called(name), listed, self.label)
 
     def _called(self, name):
         """The name of a quantity, with that of its source in place of the number."""

@@ -95,7 +95,7 @@ def given_coordinate(part: AbstractLink, joint: Any, coordinate: str, space: Any
         names = [f"{name}.{own}" for own in known]
         if not names:
             raise ValueError(f"{part.label}: {joint.label} has no coordinate of its own.")
-        raise ValueError(f"{part.label}: {unknown('coordinate', coordinate, names)}")
+        raise unknown("coordinate", coordinate, names, part.label)
     return np.asarray(known[within])
 
 
