@@ -104,8 +104,9 @@ def with_rotors(machine: Machine, notes: Notes) -> None:
             continue
         beside, name = machine.links[joint.child], f"{joint.name} armature"
         mass = armature if joint.kind == "free" else 0.0
-        place = {"position": beside.position, "rotation": beside.rotation}
-        machine.links[name] = Link(name, mass=mass, inertia=armature * np.eye(3), where=joint.where, **place)
+        machine.links[name] = Link(
+            name, mass, np.zeros(3), armature * np.eye(3), beside.position, beside.rotation, joint.where
+        )
         machine.joints.append(Joint(f"{name} weld", "fixed", joint.child, name))
         if mass:
             machine.buoyancy[name] = 1.0
