@@ -95,7 +95,7 @@ class Trajectory(eqx.Module):
             return self._motion(name)
         if name in self:
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
-        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, self)
+        raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self)
 
     def __iter__(self) -> Iterator[str]:
         """The names that `trajectory[name]` takes."""

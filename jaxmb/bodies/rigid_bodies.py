@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -75,8 +75,6 @@ class RigidBodySystem(AbstractSystem):
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
     `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`.
     """
-
-    has_bodies: ClassVar[bool] = True
 
     bodies: tuple[BodyGroup, ...]
     gravity: Float[Array, "d"] | None

@@ -38,7 +38,7 @@ def write_figures(out: Path, precision: WorkPrecision, trajectory: Trajectory | 
         written = [out / "work_precision.png"]
         if trajectory is not None:
             figures = {"motion.png": plot_motion(trajectory)}
-            if trajectory.system.has_bodies:
+            if trajectory.system.body_names:
                 figures["mechanism.png"] = plot_mechanism(trajectory)
             for name, figure in figures.items():
                 figure.savefig(out / name, dpi=150)

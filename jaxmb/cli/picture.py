@@ -13,7 +13,7 @@ from ..viz.stage import viser
 
 def check_picture(system: AbstractSystem) -> None:
     """Raise an error, before anything is computed, where no picture can be made."""
-    if not system.has_bodies:
+    if not system.body_names:
         raise ValueError("--show draws bodies, and this mechanism has none; the figures show its coordinates.")
     try:
         viser()

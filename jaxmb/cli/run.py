@@ -132,7 +132,7 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
             measured[place] = exact + noise * random.standard_normal(exact.shape)
             sigma[place] = noise
     true = float(parameters(system)[name])
-    what = "positions" if system.has_bodies else "coordinates"
+    what = "positions" if system.body_names else "coordinates"
     print(
         f"\nIdentifying {name} from {what} at {ts.size} times up to {ts[-1]:g} s, "
         f"with noise of {_NOISE:.1%} of their range, from a start {_START - 1:.0%} off:"

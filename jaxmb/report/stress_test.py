@@ -260,7 +260,7 @@ def _near_singular(base: _Base) -> Iterator[_Trial]:
 
 def _doubled(base: _Base) -> Iterator[_Trial]:
     own = base.mechanism
-    if not (own.system.has_bodies and own.system.velocity_rows):
+    if not (own.system.body_names and own.system.velocity_rows):
         raise _NotHereError("left out, there are no joints of bodies")
     yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
     if getattr(own.system.joints[0].group.part, "point_a", None) is None:

@@ -49,7 +49,7 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
     functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
     powers = {name: _powers(unit) for name, unit in units(system).items()}
     unknown = [*functions, *(name for name, own in powers.items() if own is None)]
-    if unknown or not system.has_bodies:
+    if unknown or not system.body_names:
         raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
     values = {}
     for name, value in parameters(system).items():
@@ -89,7 +89,7 @@ def _has_function(part: Any) -> bool:
 
 def _groups(system: Any) -> Iterator[Any]:
     for field in ("bodies", "constraints", "velocity_constraints", "servos", "nonideal", "forces"):
-        yield from getattr(system, field, ()) if system.has_bodies else ()
+        yield from getattr(system, field, ()) if system.body_names else ()
 
 
 def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSystem:
@@ -131,7 +131,7 @@ def nonholonomic(system: Any, state: State) -> AbstractSystem:
 
 def with_damper(system: Any, state: State) -> AbstractSystem:
     """A scene with a force element that exerts no force, a damper between its first body and the ground."""
-    if not system.has_bodies:
+    if not system.body_names:
         raise ValueError("there are no bodies")
     layout = system.layout
     origin = np.zeros(layout.space.dimension)
@@ -141,7 +141,7 @@ def with_damper(system: Any, state: State) -> AbstractSystem:
 
 
 def _first_joint(system: Any) -> Group:
-    if not (system.has_bodies and system.velocity_rows):
+    if not (system.body_names and system.velocity_rows):
         raise ValueError("there are no joints of bodies")
     return system.joints[0].group
 

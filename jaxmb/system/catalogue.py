@@ -40,7 +40,7 @@ class AbstractSystem(AbstractEquation):
     - `rows`: for every row of A, the name of its part and its number within the part.
     - `state_ends`: for each kind of internal state, in the order of z, the index after the last one of this kind.
     - `friction_parts`: names of the parts whose multipliers non-ideal forces depend on.
-    - `has_bodies`: whether the model has bodies; `Trajectory[name]` is the motion of a body if so, otherwise of a
+    - `body_names`: names of the bodies; `Trajectory[name]` is the motion of a body if there are any, otherwise of a
         coordinate.
     """
 
@@ -50,7 +50,7 @@ class AbstractSystem(AbstractEquation):
     state_ends: ClassVar[tuple[int, ...]] = ()
     friction_parts: ClassVar[frozenset[str]] = frozenset()
     rows: ClassVar[tuple[tuple[str, int], ...]] = ()
-    has_bodies: ClassVar[bool] = False
+    body_names: ClassVar[tuple[str, ...]] = ()
 
     @property
     def nz(self) -> int:

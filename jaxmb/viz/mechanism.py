@@ -38,7 +38,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}.")
-    if not trajectory.system.has_bodies:
+    if not trajectory.system.body_names:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "
             "coordinates."

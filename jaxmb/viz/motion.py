@@ -119,7 +119,7 @@ def _quantities(system, names: Iterable[str]) -> list[str]:
         found = [quantity for quantity in shown if quantity in known]
         found += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
         if not found:
-            what = "body, joint or quantity" if system.has_bodies else "coordinate"
+            what = "body, joint or quantity" if system.body_names else "coordinate"
             parts = dict.fromkeys(quantity.split(".")[0] for quantity in known)
             raise unknown(what, name, (*parts, *known, *_CHECKS))
         out |= dict.fromkeys(found)

@@ -165,7 +165,7 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
 
     **Arguments:** `rates`: q̇ and u̇ at the state; `length`: the system's size [m].
     """
-    if not system.has_bodies:
+    if not system.body_names:
         return jax.tree.map(lambda x: x[None], Advance(rates.q))
     index = body_index(system)
     vectors = ((index.position, state.q), (index.velocity, state.u), (index.velocity, rates.u))

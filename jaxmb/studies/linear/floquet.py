@@ -163,7 +163,7 @@ def _return(system, state, end, pushed, free):
     names = system.coordinate_names()
     sign = jnp.ones(end.size, end.dtype)
     distance = jnp.concatenate([q - state.q, end[nq:] - state.u])
-    for body in system.motion_names() if system.has_bodies else ():
+    for body in system.body_names:
         if (attitude := names.get(f"{body}.orientation")) is not None:
             index = np.array(attitude)
             sign = sign.at[index].set(jnp.where(jnp.dot(q[index], state.q[index]) < 0, -1.0, 1.0))

@@ -273,7 +273,7 @@ def _turns(system, rates=False):
     own = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
     count = system.nu if rates or _has_invariants(system) else system.nq
     turns = np.zeros(count, bool)
-    for body in system.motion_names() if system.has_bodies else ():
+    for body in system.body_names:
         for name in (f"{body}.angle", f"{body}.angle_rate", f"{body}.angular_velocity"):
             turns[own.get(name, [])] = True
     return turns

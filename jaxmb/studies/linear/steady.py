@@ -181,7 +181,7 @@ def _search(
 def _start(system, t, guess, advancing):
     """The guess with the turning and travel that carry it along best."""
     none = jnp.zeros(3, guess.q.dtype)
-    if advancing or not system.has_bodies:
+    if advancing or not system.body_names:
         return _Unknowns(guess, none, none)
     together = carriers(system, guess, vector_field(system, t, guess)[0], system.length)
     return _Unknowns(guess, together.turning[1], together.travel[1, 0])
@@ -189,7 +189,7 @@ def _start(system, t, guess, advancing):
 
 def _carrier(system, unknowns, rates, advancing) -> AbstractCarrier:
     """What carries a motion along: all bodies together, or only the coordinates that advance."""
-    if advancing or not system.has_bodies:
+    if advancing or not system.body_names:
         moves = np.isin(np.arange(system.nq), advancing)
         return Advance(jnp.where(moves, rates, 0.0))
     return _bodies(system, unknowns)
