@@ -37,6 +37,7 @@ from .parts.joint_laws import (
     JointStop as JointStop,
 )
 from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
+from .parts.names import UnknownNameError as UnknownNameError
 from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
 from .simulate import simulate as simulate

@@ -14,6 +14,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from ._compat import steps_of
 from ._results import RESULTS
 from ._types import State
 from .formulations import AbstractFormulation, accelerations
@@ -72,7 +73,8 @@ class Trajectory(eqx.Module):
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
     … points of the past); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a `BodyMotion`,
     and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in
-    generalized coordinates it is that of a coordinate, shape (times,).
+    generalized coordinates `trajectory["theta"]` is a coordinate and `trajectory["theta_rate"]` its rate, shape
+    (times,).
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
     that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
@@ -89,13 +91,22 @@ class Trajectory(eqx.Module):
     closer: "Trajectory | None" = None
 
     def __getitem__(self, name: str) -> Any:
-        names = self.system.motion_names()
-        if name in names:
+        if name in self.system.motion_names():
             return self._motion(name)
-        parts = dict.fromkeys(known.split(".")[0] for known in self.system.quantities())
-        if name in parts:
-            return PartMotion(self, name)
-        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, (*names, *parts))
+        if name in self:
+            return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
+        raise unknown("body, joint or frame" if self.system.has_bodies else "coordinate", name, self)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names that `trajectory[name]` takes."""
+        parts = (known.split(".")[0] for known in self.system.quantities())
+        return iter(dict.fromkeys((*self.system.motion_names(), *parts)))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """`trajectory[name]`, or the default if there is no such name."""
+        if name not in self:
+            return default
+        return self[name]
 
     @_of_each_member
     def _motion(self, name):
@@ -103,7 +114,7 @@ class Trajectory(eqx.Module):
 
     def quantity(self, name: str) -> Array:
         """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` of a body, `"A.force"` of a
-        joint; in generalized coordinates `"theta"`, `"theta.rate"`, and `"A.force"` of a constraint.
+        joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a constraint.
         """
         known = self.system.quantities()
         if name not in known:
@@ -292,8 +303,8 @@ class PartMotion:
         self._trajectory, self._name = trajectory, name
 
     def __dir__(self) -> list[str]:
-        known = (name.split(".") for name in self._trajectory.system.quantities())
-        return [field for part, field in known if part == self._name]
+        known = (name.partition(".") for name in self._trajectory.system.quantities())
+        return [field for part, _, field in known if part == self._name]
 
     def __getattr__(self, field: str) -> Array:
         if field.startswith("_") or field not in dir(self):
@@ -332,8 +343,7 @@ def _distance(a, b):
 @eqx.filter_jit
 def _between(system, interpolation, ts):
     # Before a jump a step ends at the number before it, and the next one starts at the number after it.
-    starts, fixed = lax.stop_gradient((interpolation.ts, ts))
-    direction = jnp.asarray(interpolation.direction, fixed.dtype)
+    (starts, direction), fixed = lax.stop_gradient((steps_of(interpolation), ts))
     beyond = direction * next_number(fixed, direction)
     jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
     ts = after_jumps(ts, jumps, interpolation.t0, interpolation.t1)

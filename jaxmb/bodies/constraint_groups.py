@@ -1,6 +1,7 @@
 """Stacked constraints of positions, of velocities, and of accelerations."""
 
 import abc
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -80,12 +81,16 @@ class ConstraintGroup(AbstractConstraintGroup):
         """Whether the residuals depend on time."""
         return self.group.part.rheonomic or bool(self.group.inputs)
 
+    def _residual(self, at, t, x):
+        part = at(t)
+        return part.residual(self._space, part.seen_poses(self._space, x), t)
+
     def residual(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts rows"]:
-        return self._map(lambda at, x: at(t).residual(self._space, x, t), poses)
+        return self._map(lambda at, x: self._residual(at, t, x), poses)
 
     def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
         """The joints' own coordinates, by name within the joint."""
-        return self._map(lambda at, x: at(t).coordinates(self._space, x), poses)
+        return self._map(lambda at, x: at(t).coordinates_at(self._space, x), poses)
 
     def along(
         self, t: Scalar, poses: Float[Array, "b_ground p"], moves: Float[Array, "b_ground n p"]
@@ -94,7 +99,7 @@ class ConstraintGroup(AbstractConstraintGroup):
 
         def single(at, x, moves):
             def along_one(body):
-                residual = lambda own: at(t).residual(self._space, x.at[body].set(own), t)
+                residual = lambda own: self._residual(at, t, x.at[body].set(own))
                 push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
                 return jax.vmap(push, out_axes=-1)(moves[body])
 
@@ -116,7 +121,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         return self._map(functools.partial(self._wrench, t), poses, more=(multipliers,))
 
     def _wrench(self, t, at, x, multipliers):
-        _, pull = jax.vjp(lambda x: at(t).residual(self._space, x, t), x)
+        _, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
         return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
     def wrench_derivatives(self, t, poses, velocities, multipliers):
@@ -140,9 +145,9 @@ class ConstraintGroup(AbstractConstraintGroup):
     def _rate(self, at, t, x, xdot):
         """Velocity residuals of one part, from the rates of its bodies' poses."""
         if self.rheonomic:
-            residual = lambda t, x: at(t).residual(self._space, x, t)
+            residual = lambda t, x: self._residual(at, t, x)
             return jax.jvp(residual, (t, x), (jnp.ones_like(t), xdot))[1]
-        return jax.jvp(lambda x: at(t).residual(self._space, x, t), (x,), (xdot,))[1]
+        return jax.jvp(lambda x: self._residual(at, t, x), (x,), (xdot,))[1]
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
@@ -153,18 +158,22 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
         """Whether the residuals vanish at rest."""
         return self.group.part.homogeneous and not self.group.inputs
 
+    def _residual(self, at, t, x, v):
+        part, space = at(t), self._space
+        return part.residual(space, *part.seen(space, x, v), t)
+
     def velocity(self, t, poses, velocities):
-        return self._map(lambda at, x, v: at(t).residual(self._space, x, v, t), poses, velocities)
+        return self._map(lambda at, x, v: self._residual(at, t, x, v), poses, velocities)
 
     def jacobian(self, t, poses, velocities):
-        single = lambda at, x, v: jax.jacfwd(lambda w: at(t).residual(self._space, x, w, t))(v)
+        single = lambda at, x, v: jax.jacfwd(lambda w: self._residual(at, t, x, w))(v)
         return self._map(single, poses, velocities)
 
     def wrenches(self, t, poses, velocities, multipliers):
         return self._map(functools.partial(self._wrench, t), poses, velocities, more=(multipliers,))
 
     def _wrench(self, t, at, x, v, multipliers):
-        return jax.vjp(lambda w: at(t).residual(self._space, x, w, t), v)[1](multipliers)[0]
+        return jax.vjp(lambda w: self._residual(at, t, x, w), v)[1](multipliers)[0]
 
     def wrench_derivatives(self, t, poses, velocities, multipliers):
         single = lambda at, x, v, own: along_moves(self._space, lambda x: self._wrench(t, at, x, v, own), x)
@@ -172,7 +181,7 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
 
     def acceleration(self, t, poses, velocities, accelerations):
         def single(at, x, xdot, v, a):
-            residual = lambda t, x, v: at(t).residual(self._space, x, v, t)
+            residual = lambda t, x, v: self._residual(at, t, x, v)
             return jax.jvp(residual, (t, x, v), (jnp.ones_like(t), xdot, a))[1]
 
         rates = jax.vmap(self._space.rates)(poses, velocities)
@@ -210,5 +219,5 @@ class ServoGroup(AbstractConstraintGroup):
 def servo_group(group: Group) -> ServoGroup:
     """From stacked servos."""
     part = group.part
-    own = Group(part.program, group.names, group.bodies, group.layout)
+    own = dataclasses.replace(group, part=part.program.with_fields(body_frames=part.body_frames))
     return ServoGroup(own, part.damping, part.stiffness)

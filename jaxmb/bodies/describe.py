@@ -1,38 +1,30 @@
 """A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and what is specialised away."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..system import AbstractSystem
+from ..parts.base import AbstractInertialConstraint
 from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
+from ..system.design_variables import description_rows
 
 
-def describe_scene(
-    system: AbstractSystem,
-    *,
-    spatial: bool,
-    bodies: Mapping[str, Sequence[str]],
-    joints: Sequence[tuple[Sequence[Any], str]],
-    forces: Sequence[Any],
-    laws: Sequence[Any],
-    gravity: str | None,
-    implied: Sequence[Any],
-    design: Sequence[tuple[str, str, str]] = (),
-    frames: Sequence[Any] = (),
-    tendons: Sequence[Any] = (),
-) -> Description:
-    """Describe a compiled scene; from its static structure alone, so it works on traced systems as well.
-
-    **Arguments:** `bodies`: names by kind; `joints`: groups of constraints, with a note on each kind; `forces`, `laws`:
-    groups of force elements and of non-ideal laws; `gravity`: its name, or None; `implied`: redundant rows;
-    `design`: rows on the design variables; `frames`, `tendons`: groups of them.
-    """
-    count = sum(map(len, bodies.values()))
+def describe_scene(system: Any) -> Description:
+    """Describe a compiled scene; from its static structure alone, so it works on traced systems as well."""
+    count, kinds = system.layout.bodies, {}
+    for g in system.bodies:
+        kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
+    plain = [g for g in system.constraints if not isinstance(g.group.part, AbstractInertialConstraint)]
+    joints = [
+        (plain, ""),
+        (system.inertial, ", each with a velocity of its own"),
+        (system.free_joints, ", which have coordinates only"),
+        (system.velocity_constraints, ", between velocities"),
+        (system.servos, ", a program of a Servo"),
+    ]
     grubler = system.nu - system.velocity_rows
-    counts = sum(len(g.group.names) * g.group.rows for g in tendons)
+    counts = sum(len(g.group.names) * g.group.rows for g in system.tendons)
     normalizations = system.coordinate_rows - system.position_rows - counts
     facts = [
-        ("scene", f"{'spatial' if spatial else 'planar'}, {count} bodies"),
+        ("scene", f"{'spatial' if system.spatial else 'planar'}, {count} bodies"),
         ("velocities", str(system.nu)),
         ("constraint rows", count_rows(system)),
         ("degrees of freedom", f"{system.nu - system.velocity_rank} by rank, {grubler} by Grübler's count of rows"),
@@ -46,17 +38,19 @@ def describe_scene(
     if system.nz:
         facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
     kind = lambda g: g.group.part.kind
+    plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
+    gravity = [] if system.gravity is None else [("Gravity", system.gravity_name, "")]
     tables = {
-        "bodies": [(kind, shorten(names), "") for kind, names in bodies.items() if names],
+        "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
         "joints": [(kind(g), shorten(g.group.names), f"{g.rows} rows each" + note) for gs, note in joints for g in gs],
         "forces": [
-            *([] if gravity is None else [("Gravity", gravity, "")]),
-            *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in laws),
-            *((kind(g), shorten(g.group.names), "") for g in forces),
+            *gravity,
+            *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in system.nonideal),
+            *plainly(system.forces),
         ],
-        "tendons": [(kind(g), shorten(g.group.names), "") for g in tendons],
-        "frames": [(kind(g), shorten(g.group.names), "") for g in frames],
-        "design variables": list(design),
+        "tendons": plainly(system.tendons),
+        "frames": plainly(system.frames),
+        "design variables": description_rows(system.design),
     }
     specialised = specialised_constraints(system)
     if system.elimination is not None:
@@ -64,11 +58,11 @@ def describe_scene(
     if system.implicit_in_blocks:
         joined = f"{count} bodies" if system.elimination is None else f"{count} bodies with the joints"
         specialised.append(f"no dense Newton matrix with Hermite: sparse elimination of {joined}")
-    if not spatial:
+    if not system.spatial:
         specialised.append("planar: no Euler parameters, no gyroscopic moment")
-    if not forces and not laws:
-        specialised.append("no force elements" + ("" if gravity is None else " besides gravity"))
-    redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in implied]
+    if not system.forces and not system.nonideal:
+        specialised.append("no force elements" + " besides gravity" * bool(gravity))
+    redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
     remarks = {"redundant rows": tuple(redundant), "specialised away": tuple(specialised)}
     return Description(tuple(facts), {title: tuple(rows) for title, rows in tables.items()}, remarks)
 

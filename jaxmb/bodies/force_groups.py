@@ -17,14 +17,24 @@ class ForceGroup(eqx.Module):
     def wrenches(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> Float[Array, "parts k v"]:
-        single = lambda at, poses, v: at(t).wrenches(self.group.layout.space, poses, v, t)
+        single = lambda at, x, v: self._wrenches(at, t, x, v)
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
+    def _wrenches(self, at, t, x, v):
+        part, space = at(t), self.group.layout.space
+        wrenches = part.wrenches(space, *part.seen(space, x, v), t)
+        return part.wrenches_on_bodies(space, x, wrenches)
 
     def state_rates(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
     ) -> dict[str, Float[Array, "parts *shape"]]:
         """Rates of the parts' internal states, by the name of the field."""
-        single = lambda at, poses, v: at(t).state_rates(self.group.layout.space, poses, v, t)
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            part = at(t)
+            return part.state_rates(space, *part.seen(space, x, v), t)
+
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
     def derivatives(
@@ -36,15 +46,20 @@ class ForceGroup(eqx.Module):
         space = self.group.layout.space
 
         def single(at, x, v):
-            of_positions = along_moves(space, lambda x: at(t).wrenches(space, x, v, t), x)
-            return of_positions, jax.jacfwd(lambda v: at(t).wrenches(space, x, v, t))(v)
+            of_positions = along_moves(space, lambda x: self._wrenches(at, t, x, v), x)
+            return of_positions, jax.jacfwd(lambda v: self._wrenches(at, t, x, v))(v)
 
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
     def energy(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
-        single = lambda at, poses: at(t).energy(self.group.layout.space, poses, t)
+        space = self.group.layout.space
+
+        def single(at, x):
+            part = at(t)
+            return part.energy(space, part.seen_poses(space, x), t)
+
         return jnp.sum(self.group.map(single, self.group.gather(poses)))
 
 
@@ -62,5 +77,11 @@ class NonIdealGroup(eqx.Module):
         reactions: Float[Array, "parts k v"],
     ) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
-        single = lambda at, x, v, own: at(t).wrenches(self.group.layout.space, x, v, own, t)
+        space = self.group.layout.space
+
+        def single(at, x, v, own):
+            part = at(t)
+            wrenches = part.wrenches(space, *part.seen(space, x, v), part.seen_wrenches(space, x, own), t)
+            return part.wrenches_on_bodies(space, x, wrenches)
+
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)

@@ -147,7 +147,7 @@ class CoordinateGroup(eqx.Module):
     def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
         """Their coordinates, by name within the part."""
         space = self.group.layout.space
-        return self.group.map(lambda at, x: at(t).coordinates(space, x), self.group.gather(poses))
+        return self.group.map(lambda at, x: at(t).coordinates_at(space, x), self.group.gather(poses))
 
 
 class FrameGroup(eqx.Module):

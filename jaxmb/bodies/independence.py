@@ -24,7 +24,7 @@ _DENSE = 300
 _NEGLIGIBLE = 1e-6
 
 
-class Part(NamedTuple):
+class JointRows(NamedTuple):
     """A constraint of one kernel: its bodies, and the first and the number of its rows among all."""
 
     bodies: tuple[int, ...]
@@ -58,7 +58,7 @@ class Share(NamedTuple):
 
 
 def matrix(
-    parts: Sequence[Part],
+    parts: Sequence[JointRows],
     blocks: Sequence[Float[np.ndarray, "rows k v"]],
     layout: Layout,
     own: Sequence[int],
@@ -78,7 +78,7 @@ def matrix(
 
 
 def subsets(
-    parts: Sequence[Part],
+    parts: Sequence[JointRows],
     blocks: Sequence[Float[np.ndarray, "rows k v"]],
     layout: Layout,
     scale: Float[np.ndarray, "nu"],
@@ -135,7 +135,7 @@ def _sparse_share(pivots, sizes, rows, r):
 
 
 def absolute_parts(
-    parts: Sequence[Part], blocks: Sequence[Float[np.ndarray, "rows k v"]], motions: Float[np.ndarray, "d b v"]
+    parts: Sequence[JointRows], blocks: Sequence[Float[np.ndarray, "rows k v"]], motions: Float[np.ndarray, "d b v"]
 ) -> frozenset[int]:
     """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
     world.
@@ -218,7 +218,7 @@ def _pivot_rows(A, level):
 
 
 def eliminate(
-    parts: Sequence[Part],
+    parts: Sequence[JointRows],
     blocks: Sequence[Float[np.ndarray, "rows k v"]],
     layout: Layout,
     own: Sequence[int],

@@ -25,17 +25,18 @@ def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[
 
 
 def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
-    """Indices in u of every name: as `coordinate_names` in the plane; `x`, `y`, `z`, `wx`, `wy`, `wz`, `velocity`,
-    `angular_velocity` in space; scalar coordinates have their names.
+    """Indices in u of every name: `x_rate`, `y_rate`, `angle_rate`, `velocity` of planar bodies; `x_rate`, `y_rate`,
+    `z_rate`, `wx`, `wy`, `wz`, `velocity`, `angular_velocity` of spatial ones; and rates of scalar coordinates.
     """
     if layout.space.dimension == 3:
-        fields = ["x", "y", "z", "wx", "wy", "wz"]
+        fields = ["x_rate", "y_rate", "z_rate", "wx", "wy", "wz"]
         groups = {"velocity": slice(0, 3), "angular_velocity": slice(3, 6)}
-        return _names(layout, bodies, layout.velocity_index, fields, groups)
-    return _names(layout, bodies, layout.velocity_index, ["x", "y", "angle"], {"velocity": slice(0, 2)})
+        return _names(layout, bodies, layout.velocity_index, fields, groups, "_rate")
+    fields = ["x_rate", "y_rate", "angle_rate"]
+    return _names(layout, bodies, layout.velocity_index, fields, {"velocity": slice(0, 2)}, "_rate")
 
 
-def _names(layout, bodies, index, fields, groups):
+def _names(layout, bodies, index, fields, groups, of_scalars=""):
     names = {}
     rows = index[:-1].tolist()
     for body, row, rotates in zip(bodies, rows[: layout.bodies], layout.rotates, strict=True):
@@ -46,7 +47,7 @@ def _names(layout, bodies, index, fields, groups):
             if where.stop <= own:
                 names[f"{body}.{group}"] = row[where]
     scalars = zip(layout.scalars, rows[layout.bodies :], strict=True)
-    return names | {own.name: [row[0]] for own, row in scalars if own.moves}
+    return names | {f"{own.name}{of_scalars}": [row[0]] for own, row in scalars if own.moves}
 
 
 def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:

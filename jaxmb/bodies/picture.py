@@ -35,7 +35,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         )
     width = _width(float(system.length), parts)
     shapes = [
-        (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in part.shapes(space, width)
+        (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in _shapes(part, space, width)
     ]
     # The friction of a joint acts where the joint does.
     of_laws = {law: joint for g in system.nonideal for law, joint in zip(g.group.names, g.joints, strict=True)}
@@ -62,6 +62,14 @@ def _pictured(group):
     on_ground = group.body_index[:, -1] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
     return eqx.tree_at(lambda own: own.part, group, jax.tree.map(kept, group.part, moved))
+
+
+def _shapes(part, space, width):
+    """The shapes of a part, each with the number of its body, in the frame of the body."""
+    for k, shape in part.shapes(space, width):
+        frame = part.body_frames.get(str(k))
+        rest = np.asarray(space.ground)
+        yield k, shape if frame is None else shape.moved(*space.placement(frame.pose(space, rest)))
 
 
 def _centres(group):
@@ -109,7 +117,8 @@ def _world_paths(system, group, ts, ys):
 
     def at_time(t, y):
         poses = group.gather(system.prepared_poses(y.q))
-        return group.map(lambda at, x: at(t).path(system.layout.space, x), poses)
+        space = system.layout.space
+        return group.map(lambda at, x: at(t).path(space, at(t).seen_poses(space, x)), poses)
 
     return jax.vmap(at_time)(ts, ys)
 

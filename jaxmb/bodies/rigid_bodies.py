@@ -21,7 +21,7 @@ from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from ..system.catalogue import AbstractSystem
-from ..system.design_variables import DesignVariables, description_rows, in_range
+from ..system.design_variables import DesignVariables, in_range
 from ..system.equation import Ranks
 from ..system.quantities import Quantity
 from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
@@ -267,9 +267,9 @@ class RigidBodySystem(AbstractSystem):
     # Scalar coordinates
 
     @property
-    def _inertial(self) -> tuple[ConstraintGroup, ...]:
+    def inertial(self) -> tuple[ConstraintGroup, ...]:
         """The groups of parts that have scalar coordinates."""
-        return tuple(g for g in self.constraints if _is_inertial(g))
+        return tuple(g for g in self.constraints if isinstance(g.group.part, AbstractInertialConstraint))
 
     @property
     def turn_counts(self) -> tuple[ConstraintGroup, ...]:
@@ -377,29 +377,7 @@ class RigidBodySystem(AbstractSystem):
         return dataclasses.replace(self, **with_signals(self._groups, signals))
 
     def describe(self):
-        kinds: dict[str, list[str]] = {}
-        for g in self.bodies:
-            kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
-        plain = [g for g in self.constraints if not _is_inertial(g)]
-        return describe_scene(
-            self,
-            spatial=self.spatial,
-            bodies=kinds,
-            joints=[
-                (plain, ""),
-                (self._inertial, ", each with a velocity of its own"),
-                (self.free_joints, ", which have coordinates only"),
-                (self.velocity_constraints, ", between velocities"),
-                (self.servos, ", a program of a Servo"),
-            ],
-            forces=self.forces,
-            tendons=self.tendons,
-            laws=self.nonideal,
-            gravity=self._gravity_name,
-            implied=self.implied,
-            design=description_rows(self.design),
-            frames=self.frames,
-        )
+        return describe_scene(self)
 
     # Views of a motion
 
@@ -433,13 +411,13 @@ class RigidBodySystem(AbstractSystem):
         values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))
         return values[coordinate.field][coordinate.member]
 
-    def holding(self, values, rates, t, in_blocks):
+    def holding(self, values, rates, t):
         held = held_groups(self._measured, self.joint_coordinates(), values, rates, t)
         rows = sum(g.rows for g in held)
         ranks = dataclasses.astuple(self.ranks)
         more = Ranks(*(rank + rows for rank in ranks))
         out = dataclasses.replace(self, constraints=(*self.constraints, *held), ranks=more, elimination=None)
-        if self.elimination is None or not in_blocks:
+        if self.elimination is None:
             return out
         return dataclasses.replace(out, elimination=joint_order_with_more(out, self, self.elimination))
 
@@ -620,7 +598,7 @@ class RigidBodySystem(AbstractSystem):
         """
         if not self.layout.scalars:
             return self.mass
-        found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self._inertial]
+        found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial]
         still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
         order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
         ones = jnp.ones(len(still), self.mass.dtype)
@@ -779,15 +757,11 @@ def _all_bodies(layout: Layout):
     return np.arange(layout.bodies)[:, None]
 
 
-def _is_inertial(group):
-    return isinstance(group.group.part, AbstractInertialConstraint)
-
-
 @eqx.filter_jit
 def _with_scalars(system, guess):
     t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
     layout = system.layout
-    for g in system._inertial:
+    for g in system.inertial:
         scalars = g.group.body_index[:, -1]
         unmet = g.residual(t, system.prepared_poses(q))[:, 0]
         q = q.at[layout.pose_index[scalars, 0]].add(-unmet)

@@ -29,7 +29,6 @@ from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
 from ..parts.joint_parts import AbstractCoordinatePart
 from ..parts.names import unknown
-from ..parts.on_frames import framed, law_on_frames, on_frames
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
 from ..parts.sources import AbstractOfSources
@@ -158,31 +157,33 @@ def _resolved(
     level = lambda part: isinstance(part, _OF_OTHERS) * (1 if isinstance(part, AbstractTendon) else 2)
     for part in sorted((*scene.joints, *scene.forces), key=level):
         if isinstance(part, AbstractNonIdeal):
-            joint, own, on = joints[part.joint]
-            laws.append((law_on_frames(part.resolve(space, joint, framed(space, on, given[list(own)])), on), own))
+            joint, own = joints[part.joint]
+            law = part.with_fields(body_frames=joint.body_frames)
+            # The law sees what its joint sees.
+            seen = law.seen_poses(space, given[list(own)])
+            laws.append((law.resolve(space, joint.with_fields(body_frames={}), seen), own))
         elif isinstance(part, AbstractCoordinatePart):
-            joint, own, on = joints[part.joint_name]
-            resolved = part.of_joint(joint).resolve(space, framed(space, on, given[list(own)]))
-            parts.append((on_frames(resolved, on), own))
+            joint, own = joints[part.joint_name]
+            parts.append((part.of_joint(joint).resolve(space, given[list(own)]), own))
         elif isinstance(part, AbstractOfSources):
             held = [_source(name, joints, scene.frames, frames, index) for name in part.sources]
             own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
             placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
             resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
             own = (*own, *scalars.get(part.name, ()))
-            joints[part.name] = resolved, own, (None,) * len(own)
+            joints[part.name] = resolved, own
             parts.append((resolved, own))
         elif isinstance(part, AbstractLink):
             own = tuple(index[name] for name in part.bodies)
             moving = [k for k in own if k < len(scene.bodies)]
             if len({*moving}) < len(moving):
                 raise ValueError(f"{part.label} connects two frames of one body: {', '.join(part.bodies)}.")
-            on = tuple(frames.get(name) for name in part.bodies)
-            poses = given[list(own)]
-            resolved = _call(part, "resolve", space, framed(space, on, poses) if any(on) else poses)
-            joints[part.name] = resolved, own, on
+            on = {str(k): frames[name] for k, name in enumerate(part.bodies) if name in frames}
+            part, poses = _call(part, "with_fields", body_frames=on), given[list(own)]
+            resolved = _call(part, "resolve", space, _call(part, "seen_poses", space, poses))
+            joints[part.name] = resolved, own
             components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
-            components = tuple(on_frames(component, on) for component in components)
+            components = tuple(_call(component, "with_fields", body_frames=on) for component in components)
             _check_rotation(resolved, components, own, layout, poses)
             parts += [(component, own) for component in components]
         else:
@@ -194,8 +195,7 @@ def _resolved(
 def _source(name, joints, named, frames, index):
     """A joint, a frame, or None for a body, with the numbers of its bodies."""
     if name in joints:
-        joint, own, on = joints[name]
-        return on_frames(joint, on), own
+        return joints[name]
     return (frames[name] if any(name == frame.name for frame in named) else None), (index[name],)
 
 
@@ -203,9 +203,9 @@ def _check_program(servo, space, bodies):
     check_kernels(servo.program, space, bodies)
 
 
-def _call(part, name, *arguments):
+def _call(part, name, *arguments, **fields):
     """Call a method through the class: binding it creates a module, too slow for thousands of parts."""
-    return getattr(type(part), name)(part, *arguments)
+    return getattr(type(part), name)(part, *arguments, **fields)
 
 
 def _check_kinds(scene: Scene):
@@ -264,7 +264,7 @@ def _check_names(scene: Scene):
             own = part.bodies
             for name in own:
                 if name not in known:
-                    raise ValueError(f"{part.label}: {unknown('body', name, known)}")
+                    raise unknown("body", name, known, part.label)
             twice = [name for name in own if own.count(name) > 1]
             if twice and (twice[0] != GROUND or set(own) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
@@ -278,7 +278,7 @@ def _check_sources(part, what, known):
         sources = part.sources if isinstance(part, AbstractOfSources) else (part.joint_name,)
     for name in sources:
         if name not in known or name == part.name:
-            raise ValueError(f"{part.label}: {unknown(what, name, known)}")
+            raise unknown(what, name, known, part.label)
 
 
 def _check_rotation(part, components, own, layout, poses):
@@ -299,7 +299,8 @@ def _strength(part, space, poses):
     """The size of a part's wrenches, or of its Jacobian, for each velocity of its bodies."""
     if isinstance(part, AbstractForce):
         velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
-        return jnp.abs(part.wrenches(space, poses, velocities, jnp.zeros((), poses.dtype)))
+        wrenches = part.wrenches(space, *part.seen(space, poses, velocities), jnp.zeros((), poses.dtype))
+        return jnp.abs(part.wrenches_on_bodies(space, poses, wrenches))
     rows = rows_of(part, space, poses)
     return jnp.sum(jnp.abs(rows), axis=0)
 

@@ -18,11 +18,10 @@ from jaxtyping import Array
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.rotations import cross, unrotate
 from ..states.assembly import violated_joints
-from ..states.closest import tolerance
-from ..states.closest_sparse import largest_residual, meet_sparse
+from ..states.closest import largest_residual, meet_in_blocks, tolerance
 from ..states.redundancy import (
     ZERO,
-    Group,
+    DependentRows,
     Nearby,
     Remains,
     check_gradients,
@@ -32,7 +31,7 @@ from ..states.redundancy import (
 )
 from ..system.equation import Ranks
 from ..system.residuals import binding_velocities, displaced, position_rows
-from .independence import Part, absolute_parts, eliminate, matrix, subsets
+from .independence import JointRows, absolute_parts, eliminate, matrix, subsets
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
 
@@ -92,7 +91,7 @@ def _parts(system):
     groups = [(g.group.bodies, g.rows) for g in system.joints]
     sizes = [(own, rows) for bodies, rows in groups for own in bodies]
     starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
-    return [Part(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
+    return [JointRows(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
 
 
 def _of_parts(groups):
@@ -116,7 +115,7 @@ def _analyse(system):
     """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
     still = np.zeros(system.nu, bool)
-    q = meet_sparse(system, t, q, still) if system.position_rows else system.normalize(q)
+    q = meet_in_blocks(system, t, q, still) if system.position_rows else system.normalize(q)
     at = _evaluated(system, t, q)
     residual = largest_residual(at.unmet, at.row_norms[: system.position_rows])
     return q, residual, at
@@ -333,7 +332,7 @@ def _check_nearby(system, q, parts, found, scale):
     holonomic = lambda own: own.kept[own.kept < system.position_rows]
     check_implied(
         system,
-        [Group(own.rows, own.kept, holonomic(own)) for own in groups],
+        [DependentRows(own.rows, own.kept, holonomic(own)) for own in groups],
         [own.columns for own in groups],
         evaluate,
         system.nu,

@@ -1,4 +1,4 @@
-"""`jaxmb report NAME`: error against run time, stability, what a scene leaves out, and what formulations cost."""
+"""`jaxmb report NAME`: error against run time, a stress test, unused features, and costs of formulations."""
 
 import argparse
 import json
@@ -14,14 +14,14 @@ from .subject import mechanism_of
 # Variants of a mechanism that a report without --set also covers.
 _VARIANTS = {"tracked_vehicle": ({"units": 2},)}
 # Words before the mechanism of a report, each for one report alone.
-_WORDS = ("formulations", "work_precision", "stability", "left_out")
+_WORDS = ("formulations", "work_precision", "stress_test", "left_out")
 
 
 def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
     command = commands.add_parser(
         "report",
-        help="measure error against run time, stability, what a scene leaves out, or what formulations cost",
+        help="measure error against run time, stiff and extreme variants, unused features, or costs of formulations",
         epilog="Without --set, a report on tracked_vehicle also covers two coupled vehicles.",
     )
     command.add_argument(

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
-from ..linalg.elimination import eliminate, full_pivot
+from ..linalg.elimination import full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..linalg.newton import root
@@ -66,7 +66,7 @@ def pivoted_jacobian(
     """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
     jacobian = system.jacobian(t, q, u)
     pivots = full_pivot(jacobian, scale=system.velocity_scale(), level=row_levels(system))
-    return DenseJacobian(jacobian, eliminate(jacobian, pivots.order, system.acceleration_rank))
+    return DenseJacobian(jacobian).eliminated(pivots.order, system.acceleration_rank)
 
 
 def row_levels(system: AbstractEquation) -> Array:
@@ -108,9 +108,10 @@ def accelerations(
 
 
 def _jacobian(system, formulation, t, q, u):
-    drops = system.elimination is None and system.acceleration_rank < system.acceleration_rows
-    searches = formulation.partitions or drops
-    return pivoted_jacobian(system, t, q, u) if searches else system.structured_jacobian(t, q, u)
+    if formulation.partitions:
+        return pivoted_jacobian(system, t, q, u)
+    jacobian = system.structured_jacobian(t, q, u)
+    return jacobian.selected(system.acceleration_rank, system.velocity_scale(), row_levels(system))
 
 
 class Solution(NamedTuple):

@@ -21,7 +21,7 @@ from ..parts.spatial.joints import Fixed, Spherical
 from . import chains
 from .description import Joint, Machine, quaternion
 from .fuse import Fused, fuse
-from .light import rigid, without_ends
+from .light import rigid, with_rotors, without_ends
 from .notes import Notes
 
 # The time in which a compliant stop stops a joint [s], if the file gives none: MuJoCo's default.
@@ -61,6 +61,7 @@ class Built:
 def build(machine: Machine, notes: Notes) -> Built:
     """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
     without_ends(machine, notes)
+    with_rotors(machine, notes)
     return _Builder(machine, notes).build()
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..bodies import RigidBodySystem
 from ..parts.base import GROUND, AbstractInertialConstraint
-from ..parts.on_frames import framed
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
 from .description import matrix, turned
@@ -107,10 +106,7 @@ def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray])
             own = group.group.single(k, jnp.zeros(()))
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
             places = np.stack([poses[body] for body in bodies])
-            held = getattr(own, "frames", None)
-            if isinstance(held, dict):
-                places = np.asarray(framed(SPACE, tuple(held.get(str(j)) for j in range(len(bodies))), places))
-                own = own.part
+            places = np.asarray(own.seen_poses(SPACE, places))
             out.append(Part(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
     return out
 

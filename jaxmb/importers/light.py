@@ -1,10 +1,10 @@
-"""Links whose inertia is none, or not that of a rigid body."""
+"""Links whose inertia is none, that of a joint, or not that of a rigid body."""
 
 from collections import Counter
 
 import numpy as np
 
-from .description import GROUND, Link, Machine
+from .description import GROUND, Joint, Link, Machine
 from .notes import Notes
 
 # The share of the largest moment of inertia that is taken for rounding.
@@ -85,6 +85,32 @@ def _take_out(machine, links, joints, notes):
     machine.marks = [own for own in machine.marks if own.link not in links]
     machine.shapes = [own for own in machine.shapes if own[0] not in links]
     machine.collisions = [own for own in machine.collisions if own[0] not in links]
+
+
+def with_rotors(machine: Machine, notes: Notes) -> None:
+    """Make the armature of free joints, and of ball joints on the ground, a link of its own, fixed to theirs.
+
+    The velocities of these joints are those of the link, so armature is the mass of a point in the origin of its frame,
+    without weight, and the inertia of a ball about it. No link moves like a ball joint between two moving ones.
+    """
+    of = bodies_of(machine)
+    heavy = {of[name] for name, link in machine.links.items() if link.mass}
+    for joint in list(machine.joints):
+        alone = of[joint.parent] == GROUND and of[joint.child] in heavy
+        if joint.kind not in ("free", "ball") or not joint.armature or not alone:
+            continue
+        armature, joint.armature = joint.armature, 0.0
+        if notes.leaves_out("armature", joint.name):
+            continue
+        beside, name = machine.links[joint.child], f"{joint.name} armature"
+        mass = armature if joint.kind == "free" else 0.0
+        machine.links[name] = Link(
+            name, mass, np.zeros(3), armature * np.eye(3), beside.position, beside.rotation, joint.where
+        )
+        machine.joints.append(Joint(f"{name} weld", "fixed", joint.child, name))
+        if mass:
+            machine.buoyancy[name] = 1.0
+        notes.say("Armature of free joints, and of ball joints on the ground, is part of their bodies: {}.", joint.name)
 
 
 def rigid(link: Link, notes: Notes) -> np.ndarray:

@@ -32,6 +32,10 @@ def _read(mujoco, model, names, notes, k, name):
     control, out = (int(getattr(model, f"actuator_{own}adr", range(model.nu))[k]) for own in ("ctrl", "out"))
     gear = float(model.actuator_gear[out][0])
     control_range = tuple(model.actuator_ctrlrange[control]) if model.actuator_ctrllimited[control] else None
+    if kind == transmissions.mjTRN_BODY:
+        # Shapes that may touch are left out, or the model is refused.
+        notes.say("Adhesion acts in contacts only, of which there are none here: {}.", name)
+        return None
 
     def refuse(what):
         notes.refuse("actuators", name, f"Actuator {name!r} {what}")
@@ -95,6 +99,8 @@ def _acting_on(mujoco, model, joint):
     kinds, found = mujoco.mjtTrn, []
     for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
         kind = kinds(int(number))
+        if kind == kinds.mjTRN_BODY:
+            continue
         if kind == kinds.mjTRN_TENDON:
             wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
             is_other = lambda w: model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT and model.wrap_objid[w] != joint

@@ -68,7 +68,7 @@ class Notes:
         **Raises:** `ValueError` that lists all that was refused, and for words of `ignore` that nothing answers to.
         """
         for word in sorted(self.ignore - self.used - set(LEAVABLE)):
-            raise ValueError(f"ignore: {unknown('element', word, LEAVABLE)}")
+            raise unknown("element", word, LEAVABLE, "ignore")
         if self.refused:
             listed = "".join(f"\n- {sentence}" for sentence in self.refused)
             raise ValueError(f"{file} has elements that {what}:{listed}")

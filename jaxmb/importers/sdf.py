@@ -1,5 +1,6 @@
 """Machines from SDF, the format of Gazebo: links anywhere, joints between any two of them, closed loops included."""
 
+import itertools
 import os
 import re
 from collections.abc import Collection
@@ -41,13 +42,14 @@ def sdf(
     ignore: str | Collection[str] = (),
     package_dirs: str | os.PathLike[str] | Collection[str | os.PathLike[str]] = (),
 ) -> ImportedModel:
-    """A machine from SDF.
+    """A machine from SDF, of one model or all that stand side by side in the file.
 
-    A model is free unless a joint binds it to `world`, or it is static. Before version 1.5 of the format, axes of
-    joints are in the frame of the model. Angles that are written with few digits, such
-    as 1.5708, are the multiples of π/12 that they round: the hinges of a loop are then as parallel as they are meant.
+    Links and joints of several models have the names of these before their own, `"arm::hand"`. A model is free unless
+    a joint binds it to `world`, or it is static. Before version 1.5 of the format, axes of joints are in the frame of
+    the model. Angles that are written with few digits, such as 1.5708, are the multiples of π/12 that they round: the
+    hinges of a loop are then as parallel as they are meant.
 
-    **Arguments:** `source`: a path, or the text of a file, with one model; `gravity` [m/s²], shape (3,), unless a world
+    **Arguments:** `source`: a path, or the text of a file; `gravity` [m/s²], shape (3,), unless a world
     in the file has it; `ignore`: what is to be left out, words such as `"limits"`, `"collisions"` and `"pictures"`, or
     names of joints; `package_dirs`: where `model://name/` is looked for first, folders of models or that hold models;
     then in the folder of the file and those above it.
@@ -65,13 +67,33 @@ def sdf(
     for include in (*holder.all("include"), *root.all("include")):
         raise ValueError(f"{include.where}<include> is not followed: put the model into the file.")
     models = list(holder.all("model"))
-    if len(models) != 1:
-        raise ValueError(f"{root.where}the file must hold one model, got {len(models)}.")
-    (model,) = models
+    if not models:
+        raise ValueError(f"{root.where}the file holds no <model>.")
     weight = holder.first("gravity")
-    machine = Machine(model.attributes.get("name", "model"), np.asarray(gravity, float))
+    machine = Machine(models[0].attributes.get("name", "model"), np.asarray(gravity, float))
     if weight is not None:
         machine.gravity = weight.numbers()
+    for model, scope in zip(models, _scopes(models, notes), strict=True):
+        _read_model(model, scope, machine, version, notes, files)
+    return model_of(root, machine, notes, file, _EFFECTLESS)
+
+
+def _scopes(models, notes):
+    """What stands before the names of each model's links and joints: nothing if there is one model only."""
+    if len(models) == 1:
+        return [""]
+    out: list[str] = []
+    for model in models:
+        name = model.attributes.get("name", "model")
+        tries = itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
+        own = next(own for own in tries if f"{own}::" not in out)
+        if own != name:
+            notes.say("Models have other names, since those of the file are not unique: {}.", f"{name} → {own}")
+        out.append(f"{own}::")
+    return out
+
+
+def _read_model(model, scope, machine, version, notes, files):
     place = _pose(model, notes)
     for nested in (*model.all("model"), *model.all("include"), *model.all("frame")):
         notes.refused.append(f"{nested.where}<{nested.tag}> within a model is not read; write the model out.")
@@ -80,12 +102,12 @@ def sdf(
     static = model.first("static")
     static = static is not None and _true(static.text)
     for element in model.all("link"):
-        _read_link(element, machine, place, notes, files)
+        _read_link(element, scope, machine, place, notes, files)
         if static:
-            machine.joints.append(Joint(f"{element.need('name')} weld", "fixed", GROUND, element.need("name")))
+            name = f"{scope}{element.need('name')}"
+            machine.joints.append(Joint(f"{name} weld", "fixed", GROUND, name))
     for element in model.all("joint"):
-        _read_joint(element, machine, place[1], version, notes)
-    return model_of(root, machine, notes, file, _EFFECTLESS)
+        _read_joint(element, scope, machine, place[1], version, notes)
 
 
 def _version(root: Element) -> tuple[int, ...]:
@@ -129,8 +151,8 @@ def _rounded(word, value, element, notes):
     return value
 
 
-def _read_link(element, machine, place, notes, files):
-    name = element.need("name")
+def _read_link(element, scope, machine, place, notes, files):
+    name = f"{scope}{element.need('name')}"
     if name in machine.links:
         raise ValueError(f"{element.where}link {name!r} is there twice.")
     position, rotation = _pose(element, notes)
@@ -147,7 +169,7 @@ def _read_link(element, machine, place, notes, files):
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
         if _true(inertial.attributes.get("auto", "")):
             notes.refused.append(f"{inertial.where}the inertia of link {name!r} comes from its shapes: write it out.")
-    elif name == _WORLD:
+    elif name == f"{scope}{_WORLD}":
         machine.joints.append(Joint(f"{name} weld", "fixed", GROUND, name))
     else:
         link.mass, link.inertia = 1.0, np.eye(3)
@@ -164,8 +186,8 @@ def _read_link(element, machine, place, notes, files):
     read_shapes(element, name, machine, notes, files, seen)
 
 
-def _read_joint(element, machine, of_model, version, notes):
-    name, kind = element.need("name"), element.need("type")
+def _read_joint(element, scope, machine, of_model, version, notes):
+    name, kind = f"{scope}{element.need('name')}", element.need("type")
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
         if kind in ("gearbox", "screw", "revolute2"):
@@ -176,10 +198,11 @@ def _read_joint(element, machine, of_model, version, notes):
     ends = []
     for tag in ("parent", "child"):
         own = element.first(tag)
-        link = "" if own is None else own.text.strip()
-        if link not in machine.links and link != _WORLD:
-            raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
-        ends.append(GROUND if link == _WORLD else link)
+        given = "" if own is None else own.text.strip()
+        link = GROUND if given == _WORLD else f"{scope}{given}"
+        if link not in machine.links and link != GROUND:
+            raise ValueError(f"{element.where}joint {name!r} has the {tag} {given!r}, and there is no such link.")
+        ends.append(link)
     if ends[0] == ends[1]:
         raise ValueError(f"{element.where}parent and child of joint {name!r} are the same, {link!r}.")
     child = machine.links.get(ends[1], Link(GROUND))
@@ -198,13 +221,13 @@ def _read_joint(element, machine, of_model, version, notes):
         pairs = [(joint, axes[0] if axes else None)]
     for joint, axis in pairs:
         if axis is not None:
-            _read_axis(joint, axis, frame, of_model, machine, version, notes, kind)
+            _read_axis(joint, axis, frame, of_model, scope, machine, version, notes, kind)
         elif joint.kind in ("hinge", "slide"):
             raise ValueError(f"{element.where}joint {name!r} needs an <axis>.")
         machine.joints.append(joint)
 
 
-def _read_axis(joint, axis, frame, of_model, machine, version, notes, kind):
+def _read_axis(joint, axis, frame, of_model, scope, machine, version, notes, kind):
     xyz = axis.first("xyz")
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
@@ -213,9 +236,9 @@ def _read_axis(joint, axis, frame, of_model, machine, version, notes, kind):
     if (version < (1, 5) if in_model is None else _true(in_model.text)) or expressed == "__model__":
         frame = of_model
     elif expressed:
-        if expressed not in machine.links:
+        if f"{scope}{expressed}" not in machine.links:
             raise ValueError(f"{axis.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
-        frame = machine.links[expressed].rotation
+        frame = machine.links[f"{scope}{expressed}"].rotation
     length = np.linalg.norm(direction)
     if length == 0:
         raise ValueError(f"{axis.where}the axis of joint {joint.name!r} is zero.")

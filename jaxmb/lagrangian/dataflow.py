@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.extend.core import Literal
+
+from .._compat import Literal
 
 
 def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:

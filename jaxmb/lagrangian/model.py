@@ -119,7 +119,7 @@ class AbstractLagrangian(AbstractSystem):
 
     def rate_names(self):
         if self.kinematics.identity:
-            return self.coordinate_names()
+            return super().rate_names()
         return {f"u{k}": [k] for k in range(self.nu)}
 
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._compat import with_values
 from .._types import State, VectorLike
 from ..parts.fields import as_jax
 from ..system.equation import Ranks
@@ -113,12 +114,9 @@ class LagrangianSystem(AbstractLagrangian):
 
     def with_signals(self, signals):
         inputs = self.inputs | inputs_of(self, signals)
-        out = object.__new__(type(self))
-        for field in dataclasses.fields(self):
-            object.__setattr__(out, field.name, getattr(self, field.name))
-        object.__setattr__(out, "inputs", inputs)
-        object.__setattr__(out, "drift_free", self.drift_free and not any(own.binds for own in inputs.values()))
-        return out
+        drift_free = self.drift_free and not any(own.binds for own in inputs.values())
+        same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return with_values(self, same | {"inputs": inputs, "drift_free": drift_free})
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:
@@ -141,6 +139,10 @@ def _names(coordinates: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if len(names) != count or len(set(names)) != count:
         raise ValueError(f"{count} coordinates need as many names, all different; got {names}.")
     for name in names:
+        if f"{name}_rate" in names:
+            raise ValueError(
+                f"'{name}_rate' is the name of the rate of {name!r}; choose another one for the coordinate."
+            )
         if name in _TAKEN:
             raise ValueError(f"In a saved motion {name!r} is something else; choose another name for the coordinate.")
         if any(character in name for character in _NOT_IN_FILES) or name.startswith("."):

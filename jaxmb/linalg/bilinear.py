@@ -10,14 +10,11 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+from .._compat import define_bilinear
 from .arrays import add_up, namespace
 
 # A longer result is assembled from columns: a concatenation of many components is a kernel of its own.
@@ -39,28 +36,11 @@ def bilinear_primitive(
     `Σ c · evaluate(a, b)`; names of the static `parameters`.
     """
 
-    def batched(operands, axes, **static):
-        size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
-        front = [
-            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-            for x, axis in zip(operands, axes, strict=True)
-        ]
-        return own.bind(*front, **static), 0
-
-    own = Primitive(name)
-    own.def_impl(jax.jit(evaluate, static_argnames=parameters))
-    own.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
-    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
-    ad.defbilinear(
-        own,
-        lambda c, a, b, **static: gradient_a(c, b, **static),
-        lambda c, a, b, **static: gradient_b(c, a, **static),
-    )
-    batching.primitive_batchers[own] = batched
+    bind_strictly = define_bilinear(name, evaluate, shape, (gradient_a, gradient_b), parameters)
 
     def bind(a: Any, b: Any, **static: Any) -> Array:
         dtype = jnp.result_type(a, b)
-        return own.bind(jnp.asarray(a, dtype), jnp.asarray(b, dtype), **static)
+        return bind_strictly(jnp.asarray(a, dtype), jnp.asarray(b, dtype), **static)
 
     return bind
 

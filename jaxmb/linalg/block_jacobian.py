@@ -81,6 +81,11 @@ class JointOrder:
         """Whether every body has all its velocities, so that those of the bodies are a plain reshape of all."""
         return self.velocity_place.size == self.velocity_index[:-1].size
 
+    @property
+    def is_kept(self) -> np.ndarray:
+        """Whether each of all m rows is independent of the others."""
+        return self.kept.reshape(-1)[self.place]
+
     def of_first(self, rows: int) -> "JointOrder":
         """The same order with these rows kept at most."""
         return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
@@ -132,10 +137,20 @@ class BlockJacobian(AbstractJacobian):
 
     def dense(self):
         unit = jnp.eye(self.order.velocity_place.size, dtype=self.blocks.dtype)
-        return DenseJacobian(jax.vmap(self.product, in_axes=1, out_axes=1)(unit))
+        matrix, kept = jax.vmap(self.product, in_axes=1, out_axes=1)(unit), self.order.is_kept
+        return DenseJacobian(matrix, rows=None if kept.all() else jnp.asarray(np.flatnonzero(kept)))
 
     def of_first(self, rows):
         return BlockJacobian(self.blocks, self.order.of_first(rows))
+
+    def selected(self, rank, scale, level=None):
+        # The order of elimination leaves implied rows out.
+        del rank, scale, level
+        return self
+
+    @property
+    def active(self):
+        return jnp.asarray(self.order.is_kept, self.blocks.dtype)
 
     def _joint_rows(self, values):
         return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), self.order.rows)
@@ -155,7 +170,7 @@ class BlockGram(AbstractPositiveDefinite):
         forces = self.jacobian.on_velocities(jnp.where(kept, x, 0.0))
         return jnp.where(kept, self.jacobian.on_joints(self.inertia.solve(forces)), x)
 
-    def eliminate(self, shift=0.0):
+    def eliminate(self, share=None):
         order, blocks = self.jacobian.order, self.jacobian.blocks
         joints, k, r, v = blocks.shape
         scaled = jnp.where(order.kept[:, None, :, None], blocks, 0.0)
@@ -178,19 +193,22 @@ class BlockGram(AbstractPositiveDefinite):
             across = jnp.where(hub_is_row[:, None, None], across.swapaxes(1, 2), across)
             stored = stored.at[order.hub_places].set(across, unique_indices=True, mode="promise_in_bounds")
         stored = stored + jnp.asarray(_identities(order, size), blocks.dtype)
-        if shift:
+        shift = 0.0
+        if share is not None:
             own = stored[:joints]
             largest = jnp.max(jnp.diagonal(own, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
-            stored = stored.at[:joints].set(own + shift * largest * jnp.eye(size, dtype=blocks.dtype)[None])
+            shift = share * largest
+            stored = stored.at[:joints].set(own + shift * jnp.eye(size, dtype=blocks.dtype)[None])
         factor = eliminate_blocks(stored, order.nodes)
         # The first stored blocks are those on the diagonal.
-        return BlockGramFactor(self, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
+        return BlockGramFactor(self, shift, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
 
 
 class BlockGramFactor(AbstractPositiveFactor):
     """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
 
     matrix: BlockGram
+    shift: Any
     factor: BlockFactor
     diagonal: Float[Array, "nodes b"]
 

@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from .._compat import custom_vmap, sequential_vmap
+
 # The largest number of rows for each way of sweeping; see jaxmb.linalg for the measurement.
 _ROTATING_SIZE = 18
 _LOOP_SIZE = 40
@@ -75,10 +77,6 @@ class Factor(eqx.Module):
     right_inverse: Float[Array, "n m"]
     null_space: Float[Array, "n f"]
     rows: Int[Array, "r"] | None
-
-    def scatter_rows(self, kept: Float[Array, "r"]) -> Float[Array, "m"]:
-        """The values of all rows from those of the independent ones: zero for implied rows."""
-        return jnp.zeros(self.right_inverse.shape[1], kept.dtype).at[self.rows].set(kept)
 
 
 def full_pivot(
@@ -181,7 +179,7 @@ def _sweep(B: Float[Array, "r n"]) -> Float[Array, "r n"]:
     return (_sweep_in_place if B.shape[0] > _ROTATING_SIZE else _sweep_rotating)(B)
 
 
-@jax.custom_batching.custom_vmap
+@custom_vmap
 def _sweep_rotating(B):
     return _rotate(B)
 
@@ -220,7 +218,7 @@ def _sweep_in_place(B):
 
 # The members of a batch are eliminated one after the other: XLA's batched LAPACK kernels have deadlocked in loops
 # (jaxlib 0.10.2, two cores, 64 matrices of 35 rows).
-@jax.custom_batching.sequential_vmap
+@sequential_vmap
 def _sweep_blocked(B):
     r = B.shape[0]
     inverse = jnp.linalg.inv(B[:, :r])

@@ -7,11 +7,12 @@ with `A M⁻¹ Aᵀ` by an elimination that follows the structure.
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .elimination import Factor
+from .elimination import Factor, PivotOrder, eliminate, full_pivot
 from .inertia import AbstractInertia
 from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor, DensePositiveDefinite
 from .rotations import norm
@@ -62,6 +63,18 @@ class AbstractJacobian(eqx.Module):
     def of_first(self, rows: int) -> "AbstractJacobian":
         """The same matrix whose independent rows are those of the first ones: `gather_rows` keeps no others."""
 
+    @abc.abstractmethod
+    def selected(self, rank: int, scale: Float[Array, "n"], level: Int[Array, "m"] | None = None) -> "AbstractJacobian":
+        """The same matrix with independent rows selected, as many as the `rank`, where that is not known yet.
+
+        **Arguments:** `scale` of the columns; `level` of the rows, as in `full_pivot`.
+        """
+
+    @property
+    @abc.abstractmethod
+    def active(self) -> Float[Array, "m"]:
+        """One for the independent rows, zero for those that they imply."""
+
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
         """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
         gram = self.gram(metric)
@@ -109,6 +122,11 @@ class MassProjector(eqx.Module):
         x, multipliers = split(lax.custom_linear_solve(equations, join(force, -target), solution, symmetric=True))
         return x, jacobian.scatter_rows(multipliers)
 
+    def displacement(self, rows: Float[Array, "m"]) -> Float[Array, "n"]:
+        """The smallest x in the metric with `A x = b`, to all digits."""
+        none = jax.eval_shape(self.jacobian.transpose_product, rows)
+        return self.solve(jnp.zeros(none.shape, none.dtype), rows)[0]
+
     def _refined(self, force, target):
         jacobian = self.jacobian
 
@@ -147,12 +165,13 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, which selects the independent rows, or None where all of the
-    `first` rows, default all rows, are independent and no pivots were searched for.
+    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None where
+    all of the `first` ones, default all rows, are independent and no pivots were searched for.
     """
 
     matrix: Float[Array, "m n"]
     factor: Factor | None = None
+    rows: Int[Array, "r"] | None = None
     first: int | None = eqx.field(static=True, default=None)
 
     @property
@@ -179,14 +198,15 @@ class DenseJacobian(AbstractJacobian):
         return norm(self.matrix * scale[None, :])
 
     def gather_rows(self, values):
-        if self.factor is None:
+        if self.rows is None:
             return values if self.first is None else values[: self.first]
-        return values[self.factor.rows]
+        return values[self.rows]
 
     def scatter_rows(self, values):
-        if self.factor is None:
-            return values if self.first is None else jnp.pad(values, (0, self.matrix.shape[0] - self.first))
-        return self.factor.scatter_rows(values)
+        m = self.matrix.shape[0]
+        if self.rows is None:
+            return values if self.first is None else jnp.pad(values, (0, m - self.first))
+        return jnp.zeros(m, values.dtype).at[self.rows].set(values)
 
     def gram(self, inertia):
         A = self.independent
@@ -196,5 +216,20 @@ class DenseJacobian(AbstractJacobian):
         return self
 
     def of_first(self, rows):
-        assert self.factor is None, "a chart selects the rows already"
-        return DenseJacobian(self.matrix, None, rows)
+        assert self.rows is None, "rows are selected already"
+        return DenseJacobian(self.matrix, first=rows)
+
+    def selected(self, rank, scale, level=None):
+        matrix = self.matrix if self.first is None else self.matrix[: self.first]
+        if self.rows is not None or matrix.shape[0] == rank:
+            return self
+        return DenseJacobian(self.matrix, rows=full_pivot(matrix, scale=scale, level=level).order.rows[:rank])
+
+    def eliminated(self, order: PivotOrder, rank: int) -> "DenseJacobian":
+        """The same matrix with its factor in an order of elimination, which selects the independent rows."""
+        factor = eliminate(self.matrix, order, rank)
+        return DenseJacobian(self.matrix, factor, factor.rows)
+
+    @property
+    def active(self):
+        return self.scatter_rows(self.gather_rows(jnp.ones(self.matrix.shape[0], self.matrix.dtype)))

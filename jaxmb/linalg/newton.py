@@ -1,7 +1,7 @@
 """Newton's method and its chord variant inside `lax`, and the derivative of their solution.
 
 Iterations are not differentiated: the derivative of a root follows from its equation, by the implicit function theorem.
-(The iteration of the implicit solvers is in `solvers/_implicit.py`, which imports nothing of the package.)
+(The iteration of the implicit solvers is in `solvers/_newton.py`, which imports nothing of the package.)
 """
 
 from collections.abc import Callable

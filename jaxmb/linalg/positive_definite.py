@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .elimination import gauss_jordan
 
@@ -24,16 +24,20 @@ class AbstractPositiveDefinite(eqx.Module):
         """`T x`."""
 
     @abc.abstractmethod
-    def eliminate(self, shift: float = 0.0) -> "AbstractPositiveFactor":
-        """Eliminate once, for any number of right-hand sides. With a `shift`, this share of the largest entry is added
-        to the diagonal, so that implied rows have a pivot.
+    def eliminate(self, share: Float[ArrayLike, ""] | None = None) -> "AbstractPositiveFactor":
+        """Eliminate once, for any number of right-hand sides. With a `share`, this one of the largest entry is added to
+        the diagonal, so that implied rows have a pivot.
         """
 
 
 class AbstractPositiveFactor(eqx.Module):
-    """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination carry none."""
+    """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination carry none.
+
+    **Fields:** `matrix`; `shift`: what was added to its diagonal before it was eliminated.
+    """
 
     matrix: AbstractVar[Any]
+    shift: AbstractVar[Any]
 
     @abc.abstractmethod
     def substitute(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -44,6 +48,11 @@ class AbstractPositiveFactor(eqx.Module):
         """The smallest pivot of a Gram matrix relative to its diagonal, between 0 (a row implied by those before it)
         and 1 (a row orthogonal to them).
         """
+
+    def refined(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """`(T + shift)⁻¹ b`, substituted and refined once: pivots of implied rows are small, and amplify roundings."""
+        x = self.substitute(b)
+        return x + self.substitute(b - self.matrix.product(x) - self.shift * x)
 
     def solve(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`T⁻¹ b`, differentiated implicitly, by the equation `T x = b`."""
@@ -62,19 +71,20 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
     def product(self, x):
         return self.matrix @ x
 
-    def eliminate(self, shift=0.0):
+    def eliminate(self, share=None):
         matrix = lax.stop_gradient(self.matrix)
-        if shift:
-            own = shift * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
-            matrix = matrix + own * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+        shift = 0.0 if share is None else share * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
+        if share is not None:
+            matrix = matrix + shift * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
         inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
-        return DensePositiveFactor(self, inverse)
+        return DensePositiveFactor(self, shift, inverse)
 
 
 class DensePositiveFactor(AbstractPositiveFactor):
     """The inverse of a full matrix, shape (n, n)."""
 
     matrix: DensePositiveDefinite
+    shift: Any
     inverse: Float[Array, "n n"]
 
     def substitute(self, b):

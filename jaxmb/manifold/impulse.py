@@ -11,10 +11,8 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, State
-from ..linalg.elimination import solve_positive
 from ..system import AbstractEquation
-from ..system.residuals import binding_velocities, velocity_rows
-from .orthogonal_projection import independent_rows
+from .orthogonal_projection import project_velocities
 
 # Jumps are looked for in this number of intervals in all, and in no fewer between two restarts.
 _INTERVALS, _FEWEST = 256, 16
@@ -61,17 +59,7 @@ def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
 
     Source: L. A. Pars, "A Treatise on Analytical Dynamics", Heinemann, 1965 (impulsive motion).
     """
-    u, inertia = y.u, system.inertia(t, y.q, y.u)
-    if system.elimination is not None:
-        projector = binding_velocities(system, t, y.q, u).projector(inertia)
-        change, _ = projector.solve(jnp.zeros_like(u), -velocity_rows(system, t, y.q, u))
-        return dataclasses.replace(y, u=u + change)
-    for _ in range(1 if system.linear else 3):
-        jacobian = system.velocity_jacobian(t, y.q, u)
-        rows = independent_rows(jacobian, system.velocity_scale(), system.velocity_rank)
-        per_impulse = inertia.solve(jacobian[rows].T)
-        residual = system.velocity_residual(t, y.q, u)[rows]
-        u = u - per_impulse @ solve_positive(jacobian[rows] @ per_impulse, residual)
+    u, _ = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
     return dataclasses.replace(y, u=u)
 
 

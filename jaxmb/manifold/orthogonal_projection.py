@@ -1,7 +1,8 @@
-"""Projection of states on the constraints, with exact derivatives.
+"""Projection of states on the constraints along the shortest way, with exact derivatives.
 
-`project` makes the smallest change in the scales of the coordinates; `project_in_metric` the smallest one in any metric
-of the velocities, by the projector of the Jacobian's structure.
+`ProjectorConstraints` restore a state from one close by, in the metric of the mass matrix. `project` makes the smallest
+change in the scales of the coordinates; `project_in_metric` the smallest one in any metric of the velocities, by the
+projector of the Jacobian's structure.
 
 Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
 """
@@ -13,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
@@ -22,9 +23,13 @@ from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, solve_linear
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
+from .constraints import AbstractConstraints, RestoredState, push
 from .manifold import normalize_state
 
 _ITERATIONS = 8
+# Corrections shrink at least by this multiple of the distance to the state of the factor, in scales of the coordinates.
+# (Measured in chains of ball joints: up to 4, of accelerations 13.)
+_RATE = 10.0
 # The chord method of `project` may converge slowly where a step is long and no error estimate shortens it.
 _CHORDS = 32
 # Newton's method ends with a correction that is not measured, so the one before may be of this power of eps.
@@ -32,6 +37,89 @@ _MEASURED = 0.6
 # The last measured correction of velocities that constraints are not linear in, relative to the speed, as a power of
 # eps: the error that is left is of the size of its square.
 _MEASURED_SPEED = 0.4
+
+
+class ProjectorConstraints(AbstractConstraints):
+    """Constraints that are linear in velocities, by the `projector` at coordinates `q` in the metric of the mass
+    matrix.
+    """
+
+    q: Float[Array, "nq"]
+    projector: MassProjector
+
+    def restore(self, system, t, y, near, tol):
+        fixed, scale = self.projector, system.velocity_scale()
+        start = system.normalize(y.q)
+        distance = jnp.max(jnp.abs(start - self.q) / system.coordinate_scale())
+        rate = jnp.minimum(_RATE * distance, 0.5)
+        one = jnp.ones((), start.dtype)
+
+        def move(q):
+            step = fixed.cancel(position_rows(system, t, q))
+            return displaced(system, t, q, step), _largest(step, scale)
+
+        q, iterations, failed = chord(move, start, first=one, tol=tol, most=_ITERATIONS, rate=rate)
+        speed = _nonzero(_largest(y.u, scale))
+
+        def turn(u):
+            step = fixed.cancel(system.velocity_residual(t, q, u))
+            return u + step, _largest(step, scale) / speed
+
+        # Velocities and accelerations are known to rounding errors of all that adds up to them.
+        rounding = jnp.finfo(start.dtype).eps ** 0.5
+        u, _, failed_u = chord(turn, y.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding)
+        inertia, force = system.inertia(t, q, u), system.force(t, q, u)
+        given = inertia.solve(force)
+        strength = _nonzero(_largest(given, scale) + _largest(near.udot, scale))
+
+        def accelerate(x):
+            _, multipliers = x
+            free = given + inertia.solve(system.constraint_force(t, q, u, multipliers))
+            change = -fixed.multipliers(system.acceleration_residual(t, q, u, free))
+            # What the constraints add to free accelerations is the size that shrinks with the distance. Those of a
+            # light body between heavy ones are off by much more than its acceleration changes.
+            step = fixed.direction(change)
+            return (free + step, multipliers + change), _largest(step, scale) / strength
+
+        (udot, multipliers), _, failed_udot = chord(
+            accelerate,
+            (near.udot, near.multipliers),
+            first=one,
+            tol=tol,
+            most=_ITERATIONS,
+            rate=rate,
+            rounding=100 * rounding,
+            largest=jnp.inf,
+        )
+        return RestoredState(q, u, udot, multipliers, iterations, failed | failed_u | failed_udot)
+
+    def at(self, system, t, q, u):
+        return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
+
+    def multipliers(self, system, t, restored):
+        del system, t
+        assert restored.multipliers is not None, "a projector finds multipliers with the accelerations"
+        return restored.multipliers
+
+    def push_positions(self, at, along):
+        system, t, q = at
+        still = jnp.zeros(system.nu, q.dtype)
+        step = self.cancel_velocities(push(position_rows, at, along))
+        return push(lambda q, step: displaced(system, t, q, step), (q, still), (along[2], step))
+
+    def cancel_velocities(self, residual):
+        return self.projector.displacement(-residual)
+
+    def cancel_accelerations(self, inertia, forces, rows):
+        return self.projector.solve(-forces, -rows)[0]
+
+
+def _largest(values, scale):
+    return jnp.max(jnp.abs(values) / scale)
+
+
+def _nonzero(size):
+    return jnp.where(size > 0, size, 1.0)
 
 
 def project_normalized(system: AbstractEquation, t: Scalar, y: State) -> State:
@@ -73,18 +161,23 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
     u = y.u
     if system.velocity_rank > 0:
         scale = system.velocity_scale()
-        change, passes = u, 1 if system.linear else 3
-        for _ in range(passes):
-            jacobian = system.velocity_jacobian(t, q, u)
-            rows = independent_rows(jacobian, scale, system.velocity_rank)
-            ahead = jacobian[rows] * (scale**2)[None, :]
-            change = ahead.T @ solve_positive(ahead @ jacobian[rows].T, system.velocity_residual(t, q, u)[rows])
-            u = u - change
+        u, change = project_velocities(system, t, q, u, DiagonalInertia(1 / scale**2))
         if not system.linear:
-            size = lambda u: jnp.max(jnp.abs(u) / scale)
-            failed = failed | ~(size(change) <= eps**_MEASURED_SPEED * size(u))
+            failed = failed | ~(_largest(change, scale) <= eps**_MEASURED_SPEED * _largest(u, scale))
     found = dataclasses.replace(y, q=q, u=u)
     return found, failed | ~_is_finite(found)
+
+
+def project_velocities(
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], metric: AbstractInertia
+) -> tuple[Float[Array, "nu"], Float[Array, "nu"]]:
+    """The velocities that satisfy ψ after the smallest change in a metric, and the last correction."""
+    change = u
+    for _ in range(1 if system.linear else 3):
+        jacobian = binding_velocities(system, t, q, u).selected(system.velocity_rank, system.velocity_scale())
+        change = jacobian.projector(metric).displacement(-velocity_rows(system, t, q, u))
+        u = u + change
+    return u, change
 
 
 def _is_finite(y: State) -> Bool[Array, ""]:
@@ -165,10 +258,9 @@ def project_in_metric(
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices.
     q = y.q + (found - before.q)
-    none = jnp.zeros_like(y.u)
-    q = displaced(system, t, q, own.solve(none, -position_rows(system, t, q))[0])
+    q = displaced(system, t, q, own.displacement(-position_rows(system, t, q)))
     here = binding_velocities(system, t, q, y.u).projector(metric_of(system, t, State(q, y.u)), own.factor)
-    u = y.u + here.solve(none, -velocity_rows(system, t, q, y.u))[0]
+    u = y.u + here.displacement(-velocity_rows(system, t, q, y.u))
     return dataclasses.replace(y, q=q, u=u), here, iterations, failed
 
 

@@ -12,26 +12,26 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from .._compat import cond_of_any_lane
 from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels
 from ..linalg.elimination import eliminate, full_pivot
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
-from ..solvers._lanes import cond_of_any_lane
 from ..system import AbstractEquation
 from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
-from .constrained import (
+from .chart import (
+    ChartConstraints,
     ChartIndices,
-    ConstrainedAcceleration,
     coordinate_factor,
     correct_positions,
     general_acceleration,
     ideal_acceleration,
     restore_positions,
-    restore_state,
     shares_split,
 )
+from .constraints import SolvedState, restore
 from .diagnosis import diagnose
 from .impulse import after_impulse
 from .manifold import AbstractManifold, newton_tolerance
@@ -202,9 +202,9 @@ class PartitionTerm(AbstractManifoldTerm):
         system, chart = self.system, linearized_at.chart
         if system.acceleration_rows == 0 or not system.ideal_on_velocities:
             return self._project(t, y, chart, chart.split)
-        before = lax.stop_gradient((linearized_at.y.u, linearized_at.f.u))
-        before = ConstrainedAcceleration(*before, linearized_at.factors)
-        out: Any = restore_state(system, t, y.q, y.u, before, chart.split, self.newton_tol)
+        constraints = ChartConstraints(linearized_at.factors, chart.split)
+        near = SolvedState(constraints, lax.stop_gradient(linearized_at.f.u), None)
+        out: Any = restore(system, t, y, near, self.newton_tol)
         f = State(system.rates(t, out.q, out.u), out.udot)
         chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._compat import WrappedSolver, cond_of_any_lane, direction_of
 from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
@@ -17,15 +18,13 @@ from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
-from ..solvers._lanes import cond_of_any_lane
-from ..solvers._wrapped import WrappedSolver
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
+from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
-from .orthogonal_projection import project_in_metric, project_normalized, projected
-from .restoration import SolvedState, restore_near
+from .orthogonal_projection import ProjectorConstraints, project_in_metric, project_normalized, projected
 from .vector_field import VectorField
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
@@ -179,7 +178,7 @@ class ProjectionTerm(AbstractManifoldTerm):
             )
             out = self._solved(t, y, projector, linearized_at.chart + iterations)
             return out._replace(failed=failed | out.failed)
-        out: Any = restore_near(self.system, t, y, linearized_at.factors, self.newton_tol)
+        out: Any = restore(self.system, t, y, linearized_at.factors, self.newton_tol)
         f = State(self.system.rates(t, out.q, out.u), out.udot)
         return ManifoldEvaluation(State(out.q, out.u), f, linearized_at.chart + out.iterations, out.failed, None)
 
@@ -210,7 +209,8 @@ class ProjectionTerm(AbstractManifoldTerm):
         gamma = -system.acceleration_residual(t, y.q, y.u, jnp.zeros_like(y.u))
         udot, multipliers = projector.solve(system.force(t, y.q, y.u), gamma)
         f = State(system.rates(t, y.q, y.u), udot)
-        return ManifoldEvaluation(y, f, chart, jnp.array(False), SolvedState(y.q, projector, udot, multipliers))
+        solved = SolvedState(ProjectorConstraints(y.q, projector), udot, multipliers)
+        return ManifoldEvaluation(y, f, chart, jnp.array(False), solved)
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)
@@ -239,7 +239,7 @@ class ProjectedSolver(WrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        direction = getattr(terms, "direction", 1)
+        direction = direction_of(terms)
         if made_jump is not False:
             y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)

@@ -10,7 +10,7 @@ from .vector_field import VectorField
 
 
 class Unconstrained(AbstractManifold):
-    """Integrate all coordinates and leave the constraints to themselves.
+    """Integrate all coordinates, and constraints on the level of accelerations only.
 
     The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
     that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.

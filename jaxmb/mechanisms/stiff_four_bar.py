@@ -56,7 +56,7 @@ def stiff_four_bar(
         description="Planar four-bar linkage with a stiff, lightly damped bushing for a ground pivot, under gravity.",
         references=References.load("stiff_four_bar"),
         fix={name: float(rigid.state.q[coordinates[name][0]]) for name in angles},
-        rates={name: float(rigid.state.u[rates[name][0]]) for name in angles},
+        rates={name: float(rigid.state.u[rates[f"{name}_rate"][0]]) for name in angles},
     )
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._compat import with_values
 from .._types import Scalar
 from ..linalg.arrays import namespace
 from . import checks, fields
@@ -100,10 +101,7 @@ class AbstractPart(eqx.Module):
 
     def with_fields(self, **values: Any) -> Self:
         """A copy with some fields replaced."""
-        out = object.__new__(type(self))
-        for field, value in (fields.values_of(self) | values).items():
-            object.__setattr__(out, field, value)
-        return out
+        return with_values(self, fields.values_of(self) | values)
 
 
 @functools.cache
@@ -175,7 +173,45 @@ class AbstractLaw(eqx.Module):
         checks.check_kinds(self, type(self).__name__)
 
 
-class AbstractLink(AbstractPart):
+class AbstractActor(AbstractPart):
+    """A part that acts on bodies, or on frames that are fixed in them.
+
+    Its kernels see the poses and velocities of the frames, and the wrenches that they return act on these. A scene
+    fills in the `body_frames`, by the number of the body, `"0"` the first; none where the part names the body itself.
+    """
+
+    body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        out = super().__new__(cls, *args, **kwargs)
+        # Here, so that parts with an `__init__` of their own have it as well.
+        object.__setattr__(out, "body_frames", {})
+        return out
+
+    def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
+        """The poses that the kernels see, from those of the bodies."""
+        return type(self)._on_frames(self, lambda frame, x: frame.pose(space, x), poses)
+
+    def seen(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> tuple[Poses, Velocities]:
+        """The poses and velocities that the kernels see, from those of the bodies."""
+        seen = self._on_frames(lambda frame, x, v: frame.velocity(space, x, v), poses, velocities)
+        return self.seen_poses(space, poses), seen
+
+    def wrenches_on_bodies(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
+        """The wrenches on the bodies that are equivalent to those that the kernels return."""
+        return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
+
+    def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
+        """The last of some rows of bodies, with `of_frame(frame, …)` in its place where there is a frame."""
+        frames = self.body_frames
+        if not frames:
+            return rows[-1]
+        own = enumerate(zip(*rows, strict=True))
+        out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in own]
+        return namespace(*out).stack(out)
+
+
+class AbstractLink(AbstractActor):
     """A part that acts between bodies, `bodies`."""
 
     bodies = _Bodies()
@@ -193,6 +229,10 @@ class AbstractLink(AbstractPart):
         """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""
         del space, poses
         return {}
+
+    def coordinates_at(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
+        """The coordinates at these poses of the bodies."""
+        return type(self).coordinates(self, space, self.seen_poses(space, poses))
 
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
         """A checked copy with every number filled in; world points and axes become body-fixed at the given poses."""
@@ -218,15 +258,13 @@ class AbstractLink(AbstractPart):
         del parts
         return ()
 
-    def wrapped(self, wrap: Callable[["AbstractLink"], "AbstractLink"]) -> "AbstractLink":
-        """Hook: what `wrap` makes of the part whose kernel sees the poses of the bodies, usually this one."""
-        return wrap(self)
-
     def anchor(self, k: int) -> Array | None:
         """The part's point [m] on its k-th body, in that body's frame; None if it has none."""
         for name, own in fields.declarations(type(self)).items():
-            if own.is_point and own.body == k and getattr(self, name) is not None:
-                return getattr(self, name)
+            point = getattr(self, name) if own.is_point and own.body == k else None
+            if point is not None:
+                frame = self.body_frames.get(str(k))
+                return point if frame is None else frame.point(point)
         return None
 
     def pictured(self, space: AbstractSpace) -> Self:
@@ -385,7 +423,7 @@ class AbstractDynamicForce(AbstractForce):
         return {}
 
 
-class AbstractNonIdeal(AbstractPart):
+class AbstractNonIdeal(AbstractActor):
     """A non-ideal constraint force: it does virtual work.
 
     `joint` is the joint's name. The joint exerts its reactions and this force. The force may depend on the reactions,
@@ -411,6 +449,10 @@ class AbstractNonIdeal(AbstractPart):
         """Hook: a copy with omitted numbers computed from its joint; see `filled`."""
         del space, joint, poses
         return self
+
+    def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
+        """The wrenches that the kernel sees, from those on the bodies of the joint."""
+        return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
 
     @abc.abstractmethod
     def wrenches(
@@ -470,12 +512,12 @@ def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
 
 def rows_of(part: Any, space: AbstractSpace, poses: Poses) -> Array:
     """Jacobian of a constraint with respect to the velocities of its bodies, (rows, k, velocity size)."""
-    velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
+    velocities, t = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype), jnp.zeros((), poses.dtype)
     if isinstance(part, AbstractVelocityConstraint):
-        return jax.jacfwd(lambda v: part.residual(space, poses, v, jnp.zeros((), poses.dtype)))(velocities)
+        return jax.jacfwd(lambda v: part.residual(space, *part.seen(space, poses, v), t))(velocities)
 
     def rate(v):
         rates = jax.vmap(space.rates)(poses, v)
-        return jax.jvp(lambda x: part.residual(space, x, jnp.zeros((), poses.dtype)), (poses,), (rates,))[1]
+        return jax.jvp(lambda x: part.residual(space, part.seen_poses(space, x), t), (poses,), (rates,))[1]
 
     return jax.jacfwd(rate)(velocities)

@@ -67,7 +67,7 @@ class AbstractCombination(AbstractOfSources):
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
         own = enumerate(zip(self.within, self.places, strict=True))
-        return [self.joints[str(k)].coordinates(space, poses[np.array(at)])[w].reshape(()) for k, (w, at) in own]
+        return [self.joints[str(k)].coordinates_at(space, poses[np.array(at)])[w].reshape(()) for k, (w, at) in own]
 
     def is_periodic(self, k: int) -> bool:
         """Whether a coordinate is an angle known up to full turns."""

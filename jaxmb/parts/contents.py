@@ -6,13 +6,14 @@ from typing import Any
 
 import equinox as eqx
 
+from .._compat import with_values
 from .fields import Declaration, declarations, field_names, values_of
 
 
 def anonymous(part: Any) -> Any:
     """The part without the names that distinguish stacked parts, and without the initial guess of bodies."""
     declared, values = declarations(type(part)), values_of(part)
-    out = object.__new__(type(part))
+    out = {}
     for field in field_names(type(part)):
         value, kind = values[field], declared[field].kind if field in declared else None
         if kind in ("identity", "body"):
@@ -25,8 +26,8 @@ def anonymous(part: Any) -> Any:
             value = None if value is None else anonymous(value)
         elif kind == "parts":
             value = {key: anonymous(own) for key, own in value.items()}
-        object.__setattr__(out, field, value)
-    return out
+        out[field] = value
+    return with_values(part, out)
 
 
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -46,14 +47,13 @@ def _fields_of_parts(cls: type) -> tuple[str, ...]:
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
-    """The paths of keys to the internal states of a part, or of the part that it puts on frames, by their names."""
+    """The paths of keys to the internal states of a part, by their names."""
     found = {}
-    for prefix, own in (((), part), *inner_parts(part)):
-        for name, declared in declarations(type(own)).items():
-            if declared.kind == "internal" and getattr(own, name) is not None:
-                found[name] = (*prefix, name)
-            elif declared.kind == "internals":
-                found |= {key: (*prefix, name, key) for key in getattr(own, name)}
+    for name, declared in declarations(type(part)).items():
+        if declared.kind == "internal" and getattr(part, name) is not None:
+            found[name] = (name,)
+        elif declared.kind == "internals":
+            found |= {key: (name, key) for key in getattr(part, name)}
     return found
 
 

@@ -130,7 +130,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
                 )
             if quantity not in allowed:
                 listed = [self._called(f"{source}.{own}") for own in allowed]
-                raise ValueError(f"{self.label}: {unknown('quantity', self._called(name), listed)}")
+                raise unknown("quantity", self._called(name), listed, self.label)
 
     def _called(self, name):
         """The name of a quantity, with that of its source in place of the number."""
@@ -143,7 +143,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
     def _known(self, source, space):
         if self._is_joint(source):
             poses = jnp.tile(space.prepare(np.asarray(space.ground)), (len(dict(self.places)[source]), 1))
-            return list(jax.eval_shape(lambda x: self.held[source].coordinates(space, x), poses))
+            return list(jax.eval_shape(lambda x: self.held[source].coordinates_at(space, x), poses))
         return [name for name, dimension in _OF_BODIES.items() if dimension in (None, space.dimension)]
 
     def wrenches(self, space, poses, velocities, t):
@@ -191,7 +191,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     def _coordinate(self, space, poses, name):
         source, quantity = name.split(".")
-        return self.held[source].coordinates(space, poses[np.array(dict(self.places)[source])])[quantity]
+        return self.held[source].coordinates_at(space, poses[np.array(dict(self.places)[source])])[quantity]
 
     def _measured(self, space, poses, velocities, name):
         source, quantity = name.split(".")

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._compat import default_float, is_weakly_typed
 from ..linalg.arrays import is_traced
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
@@ -114,8 +115,7 @@ def as_parameter(value: Any) -> Any:
 
     **Raises:** `ValueError` for anything but a real number or an array of real numbers.
     """
-    # Much faster than `jnp.result_type`, which counts for thousands of parts.
-    dtype = jax.dtypes.canonicalize_dtype(float)
+    dtype = default_float()
     if is_traced(value):
         return jnp.asarray(value, dtype)
     given = np.asarray(value) if not isinstance(value, dict) else np.array(None)
@@ -129,7 +129,7 @@ def as_parameter(value: Any) -> Any:
 
 def as_jax(value: Any) -> Array:
     """The same as a JAX array, which tracers can index."""
-    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not value.aval.weak_type:
+    if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not is_weakly_typed(value):
         return value
     value = as_parameter(value)
     return value if isinstance(value, Array) else jax.device_put(value)

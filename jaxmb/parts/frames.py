@@ -126,7 +126,7 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
         if name in path:
             raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
         if frame.body not in (*given, *known, GROUND):
-            raise ValueError(f"{frame.label}: {unknown('body', frame.body, [*known, GROUND, *given])}")
+            raise unknown("body", frame.body, [*known, GROUND, *given], frame.label)
         based(frame.body, (*path, name))
         frame.check(bodies[0].dimension)
         out[name] = frame.with_fields(base=out.get(frame.body))

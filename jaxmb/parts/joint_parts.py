@@ -58,7 +58,7 @@ class AbstractCoordinatePart(AbstractLink):
 
     def measured(self, space, poses) -> Float[Array, "n"]:
         """The coordinate, raveled."""
-        return self.joint.coordinates(space, poses)[self.within].reshape(-1)
+        return self.joint.coordinates_at(space, poses)[self.within].reshape(-1)
 
     def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """The coordinate and its rate, raveled."""
@@ -89,13 +89,13 @@ class AbstractCoordinatePart(AbstractLink):
 
 def given_coordinate(part: AbstractLink, joint: Any, coordinate: str, space: Any, poses: Any) -> np.ndarray:
     """A joint's coordinate at the given poses; an error of the part if there is none of this name."""
-    known = joint.coordinates(space, poses)
+    known = joint.coordinates_at(space, poses)
     name, _, within = coordinate.partition(".")
     if within not in known:
         names = [f"{name}.{own}" for own in known]
         if not names:
             raise ValueError(f"{part.label}: {joint.label} has no coordinate of its own.")
-        raise ValueError(f"{part.label}: {unknown('coordinate', coordinate, names)}")
+        raise unknown("coordinate", coordinate, names, part.label)
     return np.asarray(known[within])
 
 

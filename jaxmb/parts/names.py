@@ -16,9 +16,12 @@ class UnknownNameError(ValueError, KeyError):
     __str__ = ValueError.__str__
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """An error for an unknown name, with the nearest known ones; of `"rod.phi"` with all names of `"rod"`."""
-    return UnknownNameError(f"Unknown {what} {name!r}{_hint(name, known)}")
+def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> UnknownNameError:
+    """An error for an unknown name, with the nearest known ones; of `"rod.phi"` with all names of `"rod"`. `where`:
+    the part or argument that has the name.
+    """
+    lead = f"{where}: " if where else ""
+    return UnknownNameError(f"{lead}Unknown {what} {name!r}{_hint(str(name), known)}")
 
 
 def _hint(name: str, known: Iterable[str]) -> str:

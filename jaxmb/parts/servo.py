@@ -59,8 +59,5 @@ class Servo(AbstractLink):
         """Φ of the program."""
         return self.program.residual(space, poses, t)
 
-    def wrapped(self, wrap):
-        return self.with_fields(program=wrap(self.program))
-
     def complete(self, space, poses):
         return self.with_fields(program=self.program.resolve(space, poses))

@@ -8,6 +8,6 @@ from .formulations import (
 )
 from .left_out import LeftOut as LeftOut, Measured as Measured, left_out as left_out
 from .method_costs import MethodCost as MethodCost, MethodCosts as MethodCosts, method_costs as method_costs
-from .stability import KINDS as KINDS, Case as Case, Stability as Stability, stability as stability
+from .stress_test import KINDS as KINDS, Case as Case, StressTest as StressTest, stress_test as stress_test
 from .timing import interleaved as interleaved, timed_compile as timed_compile
 from .work_precision import Run as Run, WorkPrecision as WorkPrecision, work_precision as work_precision

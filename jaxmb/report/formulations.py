@@ -14,7 +14,7 @@ from jax import lax
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
 from ..formulations.formulation import row_levels, solve_constrained
-from ..linalg.elimination import PivotOrder, eliminate, full_pivot
+from ..linalg.elimination import PivotOrder, full_pivot
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
@@ -137,7 +137,7 @@ def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: 
     jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         matrix = jacobian.dense().matrix
-        jacobian = DenseJacobian(matrix, eliminate(matrix, order, system.acceleration_rank))
+        jacobian = DenseJacobian(matrix).eliminated(order, system.acceleration_rank)
     return solve_constrained(system, formulation, t, y.q, y.u, jacobian)[0]
 
 

@@ -162,7 +162,7 @@ class _InTime(AbstractConstraint):
         return self.part.rows
 
     def residual(self, space, poses, t):
-        return self.part.residual(space, poses, t) + self.amplitude * jnp.sin(t)
+        return self.part.residual(space, self.part.seen_poses(space, poses), t) + self.amplitude * jnp.sin(t)
 
 
 class _Rate(AbstractVelocityConstraint):
@@ -181,4 +181,5 @@ class _Rate(AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         rates, t = jax.vmap(space.rates)(poses, velocities), jnp.asarray(t, poses.dtype)
-        return jax.jvp(lambda t, x: self.part.residual(space, x, t), (t, poses), (jnp.ones_like(t), rates))[1]
+        residual = lambda t, x: self.part.residual(space, self.part.seen_poses(space, x), t)
+        return jax.jvp(residual, (t, poses), (jnp.ones_like(t), rates))[1]

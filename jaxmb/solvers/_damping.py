@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 from numpy.typing import NDArray
 
+from .._compat import sequential_vmap
 from ._formulas import FAMILIES
 from .stability import boundary_locus, formula, spectral_radius
 
@@ -57,7 +58,7 @@ def sectors(family: str) -> NDArray[np.float64]:
 
 
 # Members of a batch are treated one after the other; see `jaxmb.linalg`.
-@jax.custom_batching.sequential_vmap
+@sequential_vmap
 def _lapack_eigenvalues(matrix):
     return jnp.linalg.eigvals(matrix)
 

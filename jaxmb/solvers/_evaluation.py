@@ -4,17 +4,18 @@ diffrax wraps the terms of a solver so that time always increases; derivatives h
 States are raveled: one vector of all components.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from diffrax._term import AdjointTerm, WrapTerm  # diffrax puts these around terms, but does not export them
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .manifold_term import AbstractFieldJacobian, AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .._compat import direction_of, inner_term, unwrapped
+from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):
@@ -29,8 +30,7 @@ class Evaluation(NamedTuple):
 
 def check_term(term: Any) -> None:
     """Raise a `ValueError` unless `term` is an ordinary differential equation."""
-    while isinstance(term, (WrapTerm, AdjointTerm)):
-        term = term.term
+    term = unwrapped(term)
     if not isinstance(term, (diffrax.ODETerm, AbstractManifoldTerm)):
         raise ValueError(
             f"Multistep methods integrate a single `diffrax.ODETerm` or `AbstractManifoldTerm`, but got a "
@@ -68,13 +68,13 @@ def derivative(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
 def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None:
     """A chart at `y`, or `None` for a plain vector field."""
     manifold = _manifold(term)
-    return None if manifold is None else freeze(manifold.init_chart(t * term.direction, y, args))
+    return None if manifold is None else freeze(manifold.init_chart(t * direction_of(term), y, args))
 
 
 def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
     """The same chart, or a better one at `y`; `None` for a plain vector field."""
     manifold = _manifold(term)
-    return None if manifold is None else freeze(manifold.update_chart(t * term.direction, y, chart, args))
+    return None if manifold is None else freeze(manifold.update_chart(t * direction_of(term), y, chart, args))
 
 
 def refused(term: Any, chart: Chart | None) -> Any:
@@ -86,7 +86,7 @@ def refused(term: Any, chart: Chart | None) -> Any:
 def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
     """The state just after a jump; `y` for a plain vector field."""
     manifold = _manifold(term)
-    return y if manifold is None else manifold.after_jump(t * term.direction, y, args)
+    return y if manifold is None else manifold.after_jump(t * direction_of(term), y, args)
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
@@ -94,7 +94,7 @@ def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart |
     manifold = _manifold(term)
     if manifold is None:
         return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.evaluate(t * term.direction, unravel_like(like, flat), chart, args)
+    out = manifold.evaluate(t * direction_of(term), unravel_like(like, flat), chart, args)
     return _raveled(term, out, flat.dtype)
 
 
@@ -106,14 +106,21 @@ def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Ev
     manifold = _manifold(term)
     if manifold is None or before.of_manifold is None:
         return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.project_near(t * term.direction, unravel_like(like, flat), before.of_manifold, args)
+    out = manifold.project_near(t * direction_of(term), unravel_like(like, flat), before.of_manifold, args)
     return _raveled(term, out, flat.dtype)
 
 
-def field_jacobian(term: Any, t: Any, flat: Array, like: PyTree[Array], args: Args) -> AbstractFieldJacobian | None:
-    """The derivative of a vector field that knows its structure, in the direction of time of the term; else None."""
-    manifold = _manifold(term)
-    return None if manifold is None else manifold.jacobian(t * term.direction, unravel_like(like, flat), args)
+def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[[Array], Any]:
+    """`y -> (J, direction)` for raveled states, a pytree: the derivative of a vector field that knows its structure, in
+    the time of the term, and the direction of that time; None instead of both if the term knows none.
+    """
+    return eqx.Partial(_jacobian, term, t, like, args)
+
+
+def _jacobian(term, t, like, args, flat):
+    manifold, direction = _manifold(term), direction_of(term)
+    own = None if manifold is None else manifold.jacobian(t * direction, unravel_like(like, flat), args)
+    return None if own is None else (own, jnp.asarray(direction))
 
 
 def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: Args) -> Any:
@@ -127,7 +134,7 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
 
     def constrained(t, flat):
         assert manifold is not None
-        out = manifold.project_cold(t * term.direction, unravel_like(like, flat), chart, args)
+        out = manifold.project_cold(t * direction_of(term), unravel_like(like, flat), chart, args)
         out = _raveled(term, out, flat.dtype)
         return (out.y, out.f), (out.chart, out.failed)
 
@@ -147,7 +154,7 @@ def _evaluate_plain(term, t, flat, like, args):
 
 def _raveled(term, out: ManifoldEvaluation, dtype):
     chart, factors = freeze((out.chart, out.factors))
-    f = ravel(out.f, dtype) * jnp.asarray(term.direction).astype(dtype)
+    f = ravel(out.f, dtype) * jnp.asarray(direction_of(term)).astype(dtype)
     return Evaluation(ravel(out.y, dtype), f, chart, out.failed, out._replace(chart=chart, factors=factors))
 
 
@@ -158,7 +165,8 @@ def controlled_components(term: Any, chart: Chart | None) -> Array | None:
 
 
 def _manifold(term: Any) -> AbstractManifoldTerm | None:
-    return term.term if isinstance(term.term, AbstractManifoldTerm) else None
+    inner = inner_term(term)
+    return inner if isinstance(inner, AbstractManifoldTerm) else None
 
 
 def freeze(tree: Any) -> Any:

@@ -5,11 +5,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
+
+from .._compat import any_of_batch
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -57,7 +58,7 @@ def probed_derivatives(
     wrong = jnp.abs(change - expected)
     rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
     contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
-    lax.cond(eqxi.unvmap_any(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
+    lax.cond(any_of_batch(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
     return jax.tree.map(lambda x: x[0], both)
 
 
@@ -75,21 +76,21 @@ def filled(tangent: Array | None, primal: Array) -> Array:
 
 
 def linearized(
-    field: Field,
-    dfield: Field,
-    t: Array,
-    dt: Array | None,
+    equation: Any,
+    along: Any,
     place: Callable[[Float[Array, " free"]], Float[Array, " n"]],
     still: Float[Array, " free"],
     f: Float[Array, " n"],
 ) -> tuple[Any, Callable[[Float[Array, " free"]], Any]]:
-    """The derivatives of `(y, f, g)` at `y = place(still)`. Of g they are those for a held rate `f`: the rest of its
-    change is J times the change of the rate.
+    """The derivatives of `(y, f, g)` of the field of a step's equation at `y = place(still)`. Of g they are those for a
+    held rate `f`: the rest of its change is J times the change of the rate.
+
+    **Arguments:** `equation`, with a `field` and a time `t`; `along`: a tangent of it.
 
     **Returns:** the changes by the tangents of the field and of time, and the change as a linear function of that of
     `still`.
     """
-    values, structure = eqx.partition(field, eqx.is_inexact_array)
+    t, (values, structure) = equation.t, eqx.partition(equation.field, eqx.is_inexact_array)
 
     def at(values, t, change):
         (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, place(change), has_aux=True)
@@ -97,6 +98,6 @@ def linearized(
 
     _, push = jax.linearize(at, values, t, still)
     none = lambda x: x is None
-    dvalues = jax.tree.map(lambda v, d: None if v is None else filled(d, v), values, dfield, is_leaf=none)
+    dvalues = jax.tree.map(lambda v, d: None if v is None else filled(d, v), values, along.field, is_leaf=none)
     zeros = jax.tree.map(jnp.zeros_like, (values, t))
-    return push(dvalues, filled(dt, t), jnp.zeros_like(still)), lambda change: push(*zeros, change)
+    return push(dvalues, filled(along.t, t), jnp.zeros_like(still)), lambda change: push(*zeros, change)

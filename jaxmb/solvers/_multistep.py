@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import any_of_batch, from_controller
 from ._evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
 from ._order import StepEstimate, refuse
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
@@ -178,7 +178,7 @@ def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], An
             f"`{solver}` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
         )
     if rtol is None:
-        return diffrax.with_stepsize_controller_tols(Tolerances)()  # pyright: ignore[reportArgumentType]
+        return from_controller(Tolerances)
     return Tolerances(rtol, atol, norm, fixed=True)
 
 
@@ -191,4 +191,4 @@ def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree)
         return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart(), state)
 
     # In a batch the restart is evaluated if any member has made a jump.
-    return lax.cond(eqxi.unvmap_any(made_jump), restarted, lambda: state)
+    return lax.cond(any_of_batch(made_jump), restarted, lambda: state)

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import WrappedSolver, with_loops
 from ._evaluation import ravel, unravel_like
 from ._multistep import AbstractMultistep
 from ._scales import RunningScales
 from ._tangent import Tangent, TangentControl, pushed, pushed_only
 from ._tolerances import MultistepNorm, Tolerances
-from ._wrapped import WrappedSolver, with_loops
 
 
 class WithTangents(WrappedSolver):
@@ -29,11 +29,11 @@ class WithTangents(WrappedSolver):
 
     @property
     def inner(self) -> Any:
-        return self._whole(self.scan_kind)
+        return self.with_own_loops(self._whole)
 
-    def _whole(self, kind):
-        solver = self.solver if self.outer is None else eqx.tree_at(lambda s: s.solver, self.outer, self.solver)
-        return with_loops(solver, kind)
+    @property
+    def _whole(self) -> Any:
+        return self.solver if self.outer is None else eqx.tree_at(lambda s: s.solver, self.outer, self.solver)
 
     def init(self, terms, t0, t1, y0, args):
         start = lambda terms, y0: self.inner.init(terms, t0, t1, y0, args)
@@ -51,7 +51,7 @@ class WithTangents(WrappedSolver):
         of_terms = self.control.of_terms(terms)
         along = tuple((of, unravel_like(y0, x.w), x.memory) for of, x in zip(of_terms, before, strict=True))
         # Loops over stages in the form of the adjoint have no forward derivatives.
-        out, along = pushed(step(self._whole("lax")), (terms, y0, state), along, step(self.inner))
+        out, along = pushed(step(with_loops(self._whole, "lax")), (terms, y0, state), along, step(self.inner))
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
         for tangent, (dy1, derror, _, memory, _) in zip(before, along, strict=True):

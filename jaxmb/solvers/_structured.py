@@ -12,7 +12,7 @@ Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (gene
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,11 +20,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._compat import cond_of_any_lane
 from ._damping import eigenvalues
-from ._evaluation import field_jacobian, freeze
-from ._field import Field, filled, linearized
-from ._lanes import cond_of_any_lane
-from ._linearization import AbstractLinearization
+from ._evaluation import freeze
+from ._field import Field, filled, linearized, probed_derivatives
+from ._newton import AbstractLinearization, StepEquation
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 
 # Steps of Arnoldi's method for the spectrum.
@@ -79,7 +79,6 @@ class StructuredLinearization(AbstractLinearization):
     direction: Float[Array, ""]
     spectrum: Complex[Array, " k"]
     renewals: Int[Array, ""]
-    is_structured: ClassVar[bool] = True
 
     @property
     def patience(self) -> int:
@@ -89,15 +88,22 @@ class StructuredLinearization(AbstractLinearization):
     def slow(self) -> float:
         return _SLOW
 
-    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> StructuredInverses:
-        del free
+    def probed(self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None):
+        return probed_derivatives(field, t, y, size, along=True)
+
+    def renewed(self, equation: StepEquation, y: Float[Array, " n"], rate: Float[Array, " n"]):
+        del rate
+        return structured(equation.jacobian, y)
+
+    def inverses(self, equation: StepEquation) -> StructuredInverses:
+        a, b = equation.a, equation.b
         # The roots are complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
         product, least = -b - a**2 / 4, a**2 / 1000
         r = lax.complex(a / 2, jnp.sqrt(jnp.maximum(product, least)))
         return StructuredInverses(self.jacobian.resolvent(r * self.direction.astype(r.dtype)), a, b, r)
 
-    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> StructuredInverses:
-        shapes = eqx.filter_eval_shape(self.inverses, a, b, free)
+    def no_inverses(self, equation: StepEquation) -> StructuredInverses:
+        shapes = eqx.filter_eval_shape(self.inverses, equation)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def observed(self, inverses: StructuredInverses, anew: Bool[Array, ""]) -> "StructuredLinearization":
@@ -108,9 +114,9 @@ class StructuredLinearization(AbstractLinearization):
     def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change
 
-    def correction(self, inverses: StructuredInverses, offset, f, g, along, b, free):
-        del free
-        mismatch, lag = offset - inverses.a * along - b * g, along - f
+    def correction(self, inverses: StructuredInverses, equation: StepEquation, y, f, g, along):
+        b = equation.b
+        mismatch, lag = y - equation.past - inverses.a * along - b * g, along - f
         mismatch, lag = lax.map(self.jacobian.project, jnp.stack([mismatch, lag]))
         change, rate = inverses.solve(mismatch, lag)
         # f at y - change; with it y - change = past + a f + b g along the manifold.
@@ -118,7 +124,7 @@ class StructuredLinearization(AbstractLinearization):
         g = g - (change - mismatch - inverses.a * (lag + rate)) / b
         return change, change, corrected, g
 
-    def errors(self, inverses: StructuredInverses, changes: Float[Array, "formulas n"], free: Int[Array, " free"]):
+    def errors(self, inverses: StructuredInverses, free: Int[Array, " free"], changes: Float[Array, "formulas n"]):
         del free
 
         def error(change):
@@ -127,15 +133,29 @@ class StructuredLinearization(AbstractLinearization):
 
         return lax.map(error, changes)
 
+    def differentiable(self, inverses: StructuredInverses, equation: StepEquation, end: tuple[Array, Array, Array]):
+        return _differentiable(end, equation, self, inverses)
 
-def structured(term: Any, t: Any, y: Float[Array, " n"], like: Any, args: Any) -> StructuredLinearization | None:
+
+def structured(jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]) -> StructuredLinearization | None:
     """The linearisation of a term that knows the structure of its Jacobian, without its spectrum; else None."""
-    jacobian = field_jacobian(term, t, y, like, args)
-    if jacobian is None:
+    known = jacobian(y)
+    if known is None:
         return None
-    direction = jnp.asarray(term.direction).astype(y.dtype)
+    own, direction = known
     spectrum = lax.complex(*[jnp.zeros(_ARNOLDI, y.dtype)] * 2)
-    return freeze(StructuredLinearization(jacobian, direction, spectrum, jnp.array(0, jnp.int32)))
+    return freeze(StructuredLinearization(own, direction.astype(y.dtype), spectrum, jnp.array(0, jnp.int32)))
+
+
+def unknown_structure(
+    jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]
+) -> StructuredLinearization | None:
+    """Zeros of a term that knows the structure of its Jacobian, and that the first step computes its own; else None."""
+    shapes = eqx.filter_eval_shape(structured, jacobian, y)
+    if shapes is None:
+        return None
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return eqx.tree_at(lambda matrix: matrix.renewals, zeros, jnp.asarray(1, jnp.int32))
 
 
 def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -> Complex[Array, " k"]:
@@ -176,28 +196,24 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
 
 
 @eqx.filter_custom_jvp
-def differentiable(
+def _differentiable(
     end: tuple[Array, Array, Array],
-    field: Field,
-    t: Any,
-    past: Float[Array, " n"],
-    a: Any,
-    b: Any,
+    equation: StepEquation,
     matrix: StructuredLinearization,
     inverses: StructuredInverses,
 ) -> tuple[Array, Array, Array]:
     """`(y, f, g)` at the `end` of a step, a projection of `past + a f + b g`, with its derivatives."""
-    del field, t, past, a, b, matrix, inverses
+    del equation, matrix, inverses
     return end
 
 
-@differentiable.def_jvp
+@_differentiable.def_jvp
 def _differentiable_jvp(primals, tangents):
-    _, field, t, past, a, b, matrix, inverses = primals
-    _, dfield, dt, dpast, da, db, _, _ = tangents
-    y, f, g = differentiable(*primals)
+    _, equation, matrix, inverses = primals
+    of_equation, a, b = tangents[1], equation.a, equation.b
+    y, f, g = _differentiable(*primals)
     matrix, inverses = freeze((matrix, inverses))
-    moved, along = linearized(field, dfield, t, dt, lambda change: y + change, jnp.zeros_like(y), f)
+    moved, along = linearized(equation, of_equation, lambda change: y + change, jnp.zeros_like(y), f)
 
     def twice(change):
         """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
@@ -214,7 +230,8 @@ def _differentiable_jvp(primals, tangents):
         return change - a * rate - b * acceleration
 
     acceleration = moved[2] + along(moved[1])[1]
-    load = filled(dpast, past) + filled(da, a) * f + filled(db, b) * g + a * moved[1] + b * acceleration
+    past = filled(of_equation.past, equation.past)
+    load = past + filled(of_equation.a, a) * f + filled(of_equation.b, b) * g + a * moved[1] + b * acceleration
 
     project = matrix.jacobian.project
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import with_inner
 from ._evaluation import freeze
 
 # The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
@@ -50,7 +51,7 @@ class TangentControl(eqx.Module):
         none = jax.tree.map(lambda _: None, terms)
         if self.direction is None:
             return (none,)
-        return none, eqx.tree_at(lambda terms: (terms.term, terms.direction), terms, (self.direction, None))
+        return none, with_inner(terms, self.direction, None)
 
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""

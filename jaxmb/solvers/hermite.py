@@ -14,17 +14,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._damping import is_resolved
-from ._evaluation import field_of, free_components, freeze, next_chart, ravel, unravel_like
-from ._field import derivatives, probed_derivatives
+from ._dense import DenseLinearization
+from ._evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
+from ._field import derivatives
 from ._formulas import FAMILIES, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
-from ._implicit import Linearization, Solved, differentiable, linearize, solve
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
-from ._linearization import AbstractLinearization
 from ._multistep import AbstractMultistep, tolerances_of
 from ._neighbours import a_stable, damped_growth, ladder, responses
+from ._newton import AbstractLinearization, Newton, Solved, StepEquation
 from ._order import LOWER, choose_order, growth_factors
-from ._structured import differentiable as differentiable_projection, structured
+from ._structured import unknown_structure
 from ._tangent import Tangent, TangentControl
 from ._tolerances import Tolerances
 from .controller import ControllerState
@@ -198,10 +198,11 @@ class Hermite(AbstractMultistep):
         family, flat = FAMILIES[self.family], ravel(y0)
         field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
         free = free_components(terms, flat, chart)
-        matrix = self._no_matrix(terms, t0, y0, args, free)
+        known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
+        matrix = DenseLinearization.unknown(flat, free) if known is None else known
         if before is None:
             size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
-            first = probed_derivatives(field, t0, flat, size, along=matrix.is_structured)
+            first = matrix.probed(field, t0, flat, size)
         else:
             first = derivatives(field, t0, flat)
         chart, failed = first.rest
@@ -227,19 +228,6 @@ class Hermite(AbstractMultistep):
         index = jnp.asarray(1, np.int32)
         sizes = self._first_sizes(flat, f, before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
-
-    @staticmethod
-    def _no_matrix(terms, t, y, args, free) -> AbstractLinearization:
-        """Zeros, and that the first step computes its own."""
-        flat = ravel(y)
-        known = eqx.filter_eval_shape(structured, terms, t, flat, y, args)
-        if known is not None:
-            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), known)
-            first = zeros.direction + jnp.asarray(terms.direction).astype(flat.dtype), jnp.asarray(1, jnp.int32)
-            return eqx.tree_at(lambda matrix: (matrix.direction, matrix.renewals), zeros, first)
-        none = jnp.zeros((flat.size, free.size), flat.dtype)
-        spectrum = lax.complex(*[jnp.zeros(free.size, flat.dtype)] * 2)
-        return Linearization(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
 
     @staticmethod
     def _memory(state):
@@ -272,12 +260,11 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         latest = before, state.slope[-n:]
-        newton = self._newton(terms, field, t1, h, past, a, b, predicted, latest, free, state.matrix, scale, like, args)
-        if newton.matrix.is_structured:
-            solved = newton.matrix, newton.inverses
-            y, f, g = differentiable_projection(newton.end[:3], field, t1, past, a, b, *solved)
-        else:
-            y, f, g = differentiable(newton.end[:3], field, t1, past, a, b, free)
+        equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, h, past, a, b, free)
+        frozen, scale, predicted, latest, matrix = freeze((equation, scale, predicted, latest, state.matrix))
+        size = lambda correction: self._size(correction, scale, like)
+        newton = Newton(frozen, size, _NEWTON).solve(predicted, latest, matrix)
+        y, f, g = newton.matrix.differentiable(newton.inverses, equation, newton.end[:3])
         chart, broke = newton.end.rest
 
         ends = coefficients.past @ history.differences[:, :n]
@@ -363,16 +350,6 @@ class Hermite(AbstractMultistep):
         }
         return y1, estimate, dense_info, new_state, failed
 
-    def _newton(self, terms, field, t, h, past, a, b, predicted, before, free, matrix, scale, like, args) -> Solved:
-        field, t, h, past, a, b, predicted, before = freeze((field, t, h, past, a, b, predicted, before))
-        matrix, scale = freeze((matrix, scale))
-        size = lambda correction: self._size(correction, scale, like)
-        if matrix.is_structured:
-            renew = lambda y, rate: structured(freeze(terms), t, y, like, freeze(args))
-        else:
-            renew = lambda y, rate: linearize(field, t, y, rate, h, free)
-        return solve(field, t, past, a, b, predicted, before, free, matrix, size, _NEWTON, renew)
-
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.
 
@@ -384,7 +361,7 @@ class Hermite(AbstractMultistep):
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
-        errors = matrix.errors(inverses, changes, free)
+        errors = matrix.errors(inverses, free, changes)
         return jnp.stack([self._size(error, scale, like) for error in errors])
 
     def _recorded(self, y, f, g):

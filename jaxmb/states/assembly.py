@@ -17,9 +17,10 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.quantities import directions, rates_of
 from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
-from .held_coordinates import holding, internal_states, prescribe, split_names
+from .held_coordinates import holding, internal_states, prescribe, split_names, split_rates
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
@@ -46,9 +47,10 @@ def assemble(
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
         of a joint's own; and values of internal states, `{"motor.torque": 2.0}`. Other internal states are those of the
         guess.
-    - `rates`: rates that must have these values, by name: `{"crank.angle": 2.0}`, also of a joint's own coordinates; in
-        space `"body.angular_velocity"` (body frame) and `"body.velocity"`; for a `LagrangianSystem` names of
-        coordinates, or `u0`, `u1`, ….
+    - `rates`: rates that must have these values, by their names or those of their coordinates: `{"crank.angle": 2.0}`
+        is `{"crank.angle_rate": 2.0}`, also of a joint's own coordinates, `"hip.angle_rate"`; in space
+        `"body.angular_velocity"` (body frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the
+        quasi-velocities `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
         that one member of a batch does not spoil the others; `assembly_gap` says how far it is from closing.
@@ -64,8 +66,8 @@ def assemble(
     t = checked_time("assemble", t, guess.q.dtype)
     z, fix = internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
-    rates, rates_of_joints = split_names("rate", system, system.rate_names(), rates)
-    u, fixed_rates = prescribe("rate", system.rate_names(), rates, guess.u)
+    rates, rates_of_joints = split_rates(system, rates)
+    u, fixed_rates = prescribe("rate", rates_of(system.rate_names()), rates, guess.u)
     if not is_traced(u):
         _check_finite(u, "rates")
     q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, throw)
@@ -80,7 +82,7 @@ def assemble(
     # Under a trace, results of concrete numbers are traced as well.
     if throw and not is_traced((ok, ok_rates)):
         if not ok_rates:
-            raise ValueError(_cannot_move(system, t, q, u, fixed_rates, system.rate_names()))
+            raise ValueError(_cannot_move(system, t, q, u, fixed_rates))
         return State(q, u, z)
     ok = ok & ok_rates
     if throw:
@@ -179,8 +181,8 @@ def _dependent(system, t, q, held, names):
     return f"{', '.join(together[:-1])} and {together[-1]} depend on each other: {chosen}"
 
 
-def _cannot_move(system, t, q, u, fixed, names):
-    held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
+def _cannot_move(system, t, q, u, fixed):
+    held = [name for k, name in directions(system.rate_names()).items() if fixed[k]]
     residual = np.nan_to_num(np.abs(np.asarray(system.velocity_residual(t, q, u))), nan=np.inf)
     own = system.rows[: system.velocity_rows]
     least = 1e-6 * np.max(residual)

@@ -1,11 +1,24 @@
 """The configuration and the velocities that are closest to a guess among those that satisfy the constraints.
 
 The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0`, with some coordinates held; the
-velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0`, with some rates held. Derivatives are
-those of the minimisers, by the implicit function theorem.
+velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0`, with some rates held. Gauss–Newton steps
+lead to the constraints, and Newton's method along them to the minimiser. Derivatives are those of the minimisers, by
+the implicit function theorem.
 
-If the system has an order of elimination and very many rows, no dense matrix is formed; see `closest_sparse`.
+If the system has an order of elimination and very many rows, no dense matrix is formed. With the rates `q̇ = K u` and
+the scales S the closest configuration satisfies
+
+    g(q, μ) = Kᵀ S⁻² (q − q_guess) + Aᵀ μ = 0,    Φ(q) = 0.
+
+The linear systems of Newton's method are solved by conjugate gradients in the null space of A, with the metric
+`M = Kᵀ S⁻² K` as the preconditioner, which the elimination of `A M⁻¹ Aᵀ` projects.
+
+Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic programming
+problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001 (projected conjugate gradients).
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,45 +29,171 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ..linalg.elimination import full_pivot
+from ..linalg.inertia import DiagonalInertia
+from ..linalg.jacobian import MassProjector
 from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractEquation
-from .closest_sparse import sparse_configuration, sparse_velocities
+from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
-MANY_ROWS = 300
+_MANY_ROWS = 300
 
-# Largest number of Gauss–Newton steps to the constraints.
+# Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
+# this share.
 _ITERATIONS = 100
-# Each of them must reduce the squares of the residuals to less than this share.
 _PROGRESS = 0.999
+# Implied rows get this share of the largest entry of the diagonal as a pivot.
+_SHIFT = 1e-13
+# In blocks the share is this multiple of the largest residual, as in the method of Levenberg and Marquardt, and at
+# least this power of eps, 1e-11 in double precision.
+#
+# Away from the constraints implied rows contradict each other in the square of the distance, and multipliers are that
+# over the pivot, with errors of eps over the pivot again. Bennett's linkage from poses that are off by 1e-9 to 1e-1
+# ended at residuals of 1e-12 to 1 where all pivots were 1e-13, and ends below 3e-14 with these.
+_OF_RESIDUAL = 1e-3
+_LEAST = 0.7
 
 # Newton's method on the optimality conditions, started near their solution: size of its last step, and largest number
 # of steps.
 _REFINED = 1e-10
 _REFINEMENTS = 16
 
+# In blocks, rows are independent if every pivot of the elimination (a squared distance between rows of unit norm)
+# exceeds this. A row of n four-bars with its crank held has a pivot of 0.7 / n³, and 5e-14 where 333 of them are held
+# twice.
+_INDEPENDENT = 1e-12
+# Newton's method along the constraints in blocks: largest number of steps and halvings of steps together, and a step
+# that is small enough to be the last but one.
+_STEPS = 60
+_LAST = 1e-6
+# Conjugate gradients: reduction of the residual, and largest number of iterations.
+_REDUCTION = 1e-13
+_GRADIENTS = 300
 
-def eliminates_by_blocks(system: AbstractEquation) -> bool:
-    """Whether closest states are found without dense matrices."""
+
+def tolerance(dtype) -> float:
+    """The largest scaled residual that counts as zero: 1e-10 in double precision."""
+    return float(jnp.finfo(dtype).eps) ** 0.64
+
+
+def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
+    """The largest residual, each row scaled to unit norm of its gradient times the system's size."""
+    largest = jnp.max(row_norms, initial=0.0)
+    floor = jnp.finfo(residual.dtype).eps ** 0.75 * largest + jnp.finfo(residual.dtype).tiny
+    return jnp.max(jnp.abs(residual) / jnp.maximum(row_norms, floor), initial=0.0)
+
+
+def residual_size(
+    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
+) -> Float[Array, ""]:
+    """`largest_residual` of the coordinates; `jacobian`: theirs at this configuration or near it."""
+    jacobian = jacobian * system.coordinate_scale()[None, :]
+    return largest_residual(system.coordinate_residual(t, q), jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1)))
+
+
+# Gauss–Newton steps to the constraints
+
+
+def meet_constraints(
+    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
+) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
+    """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
+
+    Implied rows are allowed: the normal equations are regularised at rounding level.
+
+    **Returns:** the configuration, and the Jacobian of its last correction.
+    """
+    residual = lambda q: system.coordinate_residual(t, q)
+
+    def correct(at):
+        q, _ = at
+        before, jacobian = residual(q), system.coordinate_jacobian(t, q)
+        scaled = jacobian * scale[None, :]
+        gram = scaled @ scaled.T
+        shift = _SHIFT * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
+        step = -scale * (scaled.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), before))
+        longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
+        best, size = _shortened(residual, lambda step: q + step, q, step, longest)
+        return (best, jacobian), size
+
+    def far(at, size):
+        q, _ = at
+        return (size > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+
+    none = jnp.zeros((system.coordinate_rows, system.nq), start.dtype)
+    return newton(correct, far, (start, none), most=_ITERATIONS, dtype=start.dtype)[0]
+
+
+def meet_in_blocks(
+    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
+) -> Float[Array, "nq"]:
+    """The same along the velocities, without motion along fixed ones, and without a dense matrix where the system has
+    an order of elimination. The normal equations are regularised in the measure of the residuals.
+    """
+    scale = system.velocity_scale()
+    least = float(jnp.finfo(start.dtype).eps) ** _LEAST
+    metric, at_rest = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2)), jnp.zeros_like(scale)
+    residual = lambda q: system.position_residual(t, q)
+
+    def correct(q):
+        before, jacobian = residual(q), binding_velocities(system, t, q, at_rest)
+        largest = largest_residual(before, jacobian.row_norms(scale)[: system.position_rows])
+        factor = jacobian.gram(metric).eliminate(jnp.clip(_OF_RESIDUAL * largest, least, _OF_RESIDUAL))
+        multipliers = factor.refined(jacobian.gather_rows(position_rows(system, t, q)))
+        step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
+        longest = jnp.max(jnp.abs(step) / scale)
+        return _shortened(residual, lambda step: displaced(system, t, q, step), q, step, longest)
+
+    small = float(jnp.finfo(start.dtype).eps) ** 0.75
+    far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+    return newton(correct, far, system.normalize(start), most=_ITERATIONS, dtype=start.dtype)[0]
+
+
+def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], q, step, longest):
+    """The best configuration along a Gauss–Newton step, and the size of the step, zero where nothing is gained."""
+    before = jnp.sum(residual(q) ** 2)
+    # Rotations by more than about a radian leave the region where the linearisation is valid.
+    step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+    lengths = 0.5 ** jnp.arange(8, dtype=step.dtype)
+    reached = jax.vmap(lambda a: moved(a * step))(lengths)
+    sizes = jax.vmap(lambda there: jnp.sum(residual(there) ** 2))(reached)
+    best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+    # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
+    size = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
+    return jnp.where(sizes[best] < before, reached[best], q), size
+
+
+# Closest states
+
+
+def _in_blocks(system, given):
+    """Whether closest states are found without dense matrices, if nothing is given."""
     only_positions = system.velocity_rows == system.position_rows
-    return system.elimination is not None and only_positions and system.position_rows >= MANY_ROWS
+    suits = system.elimination is not None and only_positions and system.position_rows >= _MANY_ROWS
+    return suits if given is None else given
 
 
 @eqx.filter_jit
 def closest_configuration(
-    system: AbstractEquation, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...], rank: int
+    system: AbstractEquation,
+    t: Scalar,
+    guess: Float[Array, "nq"],
+    held: tuple[bool, ...],
+    rank: int,
+    in_blocks: bool | None = None,
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
     """The configuration closest to the guess with some coordinates held; and whether every residual is at rounding
     level.
 
-    `rank`: of the rows in the columns that are not held.
+    **Arguments:** `rank`: of the rows in the columns that are not held; `in_blocks`: whether no dense matrix is formed,
+    default where there are very many rows.
     """
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
     without = system.held_velocities(fixed)
-    if eliminates_by_blocks(system) and without is not None:
-        return sparse_configuration(system, t, guess, fixed, without, tolerance(guess.dtype))
+    if _in_blocks(system, in_blocks) and without is not None:
+        return _configuration_in_blocks(system, t, guess, fixed, without)
     scale = jnp.where(fixed, 0.0, system.coordinate_scale())
     start = lax.stop_gradient(guess)
     frozen = lax.stop_gradient(system)
@@ -99,7 +238,12 @@ def _refine(residual, x):
 
 @eqx.filter_jit
 def closest_velocities(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], guess: Float[Array, "nu"], held: tuple[bool, ...]
+    system: AbstractEquation,
+    t: Scalar,
+    q: Float[Array, "nq"],
+    guess: Float[Array, "nu"],
+    held: tuple[bool, ...],
+    in_blocks: bool | None = None,
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities closest to the guess with some rates held; and whether every residual is at rounding level.
 
@@ -108,8 +252,8 @@ def closest_velocities(
     if system.velocity_rows == 0:
         return guess, jnp.array(True)
     fixed = np.array(held)
-    if eliminates_by_blocks(system):
-        return sparse_velocities(system, t, q, guess, fixed)
+    if _in_blocks(system, in_blocks):
+        return _velocities_in_blocks(system, t, q, guess, fixed)
     scale = jnp.where(fixed, 0.0, system.velocity_scale())
     u, rank, ok = guess, system.velocity_rank, jnp.array(True)
     jacobian = system.velocity_jacobian(t, q, u)
@@ -129,59 +273,195 @@ def closest_velocities(
     return u, ok & (jnp.max(jnp.abs(residual)) <= 1e2 * tolerance(u.dtype) * size)
 
 
-def meet_constraints(
-    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
-) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
-    """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
+# Without dense matrices
 
-    Implied rows are allowed: the normal equations are regularised at rounding level.
 
-    **Returns:** the configuration, and the Jacobian of its last correction.
+def _configuration_in_blocks(system, t, guess, held, fixed):
+    """`closest_configuration` with some coordinates held, and so some velocities fixed."""
+    where = _Held(tuple(held.tolist()), tuple(fixed.tolist()))
+    return _closest(system, jnp.asarray(t, guess.dtype), guess, where, tolerance(guess.dtype))
+
+
+def _velocities_in_blocks(system, t, q, guess, held):
+    """`closest_velocities` with some rates held."""
+    # Rates that are held have an infinite mass.
+    metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
+    here = binding_velocities(system, t, q, jnp.zeros_like(guess)).projector(metric)
+    u = guess + here.cancel(velocity_rows(system, t, q, guess))
+    return u, jnp.all(jnp.isfinite(u)) & (here.factor.smallest_pivot() > _INDEPENDENT)
+
+
+class _Held(eqx.Module):
+    coordinates: tuple[bool, ...] = eqx.field(static=True)
+    velocities: tuple[bool, ...] = eqx.field(static=True)
+
+
+class _Optimality(NamedTuple):
+    """The equations of the closest configuration at one; `projector` in their metric."""
+
+    projector: MassProjector
+    multipliers: Float[Array, "m"]
+    gradient: Float[Array, "nu"]
+
+
+@eqx.filter_custom_jvp
+def _closest(system, t, guess, held, tol):
+    fixed = np.array(held.velocities)
+    square = 1 / system.coordinate_scale() ** 2
+    distance = lambda q: jnp.sum(square * (q - guess) ** 2)
+
+    def correct(carry):
+        q, step, length, _ = carry
+        new = meet_in_blocks(system, t, displaced(system, t, q, length * step), fixed)
+        norms = binding_velocities(system, t, new, jnp.zeros_like(step)).row_norms(system.velocity_scale())
+        residual = largest_residual(system.position_residual(t, new), norms[: system.position_rows])
+        before, after = distance(q), distance(new)
+        size = length * jnp.max(jnp.abs(step) / system.velocity_scale())
+        # The first step leads to the constraints, and the last ones change the distance by rounding errors only.
+        better = (length == 0.0) | (after < before) | (size <= _LAST)
+        go_on = lambda: (new, _newton_step(system, t, new, guess, fixed), jnp.ones_like(length), residual)
+        halve = lambda: (q, step, 0.5 * length, residual)
+        out = lax.cond(better, go_on, halve)
+        ahead = jnp.max(jnp.abs(out[1]) / system.velocity_scale()) * out[2]
+        return out, jnp.where(residual <= tol, ahead, jnp.inf)
+
+    none = jnp.zeros(())
+    far = lambda carry, ahead: (ahead > 1e-3 * tol) & jnp.all(jnp.isfinite(carry[0])) & ~(carry[3] > tol)
+    start = guess, jnp.zeros(system.nu, guess.dtype), none.astype(guess.dtype), none.astype(guess.dtype)
+    (q, _, length, residual), ahead = newton(correct, far, start, most=_STEPS, dtype=guess.dtype)
+    at = _optimality(system, t, q, guess, fixed)
+    found = jnp.all(jnp.isfinite(q)) & (residual <= tol) & (ahead <= tol) & (length > 0)
+    return q, found & (at.projector.factor.smallest_pivot() > _INDEPENDENT)
+
+
+@_closest.def_jvp
+def _closest_jvp(primals, tangents):
+    system, t, guess, held, tol = primals
+    dsystem, dt, dguess, _, _ = tangents
+    q, found = _closest(system, t, guess, held, tol)
+    fixed = np.array(held.velocities)
+    at = _optimality(system, t, q, guess, fixed)
+    dguess = jnp.zeros_like(guess) if dguess is None else dguess
+    moved = jnp.where(np.array(held.coordinates), dguess, 0.0)
+
+    def equations(system, t, guess, q):
+        return _gradient(system, t, q, guess, at.multipliers), position_rows(system, t, q)
+
+    _, (gradient, unmet) = eqx.filter_jvp(equations, (system, t, guess, q), (dsystem, dt, dguess, moved))
+    step = _solve(system, t, q, guess, fixed, at, -gradient, -unmet)
+    along = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))[1]
+    return (q, found), (moved + along, None)
+
+
+def _optimality(system, t, q, guess, fixed):
+    metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(system, t, q)))
+    projector = binding_velocities(system, t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
+    gradient = _gradient(system, t, q, guess, jnp.zeros(system.acceleration_rows, q.dtype))
+    multipliers = -projector.multipliers(projector.jacobian.product(metric.solve(gradient)))
+    return _Optimality(projector, multipliers, gradient + projector.jacobian.transpose_product(multipliers))
+
+
+def _gradient(system, t, q, guess, multipliers):
+    """`g`, of a configuration that the multipliers do not depend on."""
+    rates = lambda u: system.rates(t, q, u)
+    (pulled,) = jax.linear_transpose(rates, jnp.zeros(system.nu, q.dtype))((q - guess) / system.coordinate_scale() ** 2)
+    return pulled + system.constraint_force(t, q, jnp.zeros(system.nu, q.dtype), multipliers)
+
+
+def _weights(system, t, q):
+    """The diagonal of `Kᵀ S⁻² K`."""
+    rates = lambda u: system.rates(t, q, u)
+    ones = jnp.ones(system.nu, q.dtype)
+    return jax.linear_transpose(rates, ones)(rates(ones) / system.coordinate_scale() ** 2)[0]
+
+
+def _newton_step(system, t, q, guess, fixed):
+    at = _optimality(system, t, q, guess, fixed)
+    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
+    return _null_space_solution(curved, at.projector, -at.gradient)
+
+
+def _curvature(system, t, q, guess, fixed, multipliers):
+    """How g changes with a displacement along velocities that are not fixed."""
+
+    def along(v):
+        v = jnp.where(fixed, 0.0, v)
+        dq = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(v),), (v,))[1]
+        change = jax.jvp(lambda q: _gradient(system, t, q, guess, multipliers), (q,), (dq,))[1]
+        return jnp.where(fixed, 0.0, change)
+
+    return along
+
+
+def _solve(system, t, q, guess, fixed, at, gradient, unmet):
+    """The displacement that changes g and Φ by this much: `H v + Aᵀ δμ`, `A v`."""
+    projector, order = at.projector, at.projector.jacobian
+    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
+    free = ~fixed
+    independent = order.active
+
+    # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+    join = lambda v, multipliers: jnp.concatenate([v, multipliers])
+
+    def matrix(x):
+        v, multipliers = x[: system.nu], x[system.nu :]
+        forces = jnp.where(free, order.transpose_product(independent * multipliers), v)
+        rows = independent * order.product(jnp.where(free, v, 0.0))
+        return join(curved(v) + forces, rows + (1 - independent) * multipliers)
+
+    def displacement(rows):
+        return projector.direction(projector.multipliers(rows))
+
+    def constraint_multipliers(forces):
+        return projector.multipliers(projector.jacobian.product(projector.metric.solve(forces)))
+
+    def solve(_, b):
+        forces, rows = b[: system.nu], b[system.nu :]
+        particular = displacement(rows)
+        v = particular + _null_space_solution(curved, projector, forces - curved(particular))
+        # Both are refined once: the last pivots of long loops are small.
+        v = v + displacement(rows - projector.jacobian.product(v))
+        left = forces - curved(v)
+        multipliers = constraint_multipliers(left)
+        multipliers += constraint_multipliers(left - projector.jacobian.transpose_product(multipliers))
+        return join(jnp.where(free, v, forces), multipliers + (1 - independent) * rows)
+
+    right = join(jnp.where(free, gradient, 0.0), independent * unmet)
+    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[: system.nu]
+
+
+def _null_space_solution(curved, projector, force):
+    """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients. Where a direction of
+    negative curvature is met, what was found until then, or that direction.
     """
 
-    def squares(q):
-        return jnp.sum(system.coordinate_residual(t, q) ** 2)
+    def project(force):
+        # Only its part along the null space is kept of a residual: the constraint forces in it would grow beside it.
+        force = force - constraint_force(force)
+        towards = projector.metric.solve(force)
+        return force, towards - projector.direction(projector.multipliers(projector.jacobian.product(towards)))
 
-    def correct(at):
-        q, _ = at
-        residual = system.coordinate_residual(t, q)
-        jacobian = system.coordinate_jacobian(t, q)
-        scaled = jacobian * scale[None, :]
-        gram = scaled @ scaled.T
-        shift = 1e-13 * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
-        step = -scale * (scaled.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), residual))
-        # Rotations by more than about a radian leave the region where the linearisation is valid.
-        longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
-        step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
-        lengths = 0.5 ** jnp.arange(8, dtype=q.dtype)
-        sizes = jax.vmap(lambda a: squares(q + a * step))(lengths)
-        sizes = jnp.where(jnp.isfinite(sizes), sizes, jnp.inf)
-        best = jnp.argmin(sizes)
-        # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
-        ahead = sizes[best] < _PROGRESS * jnp.sum(residual**2)
-        return (q + lengths[best] * step, jacobian), jnp.where(ahead, jnp.max(jnp.abs(step)), 0.0)
+    def constraint_force(force):
+        free = projector.metric.solve(force)
+        return projector.jacobian.transpose_product(projector.multipliers(projector.jacobian.product(free)))
 
-    def far(at, size):
-        q, _ = at
-        return (size > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
+    force, towards = project(force)
+    size = jnp.vdot(force, towards)
 
-    none = jnp.zeros((system.coordinate_rows, system.nq), start.dtype)
-    return newton(correct, far, (start, none), most=_ITERATIONS, dtype=start.dtype)[0]
+    def correct(carry):
+        x, left, along, size, k, _ = carry
+        curve = curved(along)
+        curvature = jnp.vdot(along, curve)
+        convex = curvature > 0
+        length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
+        x = x + length * along
+        left, towards = project(left - length * curve)
+        new = jnp.vdot(left, towards)
+        along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
+        return x, left, along, new, k + 1, convex
 
+    def proceed(carry):
+        return (carry[3] > _REDUCTION**2 * size) & (carry[4] < _GRADIENTS) & carry[5]
 
-def residual_size(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
-) -> Float[Array, ""]:
-    """Largest constraint residual, each row scaled to unit norm of its gradient times the system's size.
-
-    `jacobian`: that of the coordinates at this configuration or near it.
-    """
-    jacobian = jacobian * system.coordinate_scale()[None, :]
-    norms = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1))
-    floor = jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(norms) + jnp.finfo(q.dtype).tiny
-    return jnp.max(jnp.abs(system.coordinate_residual(t, q)) / jnp.maximum(norms, floor))
-
-
-def tolerance(dtype) -> float:
-    """The largest scaled residual that counts as zero: 1e-10 in double precision."""
-    return float(jnp.finfo(dtype).eps) ** 0.64
+    start = jnp.zeros_like(force), force, towards, size, jnp.array(0), jnp.array(True)
+    return lax.while_loop(proceed, correct, start)[0]

@@ -1,4 +1,4 @@
-"""Whether a state satisfies the constraints of its system, before a motion starts from it."""
+"""Consistency of a state with the constraints of its system, before a motion starts from it."""
 
 import dataclasses
 from typing import Any

@@ -24,6 +24,7 @@ from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
 from .closest import tolerance
@@ -377,7 +378,7 @@ def _search(
 def _largest(system, values, least):
     """The rates with the largest values, those above a fraction of the largest, with these."""
     size = np.abs(np.asarray(values))
-    names = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
+    names = directions(system.rate_names())
     return ", ".join(f"{names[k]} ({values[k]:.3g})" for k in np.argsort(-size)[:4] if size[k] > least * np.max(size))
 
 

@@ -1,4 +1,4 @@
-"""How far a mechanism is from closing: a smooth distance for optimisers, where `assemble` only says that it cannot."""
+"""The gap of a mechanism that does not close: a smooth distance for optimisers, where `assemble` only fails."""
 
 from collections.abc import Mapping
 
@@ -35,7 +35,7 @@ def assembly_gap(
     """How far a mechanism is from closing, zero where `assemble` finds a configuration.
 
     A coupler that is too short leaves a gap between its joint and the rocker. `assemble(..., throw=False)` then returns
-    a state that is not a number, which an optimiser learns nothing from. The gap tells it which way to go: as a
+    a state of NaN, which an optimiser learns nothing from. The gap tells it which way to go: as a
     constraint of `optimise`, `{"gap": (None, 0)}`, and as what to make small first where a start cannot be assembled.
 
     The gap is the norm of the residuals of all position constraints at the configuration, found from the guess by

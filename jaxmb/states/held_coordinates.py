@@ -12,7 +12,7 @@ from .._types import Scalar, VectorLike
 from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import unknown
 from ..system import AbstractSystem
-from .closest import eliminates_by_blocks
+from ..system.quantities import rates_of
 
 
 def prescribe(
@@ -61,6 +61,25 @@ def split_names(
     return {name: value for name, value in values.items() if name in own}, of_joints
 
 
+def split_rates(
+    system: AbstractSystem, values: Mapping[str, VectorLike] | None
+) -> tuple[dict[str, VectorLike], dict[str, Any]]:
+    """As `split_names` of rates, which are known by the names of their coordinates as well.
+
+    **Returns:** the values of the system's own rates, and those of coordinates of joints by the coordinates' names.
+
+    **Raises:** `ValueError` for a rate that is named twice, and as `split_names`.
+    """
+    joints = system.joint_coordinates()
+    if isinstance(values, Mapping):
+        twice = [name for name in values if f"{name}_rate" in values]
+        if twice:
+            raise ValueError(f"{twice[0]!r} and '{twice[0]}_rate' are the same rate; prescribe one of them.")
+        of_joints = {f"{name}_rate": name for name in joints}
+        values = {of_joints.get(name, name): value for name, value in values.items()}
+    return split_names("rate", system, rates_of(system.rate_names()), values)
+
+
 def internal_states(
     system: AbstractSystem, z: Float[Array, "nz"] | None, values: Mapping[str, VectorLike] | None
 ) -> tuple[Float[Array, "nz"] | None, Mapping[str, VectorLike] | None]:
@@ -83,4 +102,4 @@ def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[st
     if not values:
         return system
     rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
-    return system.holding(values, rates, t, in_blocks=eliminates_by_blocks(system))
+    return system.holding(values, rates, t)

@@ -1,4 +1,4 @@
-"""Whether rows that others imply at the given pose are implied near it as well.
+"""Checks that rows that others imply at the given pose are implied near it as well.
 
 Where rows lose rank, some of them are implied by the others. Near a regular pose they stay so, and may be left out; at
 a singular one (a straight truss, a four-bar with all joints on one line, q₀ q₁ = 0 at the origin) they do not, and the
@@ -40,7 +40,7 @@ def check_gradients(system: AbstractSystem, sizes: Float[np.ndarray, "m"]) -> No
         )
 
 
-class Group(NamedTuple):
+class DependentRows(NamedTuple):
     """Rows of A that depend on each other only.
 
     **Fields:** the `rows`; `independent` ones among them; `positions`: independent rows of Φ, also those that keep
@@ -66,7 +66,7 @@ class Nearby(NamedTuple):
 
 
 class Remains(NamedTuple):
-    """What is left of rows of unit norm less the multiples of others that come closest to them.
+    """Residuals of rows of unit norm after least squares by other rows.
 
     **Fields:** its norms `off`; the `sizes` of the rows; `by(bad)`: the others that have a share in some of them.
     """
@@ -96,7 +96,7 @@ def dense_remains(
 
 def check_implied(
     system: AbstractSystem,
-    groups: Sequence[Group],
+    groups: Sequence[DependentRows],
     places: Sequence[Int[np.ndarray, "n"]],
     evaluate: Callable[[float, Float[np.ndarray, "n"]], Nearby],
     size: int,
@@ -184,7 +184,7 @@ def check_implied_as_one(
     first = np.append(positions, np.arange(system.position_rows, system.coordinate_rows)).astype(int)
     of_coordinates = np.asarray(_evaluate(system, np.zeros((), dtype), q, np.zeros(q.size, dtype))[1])
     kept = _independent_rows(of_coordinates, [*first, *np.setdiff1d(coordinate_rows, first)])
-    check_implied(system, [Group(rows, independent, kept)], [np.arange(q.size)], evaluate, q.size, dtype)
+    check_implied(system, [DependentRows(rows, independent, kept)], [np.arange(q.size)], evaluate, q.size, dtype)
 
 
 @eqx.filter_jit

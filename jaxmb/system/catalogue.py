@@ -32,7 +32,7 @@ class AbstractSystem(AbstractEquation):
     """A model: an equation of motion whose numbers have names.
 
     Methods have the values of a model without bodies, whose motion is that of its coordinates: measurable quantities
-    are the coordinates, their rates q̇, and generalized constraint forces, `"theta"`, `"theta.rate"`, `"A.force"`.
+    are the coordinates, their rates q̇, and generalized constraint forces, `"theta"`, `"theta_rate"`, `"A.force"`.
 
     - `guess`: the default guess of `assemble`.
     - `design`: the design variables, in the order in which they were added; those of later ones may determine earlier
@@ -53,6 +53,10 @@ class AbstractSystem(AbstractEquation):
     has_bodies: ClassVar[bool] = False
 
     @property
+    def nz(self) -> int:
+        return self.state_ends[-1] if self.state_ends else 0
+
+    @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
         parts = self.friction_parts
         return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
@@ -65,7 +69,7 @@ class AbstractSystem(AbstractEquation):
 
     def rate_names(self) -> dict[str, list[int]]:
         """Indices in u by name; one name may denote several rates."""
-        return self.coordinate_names()
+        return {f"{name}_rate": index for name, index in self.coordinate_names().items()}
 
     def state_names(self) -> dict[str, list[int]]:
         """Indices in z by name; one name may denote several internal states."""
@@ -87,11 +91,9 @@ class AbstractSystem(AbstractEquation):
         """The value of one of `joint_coordinates`; an angle known up to full turns is in (−π, π]."""
         raise ValueError("This system has no joints between bodies, and so no coordinates of joints.")
 
-    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar, in_blocks: bool) -> Self:
-        """The same system with coordinates of joints held at values, which change at some rates, from t on; with an
-        order of elimination if blocks are asked for.
-        """
-        del values, rates, t, in_blocks
+    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
+        """The same system with coordinates of joints held at values, which change at some rates, from t on."""
+        del values, rates, t
         return self
 
     # Parameters
@@ -164,7 +166,7 @@ class AbstractSystem(AbstractEquation):
         out = {name: Quantity((), lambda ts, ys, _, name=name: self.motion(name, ys)) for name in self.motion_names()}
         for name, (index,) in self.coordinate_names().items():
             rate = lambda ts, ys, _, index=index: self.rates_along(ts, ys)[:, index]
-            out[f"{name}.rate"] = Quantity((), rate)
+            out[f"{name}_rate"] = Quantity((), rate)
         for name in self.constraint_names():
             force = lambda ts, ys, solved, name=name: self.generalized_constraint_force(
                 name, ts, ys, solved.multipliers

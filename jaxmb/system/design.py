@@ -12,7 +12,7 @@ from .._arguments import check_kind, real_shape
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
-from ..parts.names import unknown
+from ..parts.names import UnknownNameError, unknown
 from .catalogue import AbstractSystem
 from .design_variables import DesignVariables, Variable
 from .parameters import System, parameters, with_parameters
@@ -106,6 +106,8 @@ def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Arra
     """The derived parameters of the first values."""
     try:
         derived: Any = own.derive(dict(own.values))
+    except UnknownNameError:
+        raise
     except KeyError as error:
         raise unknown("design variable", str(error.args[0]), own.values) from None
     if not isinstance(derived, Mapping) or not derived:

@@ -1,4 +1,4 @@
-"""What a picture shows of a motion."""
+"""The contents of a picture of a motion: bodies, parts, shapes and paths."""
 
 from typing import NamedTuple
 

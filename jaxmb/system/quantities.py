@@ -1,6 +1,15 @@
-"""Quantities that can be measured of a motion."""
+"""Quantities that can be measured of a motion, and the names of rates.
 
-from collections.abc import Callable
+One grammar of rates holds wherever names are given or read. The rate of a coordinate has the coordinate's name and
+`_rate`: `"hip.angle_rate"` of a joint, `"crank.angle_rate"` and `"crank.x_rate"` of a body, `"theta_rate"` of a
+`LagrangianSystem`. It is what `trajectory["hip"].angle_rate` shows, a state of `linearise`, and what `rates=`,
+`free_initial`, `Sensor` and measured data name. The velocities of a body are `"crank.velocity"` and
+`"crank.angular_velocity"`, and in space single components of the latter, in body axes, `"frame.wx"`, `"frame.wy"`,
+`"frame.wz"`. Only `rates=`, which takes nothing but rates, knows them by the names of coordinates as well, as in
+`rates={"crank.angle": 2.0}`.
+"""
+
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
@@ -57,3 +66,13 @@ class Reaction(NamedTuple):
     force: Float[Array, "*times d"]
     moment: Float[Array, "..."]
     multipliers: Float[Array, "*times rows"]
+
+
+def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
+    """The names that `rates=` takes, from those of a system's rates: theirs and those of coordinates."""
+    return {name.removesuffix("_rate"): index for name, index in names.items()} | dict(names)
+
+
+def directions(names: Mapping[str, list[int]]) -> dict[int, str]:
+    """The direction of every velocity, from the names of a system's rates: `"rod.x"`, `"rod.wx"`, `"theta"`."""
+    return {index[0]: name.removesuffix("_rate") for name, index in names.items() if len(index) == 1}

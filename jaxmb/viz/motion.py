@@ -39,6 +39,8 @@ _LABELS = {
 }
 _WITH_RATES = ("position", "angle", "displacement", "coordinate")
 _RATES = dict(zip(_LABELS, list(_LABELS)[1:], strict=False))
+# The coordinates of joints with several angles.
+_ANGLES = ("angle_a", "angle_b", "angle_1", "angle_2", "angle_3")
 _CHECKS = ("energy", "residuals")
 
 
@@ -100,8 +102,9 @@ def _default(system) -> list[str]:
     # In space a body has no angle, so that those of joints are shown.
     flat = any(f"{name}.angle" in known for name in system.motion_names())
     kinds = ("displacement",) if flat else ("angle", "displacement")
-    of_bodies = [name for name in _quantities(system, system.motion_names()) if flat or _kind(name) != _RATES["angle"]]
-    of_joints = [name for name in system.joint_coordinates() if _kind(name) in kinds]
+    of_bodies = _quantities(system, system.motion_names())
+    of_bodies = [name for name in of_bodies if flat or _kind(system, name) != _RATES["angle"]]
+    of_joints = [name for name in system.joint_coordinates() if _kind(system, name) in kinds]
     return [*of_bodies, *(x for name in of_joints for x in (name, f"{name}_rate"))]
 
 
@@ -111,9 +114,10 @@ def _quantities(system, names: Iterable[str]) -> list[str]:
     out: dict[str, None] = {}
     for name in names:
         of_part = [own for own in known if own.startswith(f"{name}.") and not known[own].of_forces]
-        own = [name] if name in known else []
+        shown = (name,) if "." in name else (name, f"{name}_rate")
         # The Euler parameters of a body say little to the eye.
-        found = own + [quantity for quantity in of_part if not quantity.endswith(".orientation")]
+        found = [quantity for quantity in shown if quantity in known]
+        found += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
         if not found:
             what = "body, joint or quantity" if system.has_bodies else "coordinate"
             parts = dict.fromkeys(quantity.split(".")[0] for quantity in known)
@@ -122,26 +126,33 @@ def _quantities(system, names: Iterable[str]) -> list[str]:
     return list(out)
 
 
-def _kind(quantity: str) -> str:
+def _split(system, quantity: str) -> tuple[str, str, bool]:
+    """The part or coordinate that a quantity belongs to, what is measured of it, and whether its rate is."""
+    is_rate = quantity.endswith("_rate") and quantity not in system.coordinate_names()
+    part, _, field = (quantity.removesuffix("_rate") if is_rate else quantity).partition(".")
+    return part, field or "coordinate", is_rate
+
+
+def _kind(system, quantity: str) -> str:
     """What a quantity measures; angles of bodies and joints, also of joints with several, are of one kind."""
-    field = quantity.partition(".")[2] or "coordinate"
-    of_joint, rate = field.removesuffix("_rate"), field.endswith("_rate")
-    if of_joint in ("angle", "angle_a", "angle_b", "angle_1", "angle_2", "angle_3"):
-        return _RATES["angle"] if rate else "angle"
-    return field
+    _, field, is_rate = _split(system, quantity)
+    kind = "angle" if field in _ANGLES else field
+    if is_rate:
+        return _RATES[kind] if kind in ("angle", "coordinate") else f"{kind}_rate"
+    return kind
 
 
 def _panels(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[_Line]]:
     """The components of quantities by kind, the kinds in the order of their panels."""
     out: dict[str, list[_Line]] = {}
     for quantity in quantities:
-        part, _, field = quantity.removesuffix("_rate").partition(".")
+        part, field, _ = _split(trajectory.system, quantity)
         # One of several angles of a joint has its whole name.
-        name = f"{part}.{field}" if _kind(quantity.removesuffix("_rate")) != (field or "coordinate") else part
+        name = f"{part}.{field}" if field in _ANGLES else part
         values = np.asarray(trajectory.quantity(quantity))
         columns = values.reshape(values.shape[0], -1).T
         lines = [_Line(name, None if values.ndim == 1 else k, column) for k, column in enumerate(columns)]
-        out.setdefault(_kind(quantity), []).extend(lines)
+        out.setdefault(_kind(trajectory.system, quantity), []).extend(lines)
     order = [*_LABELS, *out]
     return dict(sorted(out.items(), key=lambda item: order.index(item[0])))
 

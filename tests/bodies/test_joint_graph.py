@@ -13,7 +13,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.block_cut_tree import components
-from jaxmb.bodies.independence import Part, subsets
+from jaxmb.bodies.independence import JointRows, subsets
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.bodies.layout import Layout
 from jaxmb.formulations import Multipliers, accelerations
@@ -216,7 +216,7 @@ def random_parts(rng, bodies, loops):
             block[:, side] = sign * rows @ np.block([[np.eye(3), lever], [np.zeros((3, 3)), np.eye(3)]])
             if body == bodies:
                 block[:, side] *= np.nan
-        parts.append(Part(own, first, 5))
+        parts.append(JointRows(own, first, 5))
         blocks.append(block)
         first += 5
     return parts, blocks

@@ -23,7 +23,7 @@ from jaxmb.formulations import (
     pivoted_jacobian,
 )
 from jaxmb.formulations.formulation import solve_constrained
-from jaxmb.linalg.elimination import eliminate, full_pivot
+from jaxmb.linalg.elimination import full_pivot
 from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
 
@@ -33,7 +33,7 @@ N, RANK = 7, 4
 
 def solve_by_all(inertia, force, jacobian, gamma, order, formulations=FORMULATIONS):
     """Accelerations and multipliers, an array each with an axis of formulations."""
-    jacobian = DenseJacobian(jacobian, eliminate(jacobian, order, RANK))
+    jacobian = DenseJacobian(jacobian).eliminated(order, RANK)
     pairs = [formulation.solve(inertia, force, jacobian, gamma) for formulation in formulations.values()]
     return tuple(jnp.stack(values) for values in zip(*pairs, strict=True))
 
@@ -115,7 +115,7 @@ def test_forces_that_do_virtual_work():
     force = jnp.asarray(np.array([0.1, 0.2, -0.3]) - np.cross(spin, moments * spin))
     A, gamma = jnp.array([[1.0, 2.0, -1.0]]), jnp.array([0.4])
     admissible = np.linalg.svd(A)[2][1:].T
-    jacobian = DenseJacobian(A, eliminate(A, full_pivot(A).order, 1))
+    jacobian = DenseJacobian(A).eliminated(full_pivot(A).order, 1)
     inertia = DiagonalInertia(jnp.asarray(moments))
     solve = jax.jit(lambda F: [formulation.solve(inertia, F, jacobian, gamma) for formulation in FORMULATIONS.values()])
     rough = jnp.array([0.05, -0.02, 0.03])

@@ -12,7 +12,7 @@ import jaxmb as mb
 from jaxmb import manifold, planar, spatial
 from jaxmb.formulations import Multipliers
 from jaxmb.formulations.formulation import accelerations
-from jaxmb.report import stability
+from jaxmb.report import stress_test
 
 
 def planar_chain(n, closed=False):
@@ -165,7 +165,7 @@ def test_derivatives_of_a_motion():
 def test_report():
     """The report has variants whose masses alternate, and each is right."""
     system = planar_chain(16).compile()
-    report = stability(system, mb.assemble(system), t1=0.3, only=["alternating masses"])
+    report = stress_test(system, mb.assemble(system), t1=0.3, only=["alternating masses"])
     assert len(report.cases) == 6
     for case in report.cases:
         assert not case.message and (case.error is None or case.error < 1e-6), report

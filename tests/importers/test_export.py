@@ -99,6 +99,24 @@ def test_machines_of_the_library_read_back(name):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("off", [1e-9, 1e-6, 1e-3, 1e-2])
+def test_an_overconstrained_machine_is_assembled_from_rough_poses(off):
+    """Two points on the last axis close Bennett's linkage: four rows of 21 are implied, and contradict each other in
+    the square of the distance.
+    """
+    own = mb.mechanisms.get("bennett")
+    scene, random = importers.mjcf(importers.to_mjcf(own.system, own.state).text).scene, np.random.default_rng(0)
+    for _ in range(3):
+        moved = [
+            body.with_fields(position=np.asarray(body.position) + off * random.normal(size=3)) for body in scene.bodies
+        ]
+        system = mb.Scene(moved, joints=scene.joints, forces=scene.forces).compile()
+        assert system.nu - system.velocity_rank == 1
+        residual = system.position_residual(0.0, mb.assemble(system).q)
+        assert np.max(np.abs(residual)) < 1e-14
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("name", MACHINES)
 def test_machines_of_the_library_in_mujoco(name):
     """Without the constraints that close loops, accelerations and energies are MuJoCo's; these have its residuals."""

@@ -5,7 +5,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model_files import HINGE, OFF, ROD, check_dynamics, file, kinds, part, random_states, rod
+from model_files import HINGE, OFF, ROD, body_accelerations, check_dynamics, file, kinds, part, random_states, rod
 from scipy.integrate import solve_ivp
 
 import jaxmb as mb
@@ -310,14 +310,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
             "",
             "Actuator 'm' acts by way of site",
         ),
-        (
-            HINGE,
-            '<actuator><adhesion name="m" body="a" ctrlrange="0 1"/></actuator>',
-            "",
-            "Actuator 'm' acts by way of body",
-        ),
         (HINGE, "", '<option density="1"/>', "A fluid is not modelled"),
-        ('<joint name="hip" type="ball" armature=".1"/>', "", "", "armature of the ball joint 'hip'"),
         ('<joint name="hip" type="ball" limited="true" range="0 30"/>', "", "", "limits of the ball joint 'hip'"),
         ('<joint name="hip" stiffness="1 2 3"/>', "", "", "Joint 'hip' has nonlinear stiffness"),
         ('<joint name="hip" damping="1 2 3"/>', "", "", "Joint 'hip' has nonlinear damping"),
@@ -346,6 +339,58 @@ def test_what_is_refused_is_named(joints, more, head, message):
     )
     with pytest.raises(ValueError, match=message):
         importers.mjcf(text)
+
+
+def test_armature_of_balls_between_moving_bodies_is_refused():
+    wrist = rod("hand", '<joint name="wrist" type="ball" armature=".1"/>')
+    with pytest.raises(ValueError, match="armature of the ball joint 'wrist'"):
+        importers.mjcf(file(rod("a", HINGE, wrist)))
+
+
+def rotors(gravity):
+    """A free body whose frame is off its mass centre, and one on a ball joint, each with armature and an arm."""
+    arm = lambda name: rod(name, '<joint axis="0 1 1" armature=".02"/>')
+    return importers.mjcf(
+        file(
+            rod("boat", '<joint name="float" type="free" armature=".7"/>', arm("oar"))
+            + rod("bob", '<joint name="ball" type="ball" armature=".3"/>', arm("tail"), "0 0 2"),
+            head=f'<option gravity="{gravity}"/>',
+        )
+    )
+
+
+def test_armature_of_free_joints_and_of_balls_on_the_ground():
+    model = rotors("0 0 0")
+    system = check_dynamics(model, 5)
+    masses = model.locate.model.body_mass[[1, 3]]
+    np.testing.assert_allclose(np.asarray(system.mass)[[0, 2]], masses + np.array([0.7, 0.0]), rtol=1e-12)
+    assert any("Armature of free joints" in note and "'float', 'ball'" in note for note in model.notes)
+    # It has no weight.
+    model = rotors("1 2 -9.81")
+    system, there = model.scene.compile(), model.locate.model
+    data = mujoco.MjData(there)
+    there.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    for q, v in random_states(there, 5):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(there, data)
+        state = model.state(q, v)
+        udot, _ = accelerations(system, Multipliers(), 0.0, state.q, state.u)
+        expected = np.array(list(body_accelerations(there, data, model).values()))
+        found = np.asarray(udot)[: expected.size].reshape(expected.shape)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+    light = importers.mjcf(file(rod("a", '<joint type="free" armature=".7"/>')), ignore="armature")
+    np.testing.assert_allclose(light.scene.compile().mass, light.locate.model.body_mass[1], rtol=1e-12)
+
+
+def test_adhesion_does_nothing_without_contacts():
+    text = file(
+        rod("a", HINGE),
+        '<actuator><adhesion name="foot" body="a" ctrlrange="0 1"/><motor name="m" joint="hip"/></actuator>',
+    )
+    model = importers.mjcf(text)
+    assert list(model.controls) == ["m"]
+    assert any("Adhesion" in note and "'foot'" in note for note in model.notes)
+    check_dynamics(model, 3)
 
 
 def test_flexible_bodies_are_refused():

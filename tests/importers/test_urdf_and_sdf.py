@@ -8,6 +8,7 @@ from model_files import INERTIAL, MASS, body, hinge, joint, kinds, link, model, 
 
 import jaxmb as mb
 from jaxmb import importers
+from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.importers.description import quaternion, roll_pitch_yaw
 
 ARM = robot(
@@ -395,6 +396,25 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
         assert len(missing) == 6 - count
     with pytest.raises(ValueError, match=r"package_dirs: .*nowhere is no folder"):
         importers.urdf(path, package_dirs=[tmp_path / "nowhere"])
+
+
+def test_several_models_of_sdf_are_one_machine():
+    """Each moves as it does alone, and the names of links are those of their models and their own."""
+    arm = FOUR_BAR.partition("<sdf version='1.6'>")[2].replace("</sdf>", "")
+    box = "<model name='box'><pose>0 0 3 0 0 0</pose>" + body("a") + "</model>"
+    floor = "<model name='floor'><static>1</static>" + body("a") + "</model>"
+    both = importers.sdf(f"<sdf version='1.6'><world name='w'>{arm}{box}{floor}{arm}</world></sdf>")
+    alone = importers.sdf(FOUR_BAR)
+    names = [own.name for own in alone.scene.bodies]
+    here = [own.name for own in both.scene.bodies]
+    assert here == [*(f"m::{own}" for own in names), "box::a", *(f"m 2::{own}" for own in names)]
+    assert any("m → m 2" in note for note in both.notes)
+    udot = [
+        np.asarray(accelerations(system, Multipliers(), 0.0, system.guess.q, system.guess.u)[0]).reshape(-1, 6)
+        for system in (both.scene.compile(), alone.scene.compile())
+    ]
+    expected = np.concatenate([udot[1], [[0.0, 0.0, -9.81, 0.0, 0.0, 0.0]], udot[1]])
+    np.testing.assert_allclose(udot[0], expected, rtol=0, atol=1e-11)
 
 
 def test_models_of_sdf_are_found(tmp_path):

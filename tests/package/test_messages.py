@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -43,6 +44,46 @@ def test_views_by_name_are_mappings(motion):
     for error in (KeyError, ValueError):
         with pytest.raises(error, match="Unknown joint 'knee'; there are 'pin'"):
             motion.reactions["knee"]
+
+
+def test_motions_are_looked_up_by_name(motion):
+    assert list(motion) == ["rod", "pin"]
+    assert "rod" in motion and "pin" in motion and "knee" not in motion
+    assert motion.get("knee") is None and motion.get("rod") is not None
+
+
+@pytest.mark.parametrize(
+    ("lookup", "message"),
+    [
+        (lambda system, motion: motion["rud"], "Unknown body, joint or frame 'rud'; did you mean 'rod'?"),
+        (
+            lambda system, motion: mb.with_parameters(system, {"rod.mas": 1.0}),
+            "Unknown parameter 'rod.mas'; did you mean 'rod.mass'?",
+        ),
+        (
+            lambda system, motion: mb.assemble(system, fix={"rod.angel": 1.0}),
+            "Unknown coordinate 'rod.angel'; did you mean 'rod.angle'?",
+        ),
+        (
+            lambda system, motion: mb.Scene(
+                [planar.Body("rod", mass=1.0, inertia=1.0)], joints=[planar.Revolute("pin", "ground", "rodd")]
+            ),
+            "Revolute 'pin': Unknown body 'rodd'; did you mean 'rod' or 'ground'?",
+        ),
+    ],
+)
+def test_unknown_names_are_errors_of_keys_and_of_values(pendulum, motion, lookup, message):
+    for kind in (KeyError, ValueError, mb.UnknownNameError):
+        with pytest.raises(kind) as raised:
+            lookup(pendulum, motion)
+        assert str(raised.value) == message
+
+
+def test_unknown_names_in_functions_of_the_user_keep_their_message(pendulum):
+    with pytest.raises(mb.UnknownNameError, match=r"^Unknown parameter 'rod.mas'; did you mean 'rod.mass'"):
+        mb.design(
+            pendulum, {"m": 1.0}, lambda v: dict(mb.parameters(mb.with_parameters(pendulum, {"rod.mas": v["m"]})))
+        )
 
 
 def test_unknown_arguments_of_parts():
@@ -102,3 +143,38 @@ def test_modules_as_fields():
     state = mb.assemble(system)
     expected = float(network(np.zeros(3))[0])
     np.testing.assert_allclose(system.force(0.0, state.q, state.u)[2], expected, rtol=1e-12)
+
+
+def test_a_rate_has_one_name_everywhere(pendulum):
+    """`trajectory["pin"].angle_rate` is `"pin.angle_rate"` in `rates=`, quantities and states."""
+    by_coordinate, by_rate, of_body = (
+        mb.assemble(pendulum, rates={name: 2.0}) for name in ("pin.angle", "pin.angle_rate", "rod.angle_rate")
+    )
+    np.testing.assert_array_equal(by_rate.u, by_coordinate.u)
+    np.testing.assert_allclose(of_body.u, by_rate.u, rtol=1e-14)
+    motion = mb.simulate(pendulum, by_rate, t1=0.01)
+    np.testing.assert_array_equal(motion.quantity("pin.angle_rate"), motion["pin"].angle_rate)
+    rest = mb.equilibrium(pendulum)
+    assert mb.linearise(pendulum, rest, coordinates=["pin.angle"]).states == ("pin.angle", "pin.angle_rate")
+    assert mb.linearise(pendulum, rest, rates=["pin.angle_rate"]).states == ("rod.angle", "pin.angle_rate")
+    for name in ("pin", "rod"):
+        with pytest.raises(ValueError, match=f"'{name}.angle' and '{name}.angle_rate' are the same rate"):
+            mb.assemble(pendulum, rates={f"{name}.angle": 2.0, f"{name}.angle_rate": 2.0})
+    with pytest.raises(ValueError, match=r"Unknown rate 'pin\.angle\.rate'"):
+        mb.assemble(pendulum, rates={"pin.angle.rate": 2.0})
+
+
+def test_the_rate_of_a_generalized_coordinate_has_one_name():
+    system = mb.lagrangian.LagrangianSystem(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 0.5 * jnp.sum(q**2), q=[0.1], coordinates=["theta"]
+    )
+    state = mb.assemble(system, rates={"theta_rate": 2.0})
+    assert float(state.u[0]) == 2.0
+    motion = mb.simulate(system, state, t1=0.1)
+    assert list(motion) == ["theta", "theta_rate"]
+    np.testing.assert_array_equal(motion["theta_rate"], motion.quantity("theta_rate"))
+    np.testing.assert_array_equal(motion["theta_rate"], motion.ys.u[:, 0])
+    with pytest.raises(ValueError, match="'theta_rate' is the name of the rate of 'theta'"):
+        mb.lagrangian.LagrangianSystem(
+            lambda t, q, v, p: 0.5 * jnp.sum(v**2), q=[0.1, 0.2], coordinates=["theta", "theta_rate"]
+        )

@@ -15,7 +15,6 @@ from jaxmb.formulations import Partitioned, accelerations
 from jaxmb.parts import AbstractBody, AbstractCompound, AbstractForce, AbstractPotentialForce, fields
 from jaxmb.parts.base import AbstractLink, AbstractVelocityConstraint
 from jaxmb.parts.frames import LinkFrame
-from jaxmb.parts.on_frames import framed, on_frames
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
 
@@ -103,15 +102,16 @@ def evaluated(part, space, frames, poses, velocities):
     own = part.components() if isinstance(part, AbstractCompound) else (part,)
     out = []
     for single in own:
-        single = on_frames(single, frames)
+        single = single.with_fields(body_frames=frames)
+        seen = single.seen(space, poses, velocities)
         if isinstance(single, AbstractForce):
-            out.append(single.wrenches(space, poses, velocities, 0.1))
+            out.append(single.wrenches_on_bodies(space, poses, single.wrenches(space, *seen, 0.1)))
             if isinstance(single, AbstractPotentialForce) and single.conservative:
-                out.append(single.energy(space, poses, 0.1))
+                out.append(single.energy(space, seen[0], 0.1))
         elif isinstance(single, AbstractVelocityConstraint):
-            out.append(single.residual(space, poses, velocities, 0.1))
+            out.append(single.residual(space, *seen, 0.1))
         else:
-            out.append(single.residual(space, poses, 0.1))
+            out.append(single.residual(space, seen[0], 0.1))
     return out
 
 
@@ -129,19 +129,19 @@ def test_a_point_that_is_left_out_is_the_origin_of_the_frame(name):
     space, centre, known = (PLANE if d == 2 else SPACE), CENTRE[d], {body.name: body for body in bodies}
     poses = np.stack([known[own].pose() if own in known else np.asarray(space.ground) for own in part.bodies])
     velocities = np.stack([rng.normal(size=space.velocity_size) * (own in known) for own in part.bodies])
-    frames = tuple(LinkFrame(name=own, body=own, centre=centre) if own in known else None for own in part.bodies)
+    frames = {str(k): LinkFrame(name=own, body=own, centre=centre) for k, own in enumerate(part.bodies) if own in known}
     # The points where the origin is, in frames at the mass centres.
     of_body = [-centre if own in known else 0.0 * centre for own in part.bodies]
     given = {
         field: np.stack(of_body[len(of_body) - _count(part, field) :]) if body is None else of_body[body]
         for field, body in PARTS[type(part)].items()
     }
-    left_out = part.resolve(space, framed(space, frames, poses))
+    left_out = part.resolve(space, part.with_fields(body_frames=frames).seen_poses(space, poses))
     by_hand = part.with_fields(**given).resolve(space, poses)
     prepared = jnp.stack([space.prepare(jnp.asarray(pose)) for pose in poses])
     at = prepared, jnp.asarray(velocities)
     for found, expected in zip(
-        evaluated(left_out, space, frames, *at), evaluated(by_hand, space, (None,) * len(frames), *at), strict=True
+        evaluated(left_out, space, frames, *at), evaluated(by_hand, space, {}, *at), strict=True
     ):
         scale = 1.0 + np.max(np.abs(expected))
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * scale)

@@ -11,7 +11,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.cli import main
-from jaxmb.report import left_out, stability, work_precision
+from jaxmb.report import left_out, stress_test, work_precision
 from jaxmb.report.reference import MARGIN
 from jaxmb.solvers import Adams
 
@@ -65,13 +65,13 @@ def test_what_is_asked_of_a_report(oscillator):
     with pytest.raises(ValueError, match="between 0 and 1"):
         work_precision(system, state, t1=1.0, tolerances=(2.0,))
     with pytest.raises(ValueError, match="did you mean 'lengths'"):
-        stability(system, state, t1=1.0, only=["length"])
+        stress_test(system, state, t1=1.0, only=["length"])
 
 
-def test_stability_of_a_scene(oscillator, tmp_path):
+def test_stress_of_a_scene(oscillator, tmp_path):
     """Errors of known motions; a spring too stiff for the steps allowed, and what does not apply."""
     system, state, t1 = oscillator
-    report = stability(system, state, t1=t1, only=["rtol", "lengths", "initial speed", "doubled joint"])
+    report = stress_test(system, state, t1=t1, only=["rtol", "lengths", "initial speed", "doubled joint"])
     errors = {(case.kind, case.case): case for case in report.cases}
     assert errors["rtol", "1e-04"].error < 1e-2
     assert errors["rtol", "1e-10"].error < 1e-7 < 1e3 * errors["rtol", "1e-06"].error
@@ -87,14 +87,14 @@ def test_stability_of_a_scene(oscillator, tmp_path):
 
 
 @pytest.mark.long
-def test_stability_of_a_scene_with_internal_states():
+def test_stress_of_a_scene_with_internal_states():
     """A rod with a motor that lags: its force counts among the errors, and variants start with it."""
     rod = planar.Body("rod", mass=2.0, inertia=0.3)
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
     motor = mb.Actuator("motor", "pin.angle", command=1.2, lag=0.1)
     system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
     state = mb.assemble(system, fix={"motor.force": 4.0}, rates={"pin.angle": 1.0})
-    report = stability(system, state, t1=0.5, rtol=1e-8, only=["rtol", "lengths", "initial speed", "doubled joint"])
+    report = stress_test(system, state, t1=0.5, rtol=1e-8, only=["rtol", "lengths", "initial speed", "doubled joint"])
     cases = {(case.kind, case.case): case for case in report.cases}
     assert "lengths: left out, the internal states motor.force are of no known power of a length" in str(report)
     assert {kind for kind, _ in cases} == {"rtol", "initial speed", "doubled joint"}
@@ -104,15 +104,15 @@ def test_stability_of_a_scene_with_internal_states():
         assert not case.message and (case.error is None or case.error < 1e-6), case
     # A body too heavy for the motor moves uniformly, and what errors there are are those of the force.
     idle = mb.with_parameters(system, {"rod.inertia": 1e9})
-    coarse = stability(idle, state, t1=0.5, only=["rtol"]).cases[0]
+    coarse = stress_test(idle, state, t1=0.5, only=["rtol"]).cases[0]
     assert coarse.error > 1e-8
 
 
 @pytest.mark.long
-def test_stability_of_a_pendulum(pendulum):
+def test_stress_of_a_pendulum(pendulum):
     """Every kind of variant; the position below the pin is no singular one, but can be named."""
     system, state = pendulum
-    report = stability(system, state, t1=1.0, singular={"rod.angle": -np.pi / 2})
+    report = stress_test(system, state, t1=1.0, singular={"rod.angle": -np.pi / 2})
     assert {case.kind for case in report.cases} == set(mb.report.KINDS) and not report.remarks
     for case in report.cases:
         assert case.message or case.error is None or case.error < max(1e-4, 1e3 * 1e-8), case
@@ -152,5 +152,5 @@ def test_reports_on_the_command_line(capsys, tmp_path, monkeypatch):
     assert data["mechanism"] == "oscillator" and data["runs"][0]["error"] < 1e-3
     assert (tmp_path / "out" / "work_precision.png").read_bytes().startswith(b"\x89PNG")
     for name, message in ((f"{where}s", "has no attribute"), ("no_such_module:scene", "No module named")):
-        assert main(["report", "stability", name, "--out", str(tmp_path / "out")]) == 2
+        assert main(["report", "stress_test", name, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err

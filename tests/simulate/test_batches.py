@@ -71,7 +71,7 @@ def test_coordinates_of_a_batch_by_name():
     angle = 2.0 / np.sqrt(masses)[:, None] * np.array([0.1, 0.2, 0.3])
     np.testing.assert_allclose(motion["fast"], 2.0 * np.cos(angle), rtol=0, atol=1e-9)
     rate = -4.0 / np.sqrt(masses)[:, None] * np.sin(angle)
-    np.testing.assert_allclose(motion.quantity("fast.rate"), rate, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.quantity("fast_rate"), rate, rtol=0, atol=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmb.solvers._dense import differentiable
 from jaxmb.solvers._field import derivatives
-from jaxmb.solvers._implicit import differentiable
+from jaxmb.solvers._newton import StepEquation
 
 
 class Field(eqx.Module):
@@ -39,7 +40,8 @@ def test_derivative_of_a_step(b):
     one = jnp.asarray(1.0)
 
     def stepped(x):
-        return differentiable(end, Field(x[0]), x[1], x[2:], a * one, b * one, jnp.arange(2))
+        equation = StepEquation(Field(x[0]), lambda y: None, x[1], one, x[2:], a * one, b * one, jnp.arange(2))
+        return differentiable(end, equation)
 
     expected = jax.jacfwd(lambda x: solved(x, a, b))(x)
     for mode in (jax.jacfwd, jax.jacrev):

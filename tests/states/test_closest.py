@@ -1,6 +1,7 @@
 """Assembly without dense matrices against assembly with them, with derivatives; and from rough guesses."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.states import closest
-from jaxmb.states.closest_sparse import sparse_configuration, sparse_velocities
 
 
 def planar_tree(n=15, **options):
@@ -69,15 +69,12 @@ def test_the_closest_state_and_its_derivatives(build, names):
     direction = jax.tree.map(lambda x: 1e-2 * x * shift(1.0, x.shape), structured)
     rank = system.coordinate_rank - system.normalize_fixed(guess.q, held)[1]
 
-    def sparse(system, guess):
-        q, ok = sparse_configuration(system, 0.0, guess.q, held, fixed, 1e-10)
-        u, also = sparse_velocities(system, 0.0, q, guess.u, fixed)
+    def found(system, guess, in_blocks):
+        q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), rank, in_blocks)
+        u, also = closest.closest_velocities(system, 0.0, q, guess.u, tuple(fixed.tolist()), in_blocks)
         return jnp.concatenate([q, u]), ok & also
 
-    def dense(system, guess):
-        q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), rank)
-        u, also = closest.closest_velocities(system, 0.0, q, guess.u, tuple(fixed.tolist()))
-        return jnp.concatenate([q, u]), ok & also
+    sparse, dense = functools.partial(found, in_blocks=True), functools.partial(found, in_blocks=False)
 
     along = mb.State(jnp.where(held, 0.0, shift(0.1, system.nq)), shift(0.1, system.nu))
 
@@ -89,9 +86,9 @@ def test_the_closest_state_and_its_derivatives(build, names):
         pulled = sum(map(jnp.vdot, jax.tree.leaves(back), jax.tree.leaves((direction, along))))
         return push(sparse), push(dense), pulled, weights, sparse(system, guess)[1] & dense(system, guess)[1]
 
-    (found, dfound), (expected, dexpected), pulled, weights, ok = evaluate(structured, guess)
+    (result, dfound), (expected, dexpected), pulled, weights, ok = evaluate(structured, guess)
     assert ok
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-10)
     np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-8 * np.max(np.abs(dexpected)))
     np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-10)
 
@@ -116,20 +113,19 @@ def test_rough_guesses(size):
 
 
 @pytest.mark.long
-def test_coordinates_of_joints_are_held(monkeypatch):
-    """As with dense matrices, with derivatives."""
-    system = planar_tree()
+def test_coordinates_of_joints_are_held():
+    """In a tree of 300 rows as with dense matrices, with derivatives."""
+    system = planar_tree(150)
     guess = mb.State(system.guess.q, jnp.asarray(np.random.default_rng(0).normal(size=system.nu)))
 
-    def own(angle):
+    def own(angle, system=system):
         fix, rates = {"pin3.angle": angle, "rod9.x": 0.1}, {"pin3.angle": 0.5}
         y = mb.assemble(system, guess, fix=fix, rates=rates, throw=False)
         return jnp.concatenate([y.q, y.u])
 
-    pushed = lambda: jax.jit(lambda angle: jax.jvp(own, (angle,), (1.0,)))(0.3)
-    expected = pushed()
-    monkeypatch.setattr(closest, "MANY_ROWS", system.position_rows)
-    found = pushed()
+    pushed = lambda system: jax.jit(lambda angle: jax.jvp(lambda x: own(x, system), (angle,), (1.0,)))(0.3)
+    expected = pushed(dataclasses.replace(system, elimination=None))
+    found = pushed(system)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-10 * (1 + np.max(np.abs(other))))
     weights = np.cos(np.arange(found[0].size))

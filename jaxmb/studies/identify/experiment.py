@@ -284,7 +284,7 @@ def channels_of(
 
 
 def initial_unknown(system: AbstractSystem, name: str) -> Initial:
-    """The coordinate or the rate, `"crank.angle"` or `"crank.angle.rate"`, of an initial state."""
+    """The coordinate or the rate, `"crank.angle"` or `"crank.angle_rate"`, of an initial state."""
     coordinates, rates = system.coordinate_names(), system.rate_names()
     if name in coordinates:
         fixed = np.zeros(system.nq, bool)
@@ -294,10 +294,9 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
                 f"{name!r} cannot be free: its components are not independent of each other. Free a joint's coordinate."
             )
         return Initial(name, False)
-    rate = name.removesuffix(".rate")
-    if rate in rates:
-        return Initial(rate, True)
-    raise unknown("initial coordinate or rate", name, [*coordinates, *(f"{rate}.rate" for rate in rates)])
+    if name in rates:
+        return Initial(name, True)
+    raise unknown("initial coordinate or rate", name, [*coordinates, *rates])
 
 
 def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:

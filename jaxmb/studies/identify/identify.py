@@ -65,7 +65,7 @@ def identify(
     - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
         (times, 2)}`. Names are those of `sensors`, of `Trajectory[body]` (`position`, `velocity`, `angle`,
         `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
-        coordinates and their rates q̇, `"theta"` and `"theta.rate"`, shape (times,), and generalized forces of its
+        coordinates and their rates q̇, `"theta"` and `"theta_rate"`, shape (times,), and generalized forces of its
         constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
         wrapping. Instead, the `Measurements` that `read_measurements` returns, with their times; or an `Experiment` or
         a list of them, each with its own data, times and initial state.
@@ -78,7 +78,7 @@ def identify(
 
     **The initial state**, at `t0`, is found anew for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints whatever the free parameters is therefore kept as it is.
-    `free_initial` names coordinates and rates of it that are unknown, `("crank.angle", "crank.angle.rate")`, or gives
+    `free_initial` names coordinates and rates of it that are unknown, `("crank.angle", "crank.angle_rate")`, or gives
     their starting values by name; these unknowns are called `"initial.crank.angle"`.
 
     **Other arguments:**

@@ -208,13 +208,18 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
             raise ValueError(f"{name!r} belongs to a sensor that experiment {prefix!r} has not measured.")
 
     guess = system.guess if experiment.state is None else experiment.state
-    fix, rates = arrays(experiment.fix), arrays(experiment.rates)
+    known_rates = system.rate_names()
+    fix = arrays(experiment.fix)
+    # By the names of rates, so that an unknown rate takes the place of one that is given by its coordinate's name.
+    rates = {
+        full if (full := f"{name}_rate") in known_rates else name: x for name, x in arrays(experiment.rates).items()
+    }
     initial = tuple((f"initial.{name}", initial_unknown(system, name)) for name in experiment.free_initial)
     if initial:
         state = assemble(with_parameters(system, known), guess, fix=fix, rates=rates, t=experiment.t0)
         sizes = system.coordinate_scale(), system.velocity_scale()
         for (name, what), chosen in zip(initial, experiment.free_initial.values(), strict=True):
-            index = (system.rate_names() if what.is_rate else system.coordinate_names())[what.name]
+            index = (known_rates if what.is_rate else system.coordinate_names())[what.name]
             index = index[0] if len(index) == 1 else np.array(index)
             vector, size = (state.u, sizes[1]) if what.is_rate else (state.q, sizes[0])
             start = start_of(name, vector[index] if chosen is None else chosen)

@@ -119,10 +119,10 @@ def body_index(system: AbstractSystem) -> BodyIndex:
         tuple(tuple(q[f"{name}.position"]) for name in names),
         tuple(tuple(u[f"{name}.velocity"]) for name in names),
         tuple(tuple(q[f"{name}.orientation" if s else f"{name}.angle"]) for name, s in turning),
-        tuple(tuple(u[f"{name}.angular_velocity" if s else f"{name}.angle"]) for name, s in turning),
+        tuple(tuple(u[f"{name}.angular_velocity" if s else f"{name}.angle_rate"]) for name, s in turning),
         rotates,
         tuple(q[name][0] for name in scalars),
-        tuple(u[name][0] for name in scalars),
+        tuple(u[f"{name}_rate"][0] for name in scalars),
     )
 
 

@@ -20,6 +20,7 @@ from ...simulate import simulate
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem
+from ...system.quantities import directions
 from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names
@@ -178,8 +179,8 @@ def _return(system, state, end, pushed, free):
 
 def _open(system, period, distance, far):
     labels = {index[0]: name for name, index in system.coordinate_names().items() if len(index) == 1}
-    rates = {index[0]: f"the rate of {name}" for name, index in system.rate_names().items() if len(index) == 1}
-    name = lambda k: labels.get(k, "a count of turns") if k < system.nq else rates[k - system.nq]
+    rates = directions(system.rate_names())
+    name = lambda k: labels.get(k, "a count of turns") if k < system.nq else f"the rate of {rates[k - system.nq]}"
     worst = [k for k in np.argsort(-np.abs(distance)) if far[k]][:4]
     listed = ", ".join(f"{name(k)} ({distance[k]:.3g})" for k in worst)
     return (

@@ -13,6 +13,7 @@ from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem, parameters
+from ...system.quantities import directions
 from .linear_equations import LinearEquations, linear_equations
 from .linearisation import Linearisation
 from .perturbations import (
@@ -57,8 +58,8 @@ def linearise(
     - `coordinates`: names of coordinates that should be states: entries of q, `"crank.angle"`; displacements and small
         turns of spatial bodies about their own axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a
         smooth function of q. They may be fewer than the independent ones; the others are chosen, by pivoting.
-    - `rates`: likewise names of velocities, `"crank.angle"`, `"frame.wx"`, of joints' coordinates, `"hip.angle"`, or
-        `"crank.angle.rate"` of any coordinate; default the rates of the coordinates, as far as they are independent.
+    - `rates`: likewise names of rates, `"crank.angle_rate"`, `"hip.angle_rate"`, `"frame.wx"`, or of coordinates, whose
+        rates they stand for; default the rates of the coordinates, as far as they are independent.
 
     **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have no names but numbers, since numbers decide
     on the choice; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to parameters
@@ -117,7 +118,7 @@ def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations
 
 def _rate_label(system, name):
     """The name of a rate as a state, which differs from that of its coordinate."""
-    return f"{name}.rate" if name in {**system.coordinate_names(), **system.joint_coordinates()} else name
+    return f"{name}_rate" if name in {**system.coordinate_names(), **system.joint_coordinates()} else name
 
 
 def _label(item, shapes):
@@ -162,7 +163,7 @@ def remaining(system: AbstractSystem, residual) -> str:
     """The accelerations that remain where there should be none, for messages."""
     left = np.asarray(residual)
     rates, accelerations, of_states = np.split(left, [system.nq, system.nq + system.nu])
-    labels = {index[0]: name for name, index in system.rate_names().items() if len(index) == 1}
+    labels = directions(system.rate_names())
     worst = [k for k in np.argsort(-np.abs(accelerations))[:4] if abs(accelerations[k]) > 1e-6 * np.abs(left).max()]
     listed = ", ".join(f"{labels[k]} ({accelerations[k]:.3g})" for k in worst)
     states = {name: np.abs(of_states[index]).max() for name, index in system.state_names().items()}

@@ -21,6 +21,7 @@ from ...linalg.arrays import is_traced
 from ...linalg.elimination import PivotSearch, eliminate, full_pivot
 from ...parts.names import unknown
 from ...system import AbstractSystem
+from ...system.quantities import directions, rates_of
 from .quantities import checked_names, components, measured
 
 # How much rather a state is chosen than another that serves as well: turns than displacements, the rates of coordinates
@@ -76,17 +77,15 @@ def displacement_names(system: AbstractSystem) -> list[str]:
     """
     if not _has_invariants(system):
         return _singles(system.coordinate_names(), system.nq)
-    names = _singles(system.rate_names(), system.nu)
-    return [f"{name[:-2]}rotation_{name[-1]}" if name[-3:-1] == ".w" else name for name in names]
+    names = directions(system.rate_names())
+    moves = [names[k] for k in range(system.nu)]
+    return [f"{name[:-2]}rotation_{name[-1]}" if name[-3:-1] == ".w" else name for name in moves]
 
 
 def rate_candidates(system: AbstractSystem, names: StateNames) -> list[str]:
-    """Names of the rates that velocities are chosen from: of named coordinates, and the velocities, with `".rate"`
-    where a coordinate has the same name.
-    """
-    own = [f"{name}.rate" for name in names.coordinates] if names.rates is None else []
-    known = system.coordinate_names()
-    return own + [f"{name}.rate" if name in known else name for name in _singles(system.rate_names(), system.nu)]
+    """Names of the rates that velocities are chosen from: those of named coordinates, and all velocities."""
+    named = [f"{name}_rate" for name in names.coordinates] if names.rates is None else []
+    return named + _singles(system.rate_names(), system.nu)
 
 
 def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinates, rates) -> StateNames:
@@ -131,11 +130,12 @@ def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, nam
 
 def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Callable[[State], Array]:
     """A rate as a function of the state: an entry of u, the rate of a coordinate, or a quantity."""
-    known = {name: index for name, index in system.rate_names().items() if len(index) == 1}
-    base = name.removesuffix(".rate")
-    if base in known:
-        return lambda state: state.u[known[base][0]]
-    if base != name or name in system.joint_coordinates():
+    known = {name: index for name, index in rates_of(system.rate_names()).items() if len(index) == 1}
+    if name in known:
+        return lambda state: state.u[known[name][0]]
+    base = name.removesuffix("_rate")
+    coordinates = {*system.coordinate_names(), *displacement_names(system), *system.quantities()}
+    if name in system.joint_coordinates() or (base != name and base.split("[")[0] in coordinates):
         function = coordinate_function(system, t, at, base)
         if not _depends_on_velocities(function, at):
             return lambda state: _rate(system, t, function, state)
@@ -274,7 +274,7 @@ def _turns(system, rates=False):
     count = system.nu if rates or _has_invariants(system) else system.nq
     turns = np.zeros(count, bool)
     for body in system.motion_names() if system.has_bodies else ():
-        for name in (f"{body}.angle", f"{body}.angular_velocity"):
+        for name in (f"{body}.angle", f"{body}.angle_rate", f"{body}.angular_velocity"):
             turns[own.get(name, [])] = True
     return turns
 

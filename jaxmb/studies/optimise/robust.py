@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..._arguments import real_array
 from ..._types import VectorLike
-from ...parts.names import names_arguments, unknown
+from ...parts.names import UnknownNameError, names_arguments, unknown
 
 
 @names_arguments
@@ -60,6 +60,8 @@ def robust(
             moved = {name: values[name] + x if name in values else x for name, x in sample.items()}
             try:
                 out = function({**values, **moved}, **options)
+            except UnknownNameError:
+                raise
             except KeyError as error:
                 raise unknown("parameter", str(error.args[0]), [*values, *arrays]) from None
             return out if isinstance(out, Mapping) else {"objective": out}

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ..._compat import processes_of
 from .batch import Batch
 from .dataset import packages
 from .outputs import statuses
@@ -115,7 +116,7 @@ def on_processes(
                 ) from None
         finally:
             # Chunks that have begun are of no use when the sweep is interrupted or has failed.
-            for worker in list((pool._processes or {}).values()):
+            for worker in processes_of(pool):
                 worker.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend import core
 
+from ..._compat import ClosedJaxpr, Jaxpr, Literal, canonical, codes_of, is_enumerated, messages_of
 from ...parts.names import unknown
 from .identity import is_installed
 
@@ -63,7 +63,7 @@ def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixe
     if result is not None:
         steps = getattr(result, "stats", {}).get("num_steps")
         result = getattr(result, "result", result)
-        if not hasattr(result, "_enumeration"):
+        if not is_enumerated(result):
             raise ValueError(f"The output 'result' must be a trajectory or its result, got {type(result).__name__}.")
     values = dict(_flat("", given))
     for name in values:
@@ -137,9 +137,7 @@ def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **
     **Raises:** `ValueError` for what is no dictionary of arrays, and for a function that is not pure: one that gives
     other names, shapes or numbers when it is traced again.
     """
-    abstract = {
-        k: jax.ShapeDtypeStruct(np.shape(v), jax.dtypes.canonicalize_dtype(v.dtype)) for k, v in example.items()
-    }
+    abstract = {k: jax.ShapeDtypeStruct(np.shape(v), canonical(v.dtype)) for k, v in example.items()}
     # A new lambda each time, since JAX remembers what it has traced.
     trace = lambda: jax.make_jaxpr(lambda p: returned(function, p, **fixed), return_shape=True)(abstract)
     (program, found), (again, found_again) = trace(), trace()
@@ -157,9 +155,7 @@ def outputs_of(found: Returned) -> Outputs:
     """The outputs of one member, from the shapes that tracing gives."""
     statuses = [("pending", "Not computed yet."), ("ok", ""), ("not_finite", "An output is not finite.")]
     if found.result is not None:
-        kind = found.result._enumeration
-        # Equinox has no public way from the numbers of an enumeration to their names.
-        statuses += [(name, kind[item]) for name, item in kind._name_to_item.items()][1:]
+        statuses += list(messages_of(found.result).items())[1:]
     shapes = {name: (tuple(value.shape), np.dtype(value.dtype)) for name, value in found.values.items()}
     return Outputs(shapes, found.steps is not None, tuple(statuses))
 
@@ -185,8 +181,7 @@ def statuses(found: Returned) -> np.ndarray:
             finite &= np.isfinite(value).reshape(members, -1).all(axis=1)
     ended = np.where(finite, OK, NOT_FINITE)
     if found.result is not None:
-        kind, code = found.result._enumeration, np.asarray(found.result._value)
-        names = list(kind._name_to_item)
+        names, code = list(messages_of(found.result)), codes_of(found.result)
         # After an event the saved times that are left hold infinity, as in diffrax.
         by_event = code == (names.index("event_occurred") if "event_occurred" in names else -1)
         ended = np.where(code == 0, ended, np.where(by_event, OK, code + NOT_FINITE))
@@ -195,13 +190,13 @@ def statuses(found: Returned) -> np.ndarray:
 
 def _numbers(program: Any) -> Iterator[Any]:
     """The operations of a traced program by name, and the literals and constants in it, as bytes."""
-    if isinstance(program, core.ClosedJaxpr):
+    if isinstance(program, ClosedJaxpr):
         yield from (np.asarray(c).tobytes() for c in program.consts if _is_numeric(c))
         program = program.jaxpr
-    is_program = lambda x: isinstance(x, core.ClosedJaxpr | core.Jaxpr)
+    is_program = lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
     for equation in program.eqns:
         yield equation.primitive.name
-        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, core.Literal))
+        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
         for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):
             if is_program(inner):
                 yield from _numbers(inner)

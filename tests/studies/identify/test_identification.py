@@ -249,7 +249,7 @@ def test_multiple_shooting_where_single_shooting_fails():
     common = {
         "ts": ts,
         "fix": {"rod.angle": np.pi / 2},
-        "free_initial": ("rod.angle", "rod.angle.rate"),
+        "free_initial": ("rod.angle", "rod.angle_rate"),
         "sigma": {"rod.angle": 0.01},
         "solver": TSIT5,
     }
@@ -410,18 +410,18 @@ def test_sensors_with_times_of_their_own(motion):
     late = mb.simulate(own, start, t1=1.0, saveat=encoder - DELAY, solver=TSIT5)["theta"]
     rate = mb.simulate(own, start, t1=1.0, saveat=gyro, solver=TSIT5).ys.u[:, 0]
     data = {"encoder": late + 1e-3 * random.standard_normal(encoder.size)}
-    data["theta.rate"] = rate + 1e-2 * random.standard_normal(gyro.size)
-    sensors = [mb.Sensor("theta", name="encoder", sigma=1e-3), mb.Sensor("theta.rate", sigma=1e-2)]
+    data["theta_rate"] = rate + 1e-2 * random.standard_normal(gyro.size)
+    sensors = [mb.Sensor("theta", name="encoder", sigma=1e-3), mb.Sensor("theta_rate", sigma=1e-2)]
     common = {"free": {"length": 0.9, "damping": 0.2}, "sensors": sensors, "solver": TSIT5}
-    ts = {"encoder": encoder, "theta.rate": gyro}
+    ts = {"encoder": encoder, "theta_rate": gyro}
     fitted, unseen = (mb.Experiment(data, ts=ts, fix={"theta": 0.5}, held_out=out) for out in (False, True))
     fit = mb.identify(own, [fitted, unseen], **(common | {"free": common["free"] | {"encoder.delay": 0.01}}))
     assert fit.converged
     for name, true in {"length": 0.8, "damping": 0.3, "encoder.delay": DELAY}.items():
         assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name], name
     readings = fit.held_out["exp2"].readings
-    assert readings["encoder"].shape == encoder.shape and readings["theta.rate"].shape == gyro.shape
-    np.testing.assert_allclose((readings["theta.rate"] - data["theta.rate"]) / 1e-2, fit.residuals[15:], atol=1e-6)
+    assert readings["encoder"].shape == encoder.shape and readings["theta_rate"].shape == gyro.shape
+    np.testing.assert_allclose((readings["theta_rate"] - data["theta_rate"]) / 1e-2, fit.residuals[15:], atol=1e-6)
 
     whole = np.unique(np.concatenate([encoder, gyro]))
     among = {name: np.full(whole.size, np.nan) for name in ts}

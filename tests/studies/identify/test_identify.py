@@ -111,8 +111,8 @@ def test_lagrangian_system(swing):
     """A coordinate and its rate, at times of their own, from an angle and a rate that are given."""
     held = {"fix": {"theta": 0.5}, "rates": {"theta": 1.0}}
     motion = mb.simulate(swing, mb.assemble(swing, **held), t1=TS[-1], saveat=TS)
-    own = {"theta": slice(None, None, 2), "theta.rate": slice(1, None, 3)}
-    measured = {"theta": motion["theta"][own["theta"]], "theta.rate": motion.ys.u[own["theta.rate"], 0]}
+    own = {"theta": slice(None, None, 2), "theta_rate": slice(1, None, 3)}
+    measured = {"theta": motion["theta"][own["theta"]], "theta_rate": motion.ys.u[own["theta_rate"], 0]}
     ts = {name: TS[where] for name, where in own.items()}
     fit = mb.identify(swing, measured, ts=ts, free={"length": 1.1, "damping": 0.1}, **held, solver=TSIT5)
     assert fit.converged and fit.components == ("length", "damping")

@@ -24,7 +24,7 @@ def two_masses():
 def test_modes_keep_their_places_where_they_cross():
     values = np.linspace(1.0, 9.0, 18)
     locus = mb.root_locus(two_masses(), "k", values, state=mb.assemble)
-    assert locus.states == ("a", "b", "a.rate", "b.rate")
+    assert locus.states == ("a", "b", "a_rate", "b_rate")
     own = np.abs(locus.eigenvalues)
     first = np.argsort(own[0])
     np.testing.assert_allclose(own[:, first[:2]], np.sqrt(values)[:, None] * np.ones(2), rtol=1e-12)

@@ -58,8 +58,8 @@ class Case:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stability:
-    """The result of `stability`; `print` shows a table. `remarks`: cases that do not apply, and why."""
+class StressTest:
+    """The result of `stress_test`; `print` shows a table. `remarks`: cases that do not apply, and why."""
 
     mechanism: str
     t1: float
@@ -96,7 +96,7 @@ class Stability:
 
 _WORDS = {
     "small": "small: below what the reference can tell, ten times the difference of its two methods",
-    "unknown": "unknown: of Adams, Dopri8 and Hermite at a tight tolerance no two came to the end",
+    "unknown": "unknown: fewer than two of Adams, Dopri8 and Hermite reached the end at a tight tolerance",
 }
 
 
@@ -113,7 +113,7 @@ class _Trial(NamedTuple):
 
 
 @names_arguments
-def stability(
+def stress_test(
     system: AbstractSystem | Mechanism,
     state: State | None = None,
     *,
@@ -122,7 +122,7 @@ def stability(
     solver: diffrax.AbstractSolver | None = None,
     singular: Mapping[str, VectorLike] | None = None,
     only: Collection[str] | None = None,
-) -> Stability:
+) -> StressTest:
     """Simulate stiff and extreme variants of a motion, and measure the true error of each.
 
     The error is relative to a known motion where there is one: that of the given system for other tolerances, other
@@ -134,7 +134,7 @@ def stability(
     default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which the
     motion is started as well; `only`: the kinds of variants to try, default all of `KINDS`.
 
-    **Returns:** a `Stability`. A variant that cannot be built, or whose run fails, keeps its row, with a message.
+    **Returns:** a `StressTest`. A variant that cannot be built, or whose run fails, keeps its row, with a message.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver
@@ -152,7 +152,7 @@ def stability(
         except _NotHereError as reason:
             remarks.append(f"{kind}: {reason}.")
     name = type(solver).__name__
-    return Stability(mechanism.name, mechanism.t1, rtol, name, tuple(cases), tuple(remarks))
+    return StressTest(mechanism.name, mechanism.t1, rtol, name, tuple(cases), tuple(remarks))
 
 
 class _NotHereError(Exception):
@@ -342,7 +342,7 @@ def _distance(motion: Any, truth: Any) -> float:
     return max(float(np.max(np.abs((x - y)[-1]), initial=0.0)) / size(y) for x, y in zip(motion, truth, strict=True))
 
 
-def _plot(report: Stability) -> "Figure":
+def _plot(report: StressTest) -> "Figure":
     """The error of every variant, from top to bottom; refusals and unknown errors at the right."""
     figure = new_figure(7.5, 1.4 + 0.2 * len(report.cases))
     axes = figure.subplots()

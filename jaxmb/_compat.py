@@ -1,0 +1,245 @@
+"""Names and habits of JAX, equinox, diffrax and the standard library that their documentation does not promise.
+
+Each stands here once, with what it does and the versions that it was found in; `tests/test_compat.py` has a test of
+each, which says what is missing when an update takes it away.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, TypeVar
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from diffrax._term import AdjointTerm, WrapTerm
+from jax import lax
+from jax.core import ShapedArray
+from jax.extend import core
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+T = TypeVar("T")
+
+# JAX
+
+
+# Rules of functions in a batch: one that is given, and one member after the other. (jax.custom_batching, 0.7 to 0.10.)
+custom_vmap = jax.custom_batching.custom_vmap
+sequential_vmap = jax.custom_batching.sequential_vmap
+
+# The parts of traced programs. (jax.extend.core, 0.7 to 0.10; jax 0.11 changes what `scan` holds.)
+ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
+
+
+def default_float() -> np.dtype:
+    """The type of floating-point numbers, at a fiftieth of the time of `jnp.result_type(float)`.
+
+    (jax.dtypes.canonicalize_dtype, 0.7 to 0.10.)
+    """
+    return jax.dtypes.canonicalize_dtype(float)
+
+
+def canonical(dtype: Any) -> np.dtype:
+    """The type that JAX makes of one: of single precision unless `jax_enable_x64` is on."""
+    return jax.dtypes.canonicalize_dtype(dtype)
+
+
+def is_weakly_typed(array: Array) -> bool:
+    """Whether an array takes the type of what it is combined with, as Python's numbers do.
+
+    (`aval.weak_type` of arrays and tracers, jax 0.7 to 0.10.)
+    """
+    return array.aval.weak_type
+
+
+def define_bilinear(
+    name: str,
+    evaluate: Callable[..., Array],
+    shape: Callable[..., tuple[int, ...]],
+    gradients: tuple[Callable[..., Array], Callable[..., Array]],
+    parameters: tuple[str, ...] = (),
+) -> Callable[..., Array]:
+    """A new operation of JAX on two arrays of one type, linear in each, with its derivatives, its transposes and a rule
+    for batches; see `jaxmb.linalg.bilinear`.
+
+    (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10; `ad.defbilinear` makes derivatives and transposes of
+    the gradients.)
+    """
+
+    def batched(operands, axes, **static):
+        size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+        front = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(operands, axes, strict=True)
+        ]
+        return own.bind(*front, **static), 0
+
+    of_a, of_b = gradients
+    own = Primitive(name)
+    own.def_impl(jax.jit(evaluate, static_argnames=parameters))
+    own.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
+    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.defbilinear(own, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
+    batching.primitive_batchers[own] = batched
+    return own.bind
+
+
+# equinox
+
+
+def any_of_batch(pred: Any) -> Any:
+    """Whether a condition holds for any member of a batch, as one number even under `vmap`.
+
+    (equinox.internal.unvmap_any, 0.13.)
+    """
+    return eqxi.unvmap_any(pred)
+
+
+def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
+    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, and used only by those that do."""
+    new = lax.cond(any_of_batch(pred), true_fn, false_fn, operand)
+    return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))
+
+
+def is_enumerated(x: Any) -> bool:
+    """Whether something is an item of an `equinox.Enumeration`, such as a result of diffrax.
+
+    (EnumerationItem._enumeration, 0.13.)
+    """
+    return hasattr(x, "_enumeration")
+
+
+def messages_of(item: Any) -> dict[str, str]:
+    """The names and messages of all items of the enumeration of one, in the order of their codes.
+
+    (Enumeration._name_to_item, 0.13.)
+    """
+    kind = item._enumeration
+    return {name: kind[own] for name, own in kind._name_to_item.items()}
+
+
+def codes_of(item: Any) -> np.ndarray:
+    """The codes of an item, or of a batch of them. (EnumerationItem._value, 0.13.)"""
+    return np.asarray(item._value)
+
+
+def with_values(module: T, values: Mapping[str, Any]) -> T:
+    """A module of the same class with these values of all fields, as they are: without `__init__`, converters, checks.
+
+    (Modules are frozen dataclasses whose instances `object.__new__` makes and `object.__setattr__` fills, 0.13.)
+    """
+    out = object.__new__(type(module))
+    for name, value in values.items():
+        object.__setattr__(out, name, value)
+    return out
+
+
+# diffrax
+
+
+def unwrapped(term: Any) -> Any:
+    """The user's term, which diffrax wraps so that time increases, and once more in `BacksolveAdjoint`.
+
+    (diffrax._term.WrapTerm and AdjointTerm, 0.7.)
+    """
+    while isinstance(term, (WrapTerm, AdjointTerm)):
+        term = term.term
+    return term
+
+
+def inner_term(term: Any) -> Any:
+    """The term inside that which makes time increase. (WrapTerm.term, 0.7.)"""
+    return term.term
+
+
+def direction_of(term: Any) -> Any:
+    """The sign of the user's time in that of a solver; 1 for a term that is not wrapped. (WrapTerm.direction, 0.7.)"""
+    return term.direction if isinstance(term, WrapTerm) else 1
+
+
+def with_inner(terms: Any, inner: Any, direction: Any) -> Any:
+    """The same with another term inside and another direction."""
+    return eqx.tree_at(lambda terms: (terms.term, terms.direction), terms, (inner, direction))
+
+
+def from_controller(tolerances: Callable[..., T]) -> T:
+    """Tolerances with `rtol`, `atol` and `norm` that diffrax fills in from the step size controller.
+
+    A solver is never told its controller. Only the root finder of an implicit solver receives tolerances: those of
+    `diffrax.with_stepsize_controller_tols`, which is public, at the place `solver.root_finder`. So a multistep method
+    calls itself implicit, and its `root_finder` is not one. (0.7.)
+    """
+    return diffrax.with_stepsize_controller_tols(tolerances)()  # pyright: ignore[reportArgumentType]
+
+
+class WrappedSolver(diffrax.AbstractWrappedSolver):
+    """A diffrax solver inside another one, to which diffrax's settings are passed on.
+
+    diffrax's adjoints set `scan_kind`, of solvers that are, or wrap, Runge–Kutta methods: the kind of loop over stages,
+    without which it is not differentiable in forward mode or by `DirectAdjoint`. (0.7.)
+    """
+
+    solver: diffrax.AbstractSolver
+    scan_kind: Any = eqx.field(default=None, kw_only=True)
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        return self.solver.interpolation_cls
+
+    # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
+    @property
+    def root_finder(self) -> Any:
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self) -> int:
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    @property
+    def inner(self) -> Any:
+        """The solver, with the loops that the adjoint asked for."""
+        return self.with_own_loops(self.solver)
+
+    def with_own_loops(self, solver: Any) -> Any:
+        """Another solver with them."""
+        return with_loops(solver, self.scan_kind)
+
+
+def with_loops(solver: Any, kind: Any) -> Any:
+    """A solver with loops of a kind over its stages, where it has any."""
+    if kind is None or not hasattr(solver, "scan_kind"):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+def steps_of(interpolation: diffrax.DenseInterpolation) -> tuple[Array, Array]:
+    """The starts of all steps of a dense solution, in the solver's time, and the sign of the user's time in it.
+
+    (DenseInterpolation.ts and .direction, 0.7.)
+    """
+    return interpolation.ts, jnp.asarray(interpolation.direction, interpolation.ts.dtype)
+
+
+# The standard library
+
+
+def processes_of(pool: ProcessPoolExecutor) -> list[Any]:
+    """The processes of a pool. (ProcessPoolExecutor._processes, Python 3.11.)"""
+    return list((pool._processes or {}).values())

@@ -1,0 +1,157 @@
+"""The constraints at a state, and return to them from a state close by.
+
+A step of a multistep method evaluates at a prediction, and then at a corrected state beside it. Only the first of them
+needs an elimination: with the factor of the prediction, Newton's method (with one matrix, the chord method) restores
+positions and velocities, and corrects the accelerations of the prediction. Each correction leaves an error of the size
+of the distance between the two states, so at tolerances of 1e-6 and below the first one of each suffices.
+
+Derivatives follow from the equations at the state that is found, with a factor of that state, by the implicit function
+theorem, not from the algorithm: they are independent of the formulation, and cannot pick up a frozen iterate.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._types import Scalar, State
+from ..linalg.inertia import AbstractInertia
+from ..system import AbstractEquation
+
+
+class AbstractConstraints(eqx.Module):
+    """The constraints that are active, linearised at a state.
+
+    A chart solves for the dependent coordinates and velocities and keeps the independent ones; a projector makes the
+    smallest changes in a metric. What they do to residuals is linear, so JAX transposes it.
+    """
+
+    @abc.abstractmethod
+    def restore(
+        self, system: AbstractEquation, t: Scalar, y: State, near: "SolvedState", tol: Scalar
+    ) -> "RestoredState":
+        """`restore`, without derivative."""
+
+    @abc.abstractmethod
+    def at(
+        self, system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
+    ) -> "AbstractConstraints":
+        """The same rows in the same split or metric, linearised at another state."""
+
+    @abc.abstractmethod
+    def multipliers(self, system: AbstractEquation, t: Scalar, restored: "RestoredState") -> Float[Array, "m"]:
+        """The multipliers of a state with its accelerations, at the state of this linearisation."""
+
+    @abc.abstractmethod
+    def push_positions(self, at: tuple[Any, ...], along: tuple[Any, ...]) -> Float[Array, "nq"]:
+        """The tangent of restored coordinates, from (system, t, q) at the state of this linearisation and its tangent
+        before they are restored.
+        """
+
+    @abc.abstractmethod
+    def cancel_velocities(self, residual: Float[Array, "m"]) -> Float[Array, "nu"]:
+        """The change of velocities that changes the rows of ψ by `−residual`, to all digits."""
+
+    @abc.abstractmethod
+    def cancel_accelerations(
+        self, inertia: AbstractInertia, forces: Float[Array, "nu"], rows: Float[Array, "m"]
+    ) -> Float[Array, "nu"]:
+        """The change of accelerations, together with one of the multipliers, that changes `M u̇ − F − Aᵀ λ` by `−forces`
+        and `A u̇ − γ` by `−rows`.
+        """
+
+
+class SolvedState(eqx.Module):
+    """A state whose equations of motion are solved; constants.
+
+    **Fields:** the `constraints` there; the accelerations `udot`; the `multipliers`, or None if they are not known.
+    """
+
+    constraints: AbstractConstraints
+    udot: Float[Array, "nu"]
+    multipliers: Float[Array, "m"] | None
+
+
+class RestoredState(eqx.Module):
+    """A state on the constraints and its accelerations.
+
+    **Fields:** `q`, `u`, `udot`; `multipliers`, or None if they are not known; the number of `iterations` for positions
+    and whether any iteration `failed`; all but the first three are None in tangents.
+    """
+
+    q: Float[Array, "nq"]
+    u: Float[Array, "nu"]
+    udot: Float[Array, "nu"]
+    multipliers: Float[Array, "m"] | None = None
+    iterations: Int[Array, ""] | None = None
+    failed: Bool[Array, ""] | None = None
+
+
+# Wrapped in a compiled function, so that it is traced once for all its places.
+@eqx.filter_jit
+def restore(system: AbstractEquation, t: Scalar, y: State, near: SolvedState, tol: Scalar) -> RestoredState:
+    """Restore a state to ideal constraints and find the accelerations there.
+
+    Derivatives are exact in a chart; those of a projector for a state on the constraints, and off them wrong by the
+    size of the displacement.
+
+    **Arguments:** `y`: a state near the constraints, whose independent entries a chart keeps; `near`: a state close by
+    at the same time; `tol`: size of the corrections that are left out, relative to the system's size, its speed and its
+    accelerations.
+    """
+    return _restore(system, t, y, near, tol)
+
+
+@eqx.filter_custom_jvp
+def _restore(system, t, y, near, tol):
+    return near.constraints.restore(system, t, y, near, tol)
+
+
+@_restore.def_jvp
+def _restore_jvp(primals, tangents):
+    system, t, y, near, tol = primals
+    dsystem, dt, dy, _, _ = tangents
+    out = restore(system, t, y, near, tol)
+    # The factor of the other state solves the equations, but only that of this state differentiates them.
+    here = near.constraints.at(system, t, out.q, out.u)
+    dq = here.push_positions((system, t, out.q), (dsystem, dt, dense(dy.q, y.q)))
+    along = push_velocities(here, (system, t, out.q, out.u), (dsystem, dt, dq, dense(dy.u, y.u)))
+    dudot = push_accelerations(here, (system, t, out.q, out.u), along, out)
+    return out, RestoredState(dq, along[3], dudot)
+
+
+def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The tangent of (system, t, q, u) with that of velocities on the constraints."""
+    dsystem, dt, dq, du = along
+    rows = push(lambda s, t, q, u: s.velocity_residual(t, q, u), at, along)
+    return dsystem, dt, dq, du + here.cancel_velocities(rows)
+
+
+def push_accelerations(
+    here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...], out: RestoredState
+) -> Float[Array, "nu"]:
+    """The tangent of the accelerations at (system, t, q, u)."""
+    system, t, q, u = at
+    udot, multipliers = out.udot, here.multipliers(system, t, out)
+
+    def equations(system, t, q, u):
+        applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
+        return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
+
+    rows, forces = push(equations, at, along)
+    return here.cancel_accelerations(system.inertia(t, q, u), forces, rows)
+
+
+def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:
+    """The tangent of a function's value, zeros where it does not depend on what moves."""
+    value, tangent = eqx.filter_jvp(function, at, along)
+    if isinstance(value, tuple):
+        return tuple(dense(*both) for both in zip(tangent, value, strict=True))
+    return dense(tangent, value)
+
+
+def dense(tangent: Float[Array, "*n"] | None, like: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """A tangent, zeros for None."""
+    return jnp.zeros_like(like) if tangent is None else tangent

@@ -1,0 +1,239 @@
+"""Newton's method for the implicit equation of a step that uses the second derivative.
+
+A step solves `y = past + a f(t, y) + b g(t, y)`, where `g` is the time derivative of `f` along the solution: one
+directional derivative of `f`, exact. The iteration is the same for all linearisations: full matrices (`_dense`), and
+those that know their structure (`_structured`).
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from .._compat import cond_of_any_lane
+from ._field import Derivatives, Field, derivatives
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+_MAX_ITERATIONS = 10
+# If a matrix of an earlier step has failed, this number of steps compute their own.
+_DISTRUST = 10
+# If a correction is larger than this fraction of the state and its change, the matrix is not reliable at its end.
+_FAR = 0.1
+# The largest number of matrices for a step; and the code for success.
+_ATTEMPTS, _DONE = 4, 9
+
+
+class StepEquation(eqx.Module):
+    """The equation `y = past + a f(t, y) + b g(t, y)` of a step.
+
+    **Fields:** `field`; `jacobian(y)`: its derivative that knows its structure, with the direction of time, or None;
+    `t`, the end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns among the
+    components of the state.
+    """
+
+    field: Field
+    jacobian: Callable[[Float[Array, " n"]], Any]
+    t: Any
+    h: Any
+    past: Float[Array, " n"]
+    a: Any
+    b: Any
+    free: Int[Array, " free"]
+
+
+class AbstractLinearization(eqx.Module):
+    """How a state and its derivatives in time change with the unknowns of a step `y = past + a f + b g`.
+
+    **Fields:** `spectrum`: eigenvalues of the derivative J of the field; `renewals`: the number of next steps that must
+    compute their own linearisation.
+
+    `inverses` is what `inverses(equation)` returns, the solved form of Newton's equation.
+    """
+
+    spectrum: AbstractVar[Complex[Array, " k"]]
+    renewals: AbstractVar[Int[Array, ""]]
+
+    @property
+    @abc.abstractmethod
+    def patience(self) -> int:
+        """The number of iterations that cost about as much as a new linearisation."""
+
+    @property
+    @abc.abstractmethod
+    def slow(self) -> float:
+        """The linearisation is renewed after a step whose corrections shrank more slowly than by this factor."""
+
+    @abc.abstractmethod
+    def probed(self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None) -> Derivatives:
+        """The derivatives of the field, with a warning if its differences contradict them; `size` of the components."""
+
+    @abc.abstractmethod
+    def renewed(self, equation: StepEquation, y: Float[Array, " n"], rate: Float[Array, " n"]) -> Any:
+        """The linearisation at another state, for a rate."""
+
+    @abc.abstractmethod
+    def inverses(self, equation: StepEquation) -> Any:
+        """The solved form of Newton's equation."""
+
+    @abc.abstractmethod
+    def no_inverses(self, equation: StepEquation) -> Any:
+        """Zeros in its place."""
+
+    @abc.abstractmethod
+    def observed(self, inverses: Any, anew: Bool[Array, ""]) -> Any:
+        """With a spectrum that needs the inverses; `anew`: whether the linearisation is new."""
+
+    @abc.abstractmethod
+    def moved(self, change: Float[Array, " free"]) -> Float[Array, " n"]:
+        """The change of the state with the unknowns."""
+
+    @abc.abstractmethod
+    def correction(
+        self,
+        inverses: Any,
+        equation: StepEquation,
+        y: Float[Array, " n"],
+        f: Float[Array, " n"],
+        g: Float[Array, " n"],
+        along: Float[Array, " n"],
+    ) -> tuple[Float[Array, " free"], Float[Array, " free"], Float[Array, " n"], Float[Array, " n"]]:
+        """The correction of the unknowns, with and without the derivative of g at a held rate, and f and g after it.
+
+        **Arguments:** `f`, `g`: at y, g along a rate `along` that f approaches.
+        """
+
+    @abc.abstractmethod
+    def errors(
+        self, inverses: Any, free: Int[Array, " free"], changes: Float[Array, "formulas n"]
+    ) -> Float[Array, "formulas n"]:
+        """The changes of the solution with those of the past, also of what does not follow from the unknowns."""
+
+    @abc.abstractmethod
+    def differentiable(
+        self, inverses: Any, equation: StepEquation, end: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Array]:
+        """`(y, f, g)` at the `end` of a step, the solution of its equation, with its exact derivatives."""
+
+
+class Solved(NamedTuple):
+    """The end of a step, without derivatives; whether Newton's method `converged`; its last matrix, with the inverses;
+    and its `work`: numbers of evaluations of f and g, and of matrices.
+    """
+
+    end: Derivatives
+    converged: Bool[Array, ""]
+    matrix: AbstractLinearization
+    inverses: Any
+    work: Int[Array, "2"]
+
+
+class _Iterate(NamedTuple):
+    """`change` is the next correction, `size` its norm (the larger of those with and without the derivative of g at a
+    held rate), and `rate` the ratio of `size` to the previous one.
+    """
+
+    end: Derivatives
+    change: Float[Array, " free"]
+    size: Float[Array, ""]
+    rate: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+class Newton(eqx.Module):
+    """Newton's method for the equation of a step.
+
+    The iteration starts from the predicted y and rate, with the current iteration matrix (modified Newton). If
+    iterations with it would cost more than a new matrix, one is computed at the best y so far, for the rate there. The
+    prediction is not good enough where the direction of a stiff spring turns: the error of its rate is multiplied by
+    the stiffness and changes the matrix considerably.
+
+    g is evaluated along the predicted rate, then along the f after each correction. In f itself the error of y is
+    multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the square of
+    the step: Newton's method would converge only from nearby, and on Robertson's reaction only inside a basin smaller
+    than round-off.
+
+    If the error of the prediction is as large as the state, as at the end of a fast transient, the matrix there may be
+    so large that the second correction appears negligible far from any solution; it is not computed.
+
+    **Fields:** the `equation`; `size`: the norm of a correction in units of the tolerance; `tol`: the norm of the last
+    correction, which is not applied to y, and to f and g only through the current matrix, since stiffness would
+    multiply its error there and spoil predictions.
+    """
+
+    equation: StepEquation
+    size: Callable[[Array], Any]
+    tol: float
+
+    def solve(
+        self,
+        predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
+        before: tuple[Float[Array, " n"], Float[Array, " n"]],
+        matrix: AbstractLinearization,
+    ) -> Solved:
+        """The end of the step, from the `predicted` y and rate, with the current matrix.
+
+        **Arguments:** `before`: the state before the step and its rate, where Newton's method restarts if the field was
+        not finite.
+        """
+        equation, size, tol = self.equation, self.size, self.tol
+        field, t = equation.field, equation.t
+        shapes = eqx.filter_eval_shape(derivatives, field, t, predicted[0])
+        blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
+        nothing = jax.tree.map(blank, shapes)
+        none, one = jnp.zeros((), jnp.int32), jnp.ones((), equation.past.dtype)
+
+        def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
+            (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.moved(carry.change), has_aux=True)
+            along = carry.end.f
+            g = push(jnp.ones_like(t), along)[1]
+            change, without, corrected, g = matrix.correction(inverses, equation, y, f, g, along)
+            now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
+            return _Iterate(Derivatives(y, corrected, g, rest), change, now, now / carry.size, carry.iterations + 1)
+
+        patience = matrix.patience
+        far = jnp.maximum(_FAR * (size(before[0]) + size(equation.a * before[1])), 1.0)
+
+        def proceed(carry: _Iterate) -> Bool[Array, ""]:
+            hopeful = (carry.iterations < 2) | (carry.size * carry.rate**patience <= tol)
+            hopeful = hopeful & ((carry.iterations < 1) | (carry.size <= far))
+            # Before the first iteration the size is infinite.
+            return ~(carry.size <= tol) & (carry.iterations < _MAX_ITERATIONS) & hopeful
+
+        def attempt(carry):
+            k, (start, rate), matrix, _, _, work = carry
+            anew = (matrix.renewals > 0) | (k > 0)
+            renewed = lambda old: eqx.tree_at(lambda m: m.renewals, old.renewed(equation, start, rate), old.renewals)
+            matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
+            inverses = matrix.inverses(equation)
+            matrix = matrix.observed(inverses, anew)
+            first = _Iterate(
+                nothing._replace(y=start, f=rate), jnp.zeros(equation.free.size, one.dtype), one * jnp.inf, one, none
+            )
+            last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
+            converged = last.size <= tol
+            slow = (last.iterations > 2) & (last.rate > matrix.slow)
+            renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
+            renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
+            matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
+            # A matrix is not computed for the same state again.
+            farther = jnp.where(anew, last.end.y, start)
+            nearest = jnp.where(last.rate < 1, last.end.y - matrix.moved(last.change), farther)
+            finite = jnp.isfinite(last.size)
+            place = jnp.where(finite, nearest, before[0]), jnp.where(finite, last.end.f, before[1])
+            work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
+            return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
+
+        inverses = matrix.no_inverses(equation)
+        carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
+        k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
+        return Solved(end, k == _DONE, matrix, inverses, work)

@@ -1,0 +1,314 @@
+"""Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
+
+import ast
+import importlib
+import importlib.metadata
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent / "jaxmb"
+COMPAT = ROOT / "_compat.py"
+# Modules and attributes that only `_compat` may use.
+PRIVATE_MODULES = ("equinox.internal", "jax.extend", "jax.interpreters", "jax._src", "jax.custom_batching")
+PRIVATE_ATTRIBUTES = {
+    *("custom_batching", "weak_type", "canonicalize_dtype", "unvmap_any", "scan_kind", "with_stepsize_controller_tols"),
+    *("_enumeration", "_name_to_item", "_index_to_message", "_processes"),
+}
+
+
+def nodes(path):
+    return ast.walk(ast.parse(path.read_text()))
+
+
+def is_private(module):
+    return module.startswith(PRIVATE_MODULES) or any(part.startswith("_") for part in module.split("."))
+
+
+def imported(path):
+    """The names of other packages that a file imports, with their modules."""
+    for node in nodes(path):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+@pytest.mark.parametrize("module, name", [pair for pair in imported(COMPAT) if is_private(pair[0])])
+def test_private_names_exist(module, name):
+    package = module.split(".")[0]
+    message = f"{package} {importlib.metadata.version(package)} has no {module}.{name or ''}, which jaxmb._compat uses"
+    try:
+        found = importlib.import_module(module)
+    except ImportError:
+        pytest.fail(message)
+    assert name is None or hasattr(found, name), message
+
+
+def test_only_compat_uses_private_names():
+    for path in set(ROOT.rglob("*.py")) - {COMPAT}:
+        for module, name in imported(path):
+            whole = f"{module}.{name}" if name else module
+            own = module.startswith("__future__") or not (is_private(module) or whole.startswith(PRIVATE_MODULES))
+            assert own, f"{path.name} imports {whole}: private names of other packages belong in _compat.py"
+        for node in nodes(path):
+            if isinstance(node, ast.Attribute):
+                about = f"{path.name}:{node.lineno} uses .{node.attr}, which belongs in _compat.py"
+                assert node.attr not in PRIVATE_ATTRIBUTES, about
+                assert not (node.attr == "__new__" and getattr(node.value, "id", "") == "object"), about
+
+
+@pytest.fixture(scope="module")
+def compat():
+    return importlib.import_module("jaxmb._compat")
+
+
+# JAX
+
+
+def test_members_of_a_batch_can_be_taken_one_after_the_other(compat):
+    shapes = []
+
+    @compat.sequential_vmap
+    def double(x):
+        shapes.append(x.shape)
+        return 2 * x
+
+    x = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(jax.vmap(double)(x), 2 * x)
+    assert set(shapes) == {(2,)}, "sequential_vmap of jax.custom_batching hands whole batches to the function"
+
+
+def test_functions_can_have_rules_for_batches(compat):
+    @compat.custom_vmap
+    def double(x):
+        return 2 * x
+
+    @double.def_vmap
+    def rule(size, batched, x):
+        assert size == 3 and batched == [True]
+        return 2 * x + 1, True
+
+    np.testing.assert_array_equal(jax.vmap(double)(jnp.zeros(3)), np.ones(3))
+
+
+def test_types_of_numbers(compat):
+    assert compat.default_float() == jnp.result_type(float), "jax.dtypes.canonicalize_dtype(float) is no float's type"
+    with jax.enable_x64(False):
+        assert compat.default_float() == np.float32
+        assert compat.canonical(np.float64) == np.float32
+
+
+def test_weak_types(compat):
+    about = "the weak type of arrays is no longer told by `.aval.weak_type`"
+    assert compat.is_weakly_typed(jnp.asarray(1.0)) is True, about
+    assert compat.is_weakly_typed(jnp.asarray(1.0, float)) is False, about
+    jax.jit(lambda x, y: [x, compat.is_weakly_typed(x) and pytest.fail(about)])(jnp.zeros(1), 1.0)
+
+
+def test_programs_can_be_read(compat):
+    program = jax.make_jaxpr(lambda x: jax.lax.cond(x > 0, lambda: x, lambda: 2.0 * x))(1.0)
+    assert isinstance(program, compat.ClosedJaxpr)
+    assert any(isinstance(v, compat.Literal) for equation in program.jaxpr.eqns for v in equation.invars)
+    kinds = compat.ClosedJaxpr | compat.Jaxpr
+    inner = [
+        x for own in program.jaxpr.eqns for x in jax.tree.leaves(own.params, is_leaf=lambda x: isinstance(x, kinds))
+    ]
+    assert any(isinstance(x, kinds) for x in inner), "branches of `cond` are no programs in the parameters of `cond`"
+
+
+def test_bilinear_operations(compat):
+    outer = compat.define_bilinear(
+        "outer_of_test",
+        lambda a, b: a[..., :, None] * b[..., None, :],
+        lambda a, b: (*a.shape, b.shape[-1]),
+        (
+            lambda c, b: jnp.sum(c * b[..., None, :], axis=-1),
+            lambda c, a: jnp.sum(c * a[..., :, None], axis=-2),
+        ),
+    )
+    a, b = jnp.array([1.0, 2.0]), jnp.array([3.0, -1.0, 0.5])
+
+    def value(outer, a, b):
+        return jnp.sum(jnp.sin(outer(a, b)) ** 2)
+
+    for through in (lambda f: f, jax.jit, lambda f: jax.grad(f, argnums=1), lambda f: jax.jacfwd(jax.grad(f))):
+        found = through(lambda a, b: value(outer, a, b))(a, b)
+        np.testing.assert_allclose(found, through(lambda a, b: value(jnp.outer, a, b))(a, b), rtol=1e-14)
+    several = jnp.stack([b, 2 * b])
+    np.testing.assert_array_equal(jax.vmap(outer, in_axes=(None, 0))(a, several)[1], jnp.outer(a, 2 * b))
+
+
+# equinox
+
+
+def test_conditions_of_a_batch(compat):
+    def branched(x):
+        return compat.cond_of_any_lane(x > 1, lambda x: 2 * x, lambda x: x, x)
+
+    np.testing.assert_array_equal(jax.vmap(branched)(jnp.arange(3.0)), [0.0, 1.0, 4.0])
+    names = [own.primitive.name for own in jax.make_jaxpr(jax.vmap(branched))(jnp.arange(3.0)).jaxpr.eqns]
+    assert "cond" in names, "equinox.internal.unvmap_any no longer makes one condition of those of a batch"
+
+
+def test_enumerations(compat):
+    about = "items of equinox.Enumeration no longer hold their class, their code or all names"
+
+    class Results(diffrax.RESULTS):
+        stuck = "It is stuck."
+
+    assert compat.is_enumerated(Results.stuck) and not compat.is_enumerated("stuck"), about
+    messages = compat.messages_of(Results.successful)
+    assert next(iter(messages)) == "successful" and messages["stuck"] == "It is stuck.", about
+    batch = jax.vmap(lambda bad: Results.where(bad, Results.stuck, Results.successful))(jnp.array([True, False]))
+    codes = compat.codes_of(batch)
+    assert [list(messages)[code] for code in codes] == ["stuck", "successful"], about
+
+
+def test_modules_can_be_copied_without_their_checks(compat):
+    class Positive(eqx.Module):
+        value: Any = eqx.field(converter=float)
+
+        def __check_init__(self):
+            if self.value <= 0:
+                raise ValueError
+
+    copy = compat.with_values(Positive(1), {"value": "none"})
+    assert type(copy) is Positive and copy.value == "none", "equinox converts or checks fields that are set afterwards"
+    assert jax.tree.leaves(copy) == ["none"]
+    with pytest.raises(AttributeError):
+        copy.value = 1.0
+
+
+# diffrax
+
+
+def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=None):
+    term = diffrax.ODETerm(lambda t, y, args: rate * y)
+    return diffrax.diffeqsolve(
+        term,
+        solver,
+        0.0,
+        t1,
+        0.1 * t1,
+        jnp.array([1.0, 2.0]),
+        adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        stepsize_controller=diffrax.ConstantStepSize() if controller is None else controller,
+        saveat=diffrax.SaveAt(t1=True) if saveat is None else saveat,
+        max_steps=64,
+    )
+
+
+def test_terms_are_wrapped_once(compat):
+    seen = []
+
+    class Spy(compat.WrappedSolver):
+        def init(self, terms, t0, t1, y0, args):
+            seen.append((compat.inner_term(terms), compat.unwrapped(terms), compat.direction_of(terms)))
+            renewed = compat.with_inner(terms, "another", 1)
+            assert (compat.inner_term(renewed), compat.direction_of(renewed)) == ("another", 1)
+            return self.solver.init(terms, t0, t1, y0, args)
+
+        def step(self, terms, *args):
+            return self.inner.step(terms, *args)
+
+    with jax.disable_jit():
+        solve(Spy(diffrax.Euler()), t1=-1.0)
+    (inner, unwrapped, direction), *_ = seen
+    about = "diffrax no longer puts one WrapTerm with a term and a direction around the terms of a solver"
+    assert isinstance(inner, diffrax.ODETerm) and inner is unwrapped, about
+    assert direction == -1, about
+    assert compat.direction_of(diffrax.ODETerm(lambda t, y, args: y)) == 1
+
+
+def test_solvers_are_told_tolerances(compat):
+    seen = []
+
+    class Tolerances(eqx.Module):
+        rtol: Any
+        atol: Any
+        norm: Any
+
+    class Told(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
+        tolerances: Tolerances
+        term_structure: ClassVar = diffrax.AbstractTerm
+        interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+        root_find_max_steps: ClassVar = 0
+
+        @property
+        def root_finder(self):
+            return self.tolerances
+
+        def init(self, terms, t0, t1, y0, args):
+            seen.append((self.tolerances.rtol, self.tolerances.atol, self.tolerances.norm))
+
+        def order(self, terms):
+            return 1
+
+        def func(self, terms, t0, y0, args):
+            return terms.vf(t0, y0, args)
+
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            y1 = y0 + terms.vf_prod(t0, y0, args, terms.contr(t0, t1))
+            return y1, jnp.zeros_like(y0), {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+    controller = diffrax.PIDController(rtol=0.25, atol=0.125, norm=jnp.max)
+    with jax.disable_jit():
+        solve(Told(compat.from_controller(Tolerances)), controller=controller)
+    about = "diffrax no longer fills in the tolerances of a solver's root_finder from the step size controller"
+    assert {(float(rtol), float(atol), norm) for rtol, atol, norm in seen} == {(0.25, 0.125, jnp.max)}, about
+
+
+@pytest.mark.parametrize(
+    "adjoint, kind",
+    [
+        (diffrax.ForwardMode(), "lax"),
+        (diffrax.DirectAdjoint(), "bounded"),
+        (diffrax.RecursiveCheckpointAdjoint(), None),
+    ],
+    ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractAdjoint) else "",
+)
+def test_adjoints_choose_the_loops_of_wrapped_solvers(compat, adjoint, kind):
+    seen = set()
+
+    class Spy(compat.WrappedSolver):
+        def init(self, terms, t0, t1, y0, args):
+            return self.solver.init(terms, t0, t1, y0, args)
+
+        def step(self, terms, *args):
+            seen.add((self.scan_kind, self.inner.scan_kind, compat.with_loops(self.solver, "lax").scan_kind))
+            return self.inner.step(terms, *args)
+
+    final = lambda rate: solve(Spy(diffrax.Tsit5()), rate, adjoint=adjoint).ys[0, 0]
+    differentiate = jax.jacfwd if kind == "lax" else jax.grad
+    np.testing.assert_allclose(differentiate(final)(-1.0), np.exp(-1.0), rtol=1e-4)
+    about = f"{type(adjoint).__name__} no longer sets `scan_kind` of Runge–Kutta methods, also of wrapped ones"
+    assert seen == {(kind, kind, "lax")}, about
+
+
+def test_steps_of_dense_solutions(compat):
+    saveat = diffrax.SaveAt(dense=True, steps=True)
+    solution = solve(diffrax.Euler(), t1=-1.0, saveat=saveat)
+    starts, direction = compat.steps_of(solution.interpolation)
+    about = "dense solutions of diffrax no longer tell their steps in increasing time, and the direction of time"
+    assert direction == -1 and direction.dtype == starts.dtype, about
+    np.testing.assert_allclose(starts[1:11], -solution.ts[:10], err_msg=about)
+
+
+# The standard library
+
+
+def test_processes_of_a_pool(compat):
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        own = pool.submit(os.getpid).result()
+        assert [process.pid for process in compat.processes_of(pool)] == [own], "a pool no longer lists its processes"
+    assert compat.processes_of(pool) == []
