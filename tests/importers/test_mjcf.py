@@ -5,7 +5,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model_files import HINGE, OFF, ROD, check_dynamics, file, kinds, part, random_states, rod
+from model_files import HINGE, OFF, ROD, body_accelerations, check_dynamics, file, kinds, part, random_states, rod
 from scipy.integrate import solve_ivp
 
 import jaxmb as mb

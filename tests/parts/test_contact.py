@@ -1,4 +1,4 @@
-"""Terrains, and the contact of bodies with them."""
+"""Contact of bodies with terrain, and its laws of normal force and friction."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
-from laws import BUMP, FRICTION, JANOSI, LAWS, TERRAINS
+from laws import BUMP, FRICTION, JANOSI, LAWS
 from oracles import tracked_vehicle as oracle
 from scipy.integrate import quad
 
@@ -30,55 +30,6 @@ def three_wheels(kind=planar.Contact, **changes):
         "damping": 2e4,
     }
     return kind("road", ("a", "b", "c"), **(options | changes))
-
-
-# Terrains
-
-
-@pytest.mark.parametrize("name", TERRAINS)
-def test_heights_and_slopes_are_continuous(name):
-    """And curvatures but for those of the bump at its ends."""
-    of = TERRAINS[name]
-    height = lambda x: of.height(x[None])
-    slope = jax.grad(height)
-    x = jnp.linspace(2.5, 6.5, 4001)
-    values = [np.asarray(jax.vmap(f)(x)) for f in (height, slope, jax.grad(slope))]
-    h = float(x[1] - x[0])
-    # Jumps would show as differences that do not become small with the distance.
-    curvature = np.max(np.abs(values[2])) + 1.0
-    assert np.max(np.abs(np.diff(values[1]))) <= 1.1 * h * curvature
-    if name != "bump":
-        assert np.max(np.abs(np.diff(values[2]))) <= 100 * h * curvature
-    np.testing.assert_allclose(
-        np.diff(values[0]) / h, 0.5 * (values[1][1:] + values[1][:-1]), rtol=0, atol=h * curvature
-    )
-
-
-def test_bump_is_that_of_the_vehicle():
-    x = np.linspace(3.5, 6.0, 101)
-    height, slope = oracle.bump(x)
-    np.testing.assert_allclose(jax.vmap(BUMP.height)(x[:, None]), height, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(jax.vmap(jax.grad(BUMP.height))(x[:, None])[:, 0], slope, rtol=0, atol=1e-14)
-
-
-def test_spline_goes_through_its_points_and_follows_parabolas():
-    x = np.array([-1.0, 0.0, 0.3, 1.0, 1.5, 2.5])
-    at = lambda part, x: jax.vmap(part.height)(jnp.asarray(x)[:, None])
-    wild = np.sin(7 * x)
-    spline = terrain.Spline(x=x, heights=wild)
-    np.testing.assert_allclose(at(spline, x), wild, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(at(spline, [-3.0, 4.5])[0], wild[0] - 2 * (wild[1] - wild[0]), rtol=1e-13)
-    parabola = lambda x: 0.3 - 0.2 * x + 0.5 * x**2
-    between = np.linspace(0.0, 1.5, 31)
-    np.testing.assert_allclose(
-        at(terrain.Spline(x=x, heights=parabola(x)), between), parabola(between), rtol=0, atol=1e-14
-    )
-    with pytest.raises(ValueError, match="must ascend"):
-        terrain.Spline(x=[0.0, 0.0, 1.0], heights=[0.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="same length"):
-        terrain.Spline(x=[0.0, 1.0], heights=[0.0, 0.0])
-    with pytest.raises(ValueError, match="length must be positive"):
-        terrain.Bump(start=0.0, length=0.0, peak=0.1)
 
 
 # Laws

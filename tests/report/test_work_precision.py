@@ -1,9 +1,8 @@
-"""Work–precision reports: errors, references, counts of evaluations, and what is written."""
+"""Work–precision reports: errors, references, and what is written."""
 
 import dataclasses
 import json
 import sys
-import time
 
 import diffrax
 import jax
@@ -13,11 +12,9 @@ import pytest
 from PIL import Image
 
 from jaxmb import mechanisms
-from jaxmb.formulations import Multipliers, Partitioned
-from jaxmb.report import every_formulation, formulation_costs, interleaved, work_precision
-from jaxmb.report.evaluations import evaluations
+from jaxmb.report import work_precision
 from jaxmb.report.reference import reference
-from jaxmb.solvers import Adams, MultistepController
+from jaxmb.solvers import Adams
 
 
 @pytest.fixture(scope="module")
@@ -82,49 +79,6 @@ def test_failed_run_keeps_its_row(pendulum):
     assert "failed" in str(failed) and run.message in str(failed)
 
 
-@pytest.mark.parametrize("solver", [Adams(), diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Bosh3()])
-def test_evaluations_are_those_that_happen(solver):
-    count = 0
-
-    def field(t, y, args):
-        jax.debug.callback(tick)
-        return -y * (1 + jnp.sin(20 * t))
-
-    def tick():
-        nonlocal count
-        count += 1
-
-    controller = (MultistepController if isinstance(solver, Adams) else diffrax.PIDController)(rtol=1e-6, atol=1e-8)
-    saveat = diffrax.SaveAt(t1=True, solver_state=True)
-    term = diffrax.ODETerm(field)
-    solution = diffrax.diffeqsolve(
-        term, solver, 0.0, 2.0, None, jnp.ones(1), stepsize_controller=controller, saveat=saveat
-    )
-    jax.block_until_ready(solution.ys)
-    jax.effects_barrier()
-    stats = dict(solution.stats)
-    if isinstance(solver, Adams):
-        stats["num_evaluations"] = solution.solver_state.step_counts[0] + 2 * stats["num_steps"]
-    uncounted = 0 if isinstance(solver, Adams) else 2
-    assert 0 <= count - evaluations(solver, stats) <= uncounted
-
-
-def test_evaluations_of_implicit_methods_are_unknown():
-    assert evaluations(diffrax.Kvaerno5(), {"num_steps": 3}) is None
-
-
-def test_interleaved_takes_turns():
-    calls = []
-
-    def run(k):
-        calls.append(k)
-        time.sleep(0.002 * k)
-
-    short, long = interleaved([lambda: run(1), lambda: run(2)], 3)
-    assert calls == [1, 2] * 4
-    assert len(short) == len(long) == 3 and min(long) > min(short)
-
-
 def test_no_arguments_to_work_with(pendulum):
     for arguments in ({"solvers": {}}, {"tolerances": ()}, {"repeats": 0}):
         with pytest.raises(ValueError, match="at least one"):
@@ -135,25 +89,3 @@ def test_figures_without_matplotlib(precision, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"jaxmb\[plot\]"):
         precision.figure(tmp_path / "figure.png")
-
-
-# Formulations
-
-
-def test_costs_of_formulations(pendulum):
-    report = formulation_costs(pendulum, {"one": Partitioned(), "other": Multipliers()}, repeats=1)
-    assert [cost.formulation for cost in report.costs] == ["one", "other"]
-    for cost in report.costs:
-        assert cost.evaluation > 0 and cost.forward > 0 and cost.reverse > 0
-        assert 0 < cost.lines[0] < cost.lines[1] and cost.deviation < 1e-13
-    text = str(report).splitlines()
-    assert len(text) == 4 and text[2].startswith("one")
-
-
-def test_formulations_that_a_mechanism_does_not_allow(pendulum):
-    with pytest.raises(ValueError, match="no constraints"):
-        formulation_costs(mechanisms.get("free_body"))
-    singular = mechanisms.get("spherical_four_bar")
-    with pytest.raises(ValueError, match="singular"):
-        formulation_costs(singular, {"one": Multipliers()})
-    assert len(every_formulation()) == 7

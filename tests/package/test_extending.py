@@ -1,0 +1,252 @@
+"""What a user adds: a joint, a force with an internal state, a solver, a formulation and a system that is not made of
+bodies, each in a few lines against the public classes, simulated and compared with a closed form or the library's own.
+"""
+
+import inspect
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from jax.scipy.linalg import solve_triangular
+
+import jaxmb as mb
+from jaxmb import mechanisms, parts, planar
+from jaxmb.formulations import AbstractFormulation, Multipliers, accelerations
+from jaxmb.system import AbstractSystem, DiagonalInertia, Ranks
+
+G = 9.81
+
+
+class Rolling(parts.AbstractPlanarPart, parts.AbstractPair, parts.AbstractConstraint):
+    """A wheel (`body_b`) that rolls on the x axis of `body_a`. Rows 2: `y − radius`, `x + radius · angle`.
+
+    **Arguments:** `radius` [m] > 0 of the wheel.
+    """
+
+    radius: parts.Number = parts.length(sign="positive")
+    rows: ClassVar[int] = 2
+    rheonomic: ClassVar[bool] = False
+
+    def residual(self, space, poses, t):
+        x, y = space.body_point(poses[0], space.point(poses[1], jnp.zeros(2)))
+        return jnp.stack([y - self.radius, x + self.radius * (poses[1, 2] - poses[0, 2])])
+
+
+class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
+    """A spring and a damper in succession between the origins of two bodies, in the plane and in space.
+
+    **Arguments:** `stiffness` [N/m] > 0; `damping` [N s/m] > 0; `tension` [N] at the start, the internal state.
+    """
+
+    stiffness: parts.Number = parts.parameter(unit="N/m", sign="positive")
+    damping: parts.Number = parts.parameter(unit="N s/m", sign="positive")
+    tension: parts.Number = parts.internal_state(unit="N")
+    point_a: parts.Number = parts.point(body=0, default="origin")
+    point_b: parts.Number = parts.point(body=1, default="origin")
+
+    def wrenches(self, space, poses, velocities, t):
+        d = parts.separation(space, self, poses)
+        return parts.force_pair(space, self, poses, -self.tension * d / jnp.linalg.norm(d))
+
+    def state_rates(self, space, poses, velocities, t):
+        d, rate = parts.separation(space, self, poses), parts.separation_rate(space, self, poses, velocities)
+        return {"tension": self.stiffness * (jnp.dot(d, rate) / jnp.linalg.norm(d) - self.tension / self.damping)}
+
+
+class Kutta(diffrax.AbstractSolver):
+    """Kutta's method of order three, with the midpoint rule for its error."""
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 3
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        over = terms.contr(t0, t1)
+        change = lambda t, y: terms.vf_prod(t, y, args, over)
+        k1 = change(t0, y0)
+        k2 = change((t0 + t1) / 2, jax.tree.map(lambda y, a: y + a / 2, y0, k1))
+        k3 = change(t1, jax.tree.map(lambda y, a, b: y - a + 2 * b, y0, k1, k2))
+        y1 = jax.tree.map(lambda y, a, b, c: y + (a + 4 * b + c) / 6, y0, k1, k2, k3)
+        error = jax.tree.map(lambda end, y, b: end - (y + b), y1, y0, k2)
+        return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+
+class LeastConstraint(AbstractFormulation):
+    """Gauss's principle in the norm of the mass matrix, M = L Lᵀ: the constraint force along the columns of L⁻¹ Aᵀ."""
+
+    partitions: ClassVar[bool] = False
+    inverts_mass: ClassVar[bool] = True
+
+    def solve(self, inertia, force, jacobian, gamma):
+        jacobian = jacobian.dense()
+        A = jacobian.independent
+        L = jnp.linalg.cholesky(inertia.product(jnp.eye(A.shape[1])))
+        free = solve_triangular(L, force, lower=True)
+        Q, R = jnp.linalg.qr(solve_triangular(L, A.T, lower=True))
+        missing = solve_triangular(R.T, jacobian.gather_rows(gamma), lower=True) - Q.T @ free
+        udot = solve_triangular(L.T, free + Q @ missing)
+        return udot, jacobian.scatter_rows(solve_triangular(R, missing))
+
+
+class SphericalPendulum(AbstractSystem):
+    """A particle on a rod from the origin, in Cartesian coordinates; Φ = (q·q − l²) / 2l."""
+
+    mass: jax.Array
+    length: jax.Array
+    gravity: jax.Array
+    guess: mb.State
+    design: tuple = ()
+    nq: ClassVar[int] = 3
+    nu: ClassVar[int] = 3
+    position_rows: ClassVar[int] = 1
+    rows: ClassVar = (("rod", 0),)
+    ranks: ClassVar[Ranks] = Ranks(1, 1, 1, 1)
+
+    def coordinate_names(self):
+        return {"x": [0], "y": [1], "z": [2]}
+
+    def parameter_paths(self):
+        return {name: [(lambda s, name=name: getattr(s, name), None)] for name in ("mass", "length", "gravity")}
+
+    def coordinate_scale(self):
+        return jax.lax.stop_gradient(jnp.full(3, self.length))
+
+    def velocity_scale(self):
+        return self.coordinate_scale()
+
+    def inertia(self, t, q, u):
+        return DiagonalInertia(jnp.full(3, self.mass))
+
+    def force(self, t, q, u):
+        return jnp.array([0.0, 0.0, -1.0]) * self.mass * self.gravity
+
+    def kinetic_energy(self, t, q, u):
+        return 0.5 * self.mass * jnp.dot(u, u)
+
+    def potential_energy(self, t, q):
+        return self.mass * self.gravity * q[2]
+
+    def position_residual(self, t, q):
+        return (jnp.dot(q, q) - self.length**2)[None] / (2 * self.length)
+
+    def coordinate_jacobian(self, t, q):
+        return q[None] / self.length
+
+    def velocity_residual(self, t, q, u):
+        return jnp.dot(q, u)[None] / self.length
+
+    def acceleration_residual(self, t, q, u, udot):
+        return (jnp.dot(q, udot) + jnp.dot(u, u))[None] / self.length
+
+    def jacobian(self, t, q, u):
+        return q[None] / self.length
+
+    def constraint_force(self, t, q, u, multipliers):
+        return q * multipliers[0] / self.length
+
+
+@pytest.mark.parametrize("cls, most", [(Rolling, 30), (SphericalPendulum, 40)])
+def test_lines(cls, most):
+    code = [line for line in inspect.getsource(cls).splitlines() if line.strip()]
+    assert len(code) <= most
+
+
+def test_a_joint():
+    """A wheel rolls down a slope, and rubs and presses on it as the closed form says."""
+    mass, inertia, slope, t1 = 2.0, 0.05, 0.3, 0.8
+    wheel = planar.Body("wheel", mass=mass, inertia=inertia, position=(0.0, 0.3))
+    weight = mb.Gravity((G * np.sin(slope), -G * np.cos(slope)))
+    system = mb.Scene([wheel], joints=[Rolling("roll", "ground", "wheel", radius=0.3)], forces=[weight]).compile()
+    assert system.nu - system.velocity_rank == 1
+
+    def end(radius):
+        changed = mb.with_parameters(system, {"roll.radius": radius})
+        motion = mb.simulate(changed, mb.assemble(changed), t1=t1, rtol=1e-10, adjoint=diffrax.ForwardMode())
+        own = motion["wheel"]
+        return jnp.append(own.position[-1], own.angle[-1]), motion.reactions["roll"].force[-1]
+
+    def closed(r):
+        acceleration = G * jnp.sin(slope) / (1 + inertia / (mass * r**2))
+        x = 0.5 * t1**2 * acceleration
+        return jnp.stack([x, r, -x / r]), mass * jnp.stack([acceleration - G * jnp.sin(slope), G * jnp.cos(slope)])
+
+    found, exact = (jax.jvp(of, (0.3,), (1.0,), has_aux=True) for of in (end, closed))
+    for own, expected, bound in zip(found, exact, (1e-9, 1e-7, 1e-8), strict=True):
+        np.testing.assert_allclose(own, expected, rtol=0, atol=bound)
+
+
+def test_a_force_with_an_internal_state():
+    """A mass on a spring and a damper in succession: linear equations of third order."""
+    mass, k, c, t1 = 1.5, 40.0, 6.0, 1.2
+    bob = planar.PointMass("bob", mass=mass, position=(1.0, 0.0), velocity=(0.3, 0.0))
+    element = Maxwell("element", "ground", "bob", stiffness=k, damping=c, tension=2.0)
+    system = mb.Scene([bob], forces=[element]).compile()
+    ts = np.linspace(0.0, t1, 5)
+    motion = mb.simulate(system, mb.assemble(system), t1=t1, saveat=ts, rtol=1e-10)
+    rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1 / mass], [0.0, k, -k / c]])
+    exact = np.stack([scipy.linalg.expm(t * rates) @ [1.0, 0.3, 2.0] for t in ts])
+    found = np.stack([motion["bob"].position[:, 0], motion["bob"].velocity[:, 0], motion["element"].tension], axis=1)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8)
+
+
+def test_a_one_step_solver():
+    """Of its order in steps of one length, and as accurate as asked for where it chooses them."""
+    pendulum = mechanisms.get("pendulum")
+    run = lambda **options: mb.simulate(pendulum.system, pendulum.state, t1=0.5, max_steps=4096, **options).ys.q[-1]
+    exact = run(rtol=1e-12)
+    fixed = {"solver": Kutta(), "stepsize_controller": diffrax.ConstantStepSize()}
+    coarse, fine = (np.max(np.abs(run(dt0=h, **fixed) - exact)) for h in (0.02, 0.01))
+    assert 1e-7 < coarse < 1e-3
+    assert 7.0 < coarse / fine < 9.0
+    np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["four_bar", "parallelogram"])
+def test_a_formulation(name):
+    """The same accelerations, constraint forces and motion as by multipliers; the parallelogram has a redundant row."""
+    mechanism = mechanisms.get(name)
+    system, state = mechanism.system, mechanism.state
+    both = [accelerations(system, own, 0.0, state.q, state.u) for own in (LeastConstraint(), Multipliers())]
+    for udot, multipliers in both:
+        np.testing.assert_allclose(udot, both[1][0], rtol=1e-10, atol=1e-10)
+        forces = [system.constraint_force(0.0, state.q, state.u, own) for own in (multipliers, both[1][1])]
+        np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
+    ends = [mb.simulate(system, state, t1=0.3, rtol=1e-10, formulation=own).ys for own in (LeastConstraint(), None)]
+    np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-9)
+
+
+def test_a_system_that_is_not_made_of_bodies():
+    """A particle that goes around on a cone, with the period and the tension of the closed form."""
+    mass, length, tilt, t1 = 0.7, 1.3, 0.6, 2.0
+    rate = np.sqrt(G / (length * np.cos(tilt)))
+    at = lambda t: length * np.array([np.sin(tilt) * np.cos(rate * t), np.sin(tilt) * np.sin(rate * t), -np.cos(tilt)])
+    # Off the sphere, so that the start is assembled.
+    guess = mb.State(jnp.asarray(1.1 * at(0.0)), jnp.zeros(3))
+    system = SphericalPendulum(*(jnp.asarray(x) for x in (mass, length, G)), guess)
+    state = mb.assemble(system, fix={"x": at(0.0)[0], "y": 0.0}, rates={"y": rate * at(0.0)[0], "z": 0.0})
+    ts = np.linspace(0.0, t1, 9)
+    motion = mb.simulate(system, state, t1=t1, saveat=ts, rtol=1e-10)
+    exact = np.stack([at(t) for t in ts])
+    np.testing.assert_allclose(motion.ys.q, exact, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(motion["z"], exact[:, 2], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=0, atol=1e-9)
+    other = mb.simulate(system, state, t1=t1, rtol=1e-10, solver=diffrax.Dopri8())
+    np.testing.assert_allclose(other.ys.q[-1], exact[-1], rtol=0, atol=1e-10)
+    pull = np.linalg.norm(motion.constraint_forces["rod"], axis=1)
+    np.testing.assert_allclose(pull, mass * G / np.cos(tilt), rtol=1e-10)
+    assert set(mb.parameters(system)) == {"mass", "length", "gravity"} and "x, y, z" in str(system)
+    # A small swing about the lowest place, from the same class: its frequency by linear equations.
+    linear = mb.linearise(system, mb.equilibrium(system))
+    np.testing.assert_allclose(np.abs(linear.eigenvalues), np.sqrt(G / length), rtol=1e-9)
