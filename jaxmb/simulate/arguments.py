@@ -148,7 +148,8 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
         raise ValueError(f"The system {has} and the state {'none' if state.z is None else 'some, in z'}; {cure}.")
     of_states = [] if state.z is None else [("z", state.z, system.nz)]
     for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu), *of_states):
-        if np.result_type(getattr(value, "dtype", type(value))).kind not in "fiub":
+        kind = value.dtype if isinstance(value, jax.Array | np.ndarray | np.generic) else type(value)
+        if np.result_type(kind).kind not in "fiub":
             raise ValueError(f"state.{name} must be an array of real numbers, got {value!r}; {cure}.")
         if np.shape(value) != (size,):
             raise ValueError(

@@ -10,7 +10,7 @@ from .._results import RESULTS
 from ..formulations.friction import coupled_most
 from ..linalg.arrays import is_traced
 from ..manifold import find_jumps
-from ..solvers import Adams
+from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
 
 # Stiffness is not looked for after fewer steps than this, and found in this number.
@@ -93,7 +93,7 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
 
     **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most this number of steps.
     """
-    if getattr(solver, "solves_implicitly", False):
+    if isinstance(solver, AbstractMultistep) and solver.solves_implicitly:
         return False
     if "stiff" in stats:
         return bool(stats["stiff"])

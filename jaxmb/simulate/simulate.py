@@ -19,8 +19,7 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import not_a_number_where
 from ..manifold import AbstractManifold, default_manifold, with_internal_states
 from ..parts.names import names_arguments
-from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController
-from ..solvers._one_step import OneStepController
+from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController, OneStepController
 from ..states.consistency import consistent
 from ..system import AbstractSystem
 from ..system.inputs import Signals, check_inputs, input_break_times, with_inputs

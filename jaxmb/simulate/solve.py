@@ -10,12 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._results import RESULTS
-from ..manifold import after_jumps
+from ..manifold import after_jumps, natural_units, state_blocks
 from ..manifold.diagnosis import diagnose_friction
-from ..solvers import AbstractMultistep
-from ..solvers._one_step import intended_step, with_tangents
-from ..solvers._scales import RunningScales
-from ..solvers._tangent import TangentControl
+from ..solvers import AbstractMultistep, RunningScales, TangentControl, intended_step, with_tangents
 from ..trajectory import Trajectory
 from .outcome import Outcome, has_failed
 
@@ -29,7 +26,8 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
     options = options | {"t1": at_once(options["t1"])}
-    jumps, after = getattr(options["stepsize_controller"], "jump_ts", None), times
+    controller, after = options["stepsize_controller"], times
+    jumps = controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
     if times is not None:
         if jumps is not None:
             # States that are saved at a jump are those after it, also in a run that comes to it from there.
@@ -126,28 +124,20 @@ def _tangent_control(system, options, direction) -> TangentControl:
     motion takes.
     """
     state, span = options["y0"], jnp.abs(options["t1"] - options["t0"])
-    coordinates, velocities = system.coordinate_scale(), system.velocity_scale()
+    velocities = system.velocity_scale()
     rate = jnp.maximum(jnp.max(jnp.abs(state.u) / velocities, initial=0.0), 1 / jnp.where(span > 0, span, 1.0))
-    units = [coordinates, velocities * rate, *([system.state_scale()] if system.nz else [])]
-    units = jnp.concatenate(units).astype(state.q.dtype)
-    blocks = tuple(zip((0, *_group_ends(system)[:-1]), _group_ends(system), strict=True))
-    return lax.stop_gradient(TangentControl(units, blocks, direction))
+    units = natural_units(system, rate, state.q.dtype)
+    sizes = tuple(block.size for block in state_blocks(system, rate))
+    return lax.stop_gradient(TangentControl(units, sizes, direction))
 
 
 def running_scales(system, state, options) -> RunningScales:
     """Natural units of coordinates, velocities and internal states; where nothing moves yet, one unit in the whole
     time.
     """
-    units = [system.coordinate_scale(), system.velocity_scale(), *([system.state_scale()] if system.nz else [])]
-    units = jnp.concatenate(units).astype(state.q.dtype)
     span = jnp.abs(options["t1"] - options["t0"])
-    return lax.stop_gradient(RunningScales(units, _group_ends(system), 1 / jnp.where(span > 0, span, 1.0)))
-
-
-def _group_ends(system) -> tuple[int, ...]:
-    """Where groups of components that have one size end: coordinates, velocities, and each kind of internal state."""
-    first = system.nq + system.nu
-    return (system.nq, first, *(first + end for end in system.state_ends))
+    units, rate = lax.stop_gradient((natural_units(system, None, state.q.dtype), 1 / jnp.where(span > 0, span, 1.0)))
+    return RunningScales(units, state_blocks(system, rate))
 
 
 def _replaced(values, old, new):

@@ -1,9 +1,20 @@
 """Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds."""
 
 from . import stability as stability
-from ._multistep import AbstractMultistep as AbstractMultistep
 from .adams import Adams as Adams, AdamsState as AdamsState
-from .controller import ControllerState as ControllerState, MultistepController as MultistepController
+from .controller import (
+    AbstractControllerState as AbstractControllerState,
+    ControllerState as ControllerState,
+    MultistepController as MultistepController,
+    intended_step as intended_step,
+)
+from .evaluation import (
+    Evaluation as Evaluation,
+    evaluate as evaluate,
+    next_chart as next_chart,
+    ravel as ravel,
+    unravel_like as unravel_like,
+)
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
 from .manifold_term import (
     AbstractFieldJacobian as AbstractFieldJacobian,
@@ -11,3 +22,14 @@ from .manifold_term import (
     AbstractResolvent as AbstractResolvent,
     ManifoldEvaluation as ManifoldEvaluation,
 )
+from .multistep import (
+    AbstractAttempt as AbstractAttempt,
+    AbstractMultistep as AbstractMultistep,
+    AbstractMultistepState as AbstractMultistepState,
+    tolerances_of as tolerances_of,
+)
+from .one_step import OneStepController as OneStepController, with_tangents as with_tangents
+from .order import StepEstimate as StepEstimate, choose_order as choose_order
+from .scales import Block as Block, RunningScales as RunningScales
+from .tangent import Tangent as Tangent, TangentControl as TangentControl
+from .tolerances import Tolerances as Tolerances

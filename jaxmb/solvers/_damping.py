@@ -45,7 +45,8 @@ def sectors(family: str) -> NDArray[np.float64]:
         own = formula(family, k)
         # The locus of roots of this modulus is the boundary locus of the recurrence for the scaled solution.
         falling = _GROWTH ** -np.arange(len(own.a), dtype=float)
-        scaled = own._replace(**{name: tuple(np.array(getattr(own, name), float) * falling) for name in "abc"})
+        a, b, c = (tuple(np.array(x, float) * falling) for x in (own.a, own.b, own.c))
+        scaled = own._replace(a=a, b=b, c=c)
         locus = boundary_locus(scaled, _THETA).ravel()
         locus = locus[np.isfinite(locus) & (locus.real < 0)]
         bins = np.round(np.log2(np.abs(locus) / _SIZES[0]) * _PER_OCTAVE).astype(int)

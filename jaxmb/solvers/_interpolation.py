@@ -7,8 +7,8 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ._evaluation import ravel, unravel_like
 from ._history import basis, basis_means, spans
+from .evaluation import ravel, unravel_like
 
 
 class MultistepInterpolation(diffrax.AbstractLocalInterpolation):

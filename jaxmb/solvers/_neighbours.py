@@ -7,7 +7,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from ._damping import are_damped
 from ._formulas import FAMILIES, Family
-from ._order import GAIN
+from .order import GAIN
 
 
 def ladder(past_points: tuple[int, ...]) -> np.ndarray:

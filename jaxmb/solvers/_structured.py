@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._compat import cond_of_any_lane
 from ._damping import eigenvalues
-from ._evaluation import freeze
 from ._field import Field, filled, linearized, probed_derivatives
 from ._newton import AbstractLinearization, StepEquation
+from .evaluation import freeze
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 
 # Steps of Arnoldi's method for the spectrum.

@@ -1,7 +1,7 @@
 """The Adams method of Shampine and Gordon, of variable order and variable step."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -11,7 +11,10 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import (
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
+from ._interpolation import RateInterpolation
+from ._stiffness import Stiffness, none_found, observed
+from .evaluation import (
     Evaluation,
     controlled_components,
     evaluate,
@@ -21,14 +24,11 @@ from ._evaluation import (
     ravel,
     unravel_like,
 )
-from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
-from ._interpolation import RateInterpolation
-from ._multistep import AbstractMultistep, tolerances_of
-from ._order import GAIN, choose_order
-from ._stiffness import Stiffness, none_found, observed
-from ._tangent import Tangent, TangentControl
-from ._tolerances import Tolerances, norm_of
 from .manifold_term import Chart
+from .multistep import AbstractAttempt, AbstractMultistep, AbstractMultistepState, tolerances_of
+from .order import GAIN, choose_order
+from .tangent import Tangent, TangentControl
+from .tolerances import Tolerances, norm_of
 
 # The finest relative tolerance of a step, in units of the machine precision.
 _FINEST = 200
@@ -42,7 +42,7 @@ _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
 
-class AdamsState(eqx.Module):
+class AdamsState(AbstractMultistepState):
     """The state of `Adams` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
@@ -66,8 +66,12 @@ class AdamsState(eqx.Module):
     sizes: Float[Array, " groups"] | None
     tangents: tuple[Tangent, ...] | None
 
+    @property
+    def memory(self) -> Float[Array, "length n"]:
+        return self.history.differences
 
-class _Step(NamedTuple):
+
+class _Step(AbstractAttempt):
     """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas, the
     `mismatch` of the corrector at the end, and the evaluations of the prediction and of the corrected state.
     """
@@ -79,6 +83,10 @@ class _Step(NamedTuple):
     predicted: Float[Array, " n"]
     first: Evaluation
     second: Evaluation
+
+    @property
+    def memory(self) -> Float[Array, "length n"]:
+        return self.history.differences
 
 
 class Adams(AbstractMultistep):
@@ -174,7 +182,7 @@ class Adams(AbstractMultistep):
             out |= {"stiff": solver_state.stiffness.found, "stiff_steps": solver_state.stiffness.steps}
         return out
 
-    def _initial_state(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
+    def initial_state(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
         first = evaluate(terms, t0, ravel(y0), y0, chart, args)
         f, chart = first.f, first.chart
         if first.failed is not False:
@@ -190,16 +198,12 @@ class Adams(AbstractMultistep):
             (y, f), _ = field_of(terms, t0, unravel_like(y0, flat), chart, args)(t0, flat)
             return y, start(t0, f, t1 - t0).differences
 
-        tangents = self._first_tangents(numbers, terms, ravel(y0), before)
+        tangents = self.first_tangents(numbers, terms, ravel(y0), before)
         order = jnp.asarray(1, np.int32)
-        sizes = self._first_sizes(ravel(y0), f, before)
+        sizes = self.first_sizes(ravel(y0), f, before)
         return AdamsState(history, order, step_counts.at[0].add(1), chart, stiffness, sizes, tangents)
 
-    @staticmethod
-    def _memory(state):
-        return state.history.differences
-
-    def _attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
+    def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
         dtype = before.dtype
         h = (t1 - history.mesh[0]).astype(dtype)
@@ -232,16 +236,16 @@ class Adams(AbstractMultistep):
             second.y, advance(history, end, second.f, partial_sums), errors, mismatch, predicted, first, second
         )
 
-    def _advance(self, terms, t1, y0, args, state: AdamsState):
+    def advance(self, terms, t1, y0, args, state: AdamsState):
         history, order, before = state.history, state.order, ravel(y0)
         dtype = before.dtype
-        step, along = self._attempted(terms, t1, before, y0, args, state)
+        step, along = self.attempted(terms, t1, before, y0, args, state)
         after = step.after
 
         failed = step.first.failed | step.second.failed
         scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
-        tangents, scales = self._tangents_after(state.tangents, along)
+        tangents, scales = self.tangents_after(state.tangents, along)
         for end, own in zip(along, scales, strict=True):
             sizes = jnp.maximum(sizes, self._sizes(terms, y0, own, end.errors, state.chart))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
@@ -263,7 +267,7 @@ class Adams(AbstractMultistep):
             step_counts=state.step_counts + (order == INDEX).astype(np.int32),
             chart=next_chart(terms, t1, y1, step.second.chart, args),
             stiffness=self._observed(state, h, before, step.predicted, after, step.first.f, step.second.f, y0),
-            sizes=self._grown(state.sizes, after),
+            sizes=self.grown_sizes(state.sizes, after),
             tangents=tangents,
         )
         used = (order >= INDEX)[:, None]
@@ -281,7 +285,7 @@ class Adams(AbstractMultistep):
         if state.stiffness is None:
             return None
         scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
-        size = lambda change: self._size(lax.stop_gradient(change), scale, like)
+        size = lambda change: self.weighted_norm(lax.stop_gradient(change), scale, like)
         correction = size(after - predicted), size(second - first)
         change = size(after - before), size(second - state.history.differences[0])
         return observed(state.stiffness, state.order, lax.stop_gradient(h), correction, change)

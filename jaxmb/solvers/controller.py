@@ -1,7 +1,7 @@
 """The step size controller of the multistep methods."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -13,11 +13,16 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._evaluation import check_real, check_term, evaluate, first_chart, ravel
-from ._order import StepEstimate
-from ._scales import RunningScales
-from ._tolerances import MultistepNorm, Tolerances, norm_of
+from .evaluation import check_real, check_term, evaluate, first_chart, ravel
 from .manifold_term import Args, Y
+from .order import StepEstimate
+from .scales import RunningScales
+from .tolerances import MultistepNorm, Tolerances, norm_of
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 # After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
 _WITHOUT_ESTIMATE = 0.25
@@ -31,7 +36,23 @@ _RECOVERY = 100.0
 _CAUTION, _CAUTIOUS = 4, 1.4
 
 
-class ControllerState(eqx.Module):
+class AbstractControllerState(eqx.Module):
+    """The state of a step size controller that knows its next step.
+
+    **Fields:** `intended`: the last step size that was requested.
+    """
+
+    intended: AbstractVar[Float[Array, ""]]
+
+
+def intended_step(controller_state: Any) -> Float[Array, ""] | None:
+    """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
+    is_known = lambda x: isinstance(x, AbstractControllerState)
+    found = [x for x in jax.tree.leaves(controller_state, is_leaf=is_known) if is_known(x)]
+    return found[0].intended if found else None
+
+
+class ControllerState(AbstractControllerState):
     """The state of `MultistepController` between steps; `diffrax.SaveAt(controller_state=True)` returns it.
 
     **Fields:**
@@ -109,8 +130,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         self.factormax = factormax
 
     def __check_init__(self):
-        for name in ("rtol", "atol", "dtmin", "dtmax"):
-            value = getattr(self, name)
+        numbers = {"rtol": self.rtol, "atol": self.atol, "dtmin": self.dtmin, "dtmax": self.dtmax}
+        for name, value in numbers.items():
             if _is_known(value) and not np.all(np.isfinite(value) & (np.asarray(value) > 0)):
                 raise ValueError(
                     f"`MultistepController` needs a positive and finite `{name}`, but got `{name}={value}`."
@@ -119,8 +140,12 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
             raise ValueError(f"`dtmin={self.dtmin}` is larger than `dtmax={self.dtmax}`.")
         if self.force_dtmin and self.dtmin is None:
             raise ValueError("`force_dtmin=True` needs a `dtmin`.")
-        for name, low, high in (("safety", 0, 1), ("factormin", 0, 1), ("factormax", 1, np.inf)):
-            value = getattr(self, name)
+        factors = (
+            ("safety", self.safety, 0, 1),
+            ("factormin", self.factormin, 0, 1),
+            ("factormax", self.factormax, 1, np.inf),
+        )
+        for name, value, low, high in factors:
             if _is_known(value) and not low < value <= high:
                 raise ValueError(f"`{name}` lies between {low} and {high}, but got `{name}={value}`.")
 

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -15,20 +15,20 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._damping import is_resolved
 from ._dense import DenseLinearization
-from ._evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
 from ._field import derivatives
 from ._formulas import FAMILIES, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
-from ._multistep import AbstractMultistep, tolerances_of
 from ._neighbours import a_stable, damped_growth, ladder, responses
 from ._newton import AbstractLinearization, Newton, Solved, StepEquation
-from ._order import LOWER, choose_order, growth_factors
 from ._structured import unknown_structure
-from ._tangent import Tangent, TangentControl
-from ._tolerances import Tolerances
 from .controller import ControllerState
+from .evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
 from .manifold_term import Chart
+from .multistep import AbstractAttempt, AbstractMultistep, AbstractMultistepState, tolerances_of
+from .order import LOWER, choose_order, growth_factors
+from .tangent import Tangent, TangentControl
+from .tolerances import Tolerances
 
 # Newton's method ends when the next correction is below this, in units of the tolerance.
 _NEWTON = 0.01
@@ -38,7 +38,7 @@ _FINEST = 50000
 _TARGET = 0.05
 
 
-class HermiteState(eqx.Module):
+class HermiteState(AbstractMultistepState):
     """The state of `Hermite` between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
@@ -66,8 +66,12 @@ class HermiteState(eqx.Module):
     sizes: Float[Array, " groups"] | None
     tangents: tuple[Tangent, ...] | None
 
+    @property
+    def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
+        return self.history.differences, self.slope
 
-class _Step(NamedTuple):
+
+class _Step(AbstractAttempt):
     """The numbers of a step: the state `after` it, the history there and its `slope`; the `ends` of the step by every
     formula, for their errors; for interpolation the history with the last point doubled, and the `mismatch` of the
     formula at the end; the chart there, whether the evaluation `broke` down, and the end of Newton's method.
@@ -82,6 +86,10 @@ class _Step(NamedTuple):
     chart: Chart | None
     broke: Bool[Array, ""]
     newton: Solved
+
+    @property
+    def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
+        return self.history.differences, self.slope
 
 
 class Hermite(AbstractMultistep):
@@ -194,7 +202,7 @@ class Hermite(AbstractMultistep):
             "past_points": solver_state.step_counts[1:],
         }
 
-    def _initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
+    def initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
         field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
         free = free_components(terms, flat, chart)
@@ -224,16 +232,12 @@ class Hermite(AbstractMultistep):
             z, slope = self._recorded(at.y, at.f, at.g)
             return at.y, (start(family, t0, z, slope, t1 - t0).differences, slope)
 
-        tangents = self._first_tangents(numbers, terms, flat, before)
+        tangents = self.first_tangents(numbers, terms, flat, before)
         index = jnp.asarray(1, np.int32)
-        sizes = self._first_sizes(flat, f, before)
+        sizes = self.first_sizes(flat, f, before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
 
-    @staticmethod
-    def _memory(state):
-        return state.history.differences, state.slope
-
-    def _attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
+    def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
         family, history, k = FAMILIES[self.family], state.history, state.order_index
         n, dtype = before.size, before.dtype
         nodes = family.multiplicity * k
@@ -262,7 +266,7 @@ class Hermite(AbstractMultistep):
         latest = before, state.slope[-n:]
         equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, h, past, a, b, free)
         frozen, scale, predicted, latest, matrix = freeze((equation, scale, predicted, latest, state.matrix))
-        size = lambda correction: self._size(correction, scale, like)
+        size = lambda correction: self.weighted_norm(correction, scale, like)
         newton = Newton(frozen, size, _NEWTON).solve(predicted, latest, matrix)
         y, f, g = newton.matrix.differentiable(newton.inverses, equation, newton.end[:3])
         chart, broke = newton.end.rest
@@ -279,7 +283,7 @@ class Hermite(AbstractMultistep):
         history = doubled if family.multiplicity == 2 else advanced
         return _Step(y, history, slope, ends, doubled, past + a * f + b * g - y, chart, broke, newton)
 
-    def _advance(self, terms, t1, y0, args, state: HermiteState):
+    def advance(self, terms, t1, y0, args, state: HermiteState):
         family, history, k = FAMILIES[self.family], state.history, state.order_index
         before = ravel(y0)
         n, dtype = before.size, before.dtype
@@ -288,7 +292,7 @@ class Hermite(AbstractMultistep):
         h = (step_end(history, t1) - history.mesh[0]).astype(dtype)
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
-        step, along = self._attempted(terms, t1, before, y0, args, state)
+        step, along = self.attempted(terms, t1, before, y0, args, state)
         newton = freeze(step.newton)
         failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
 
@@ -296,7 +300,7 @@ class Hermite(AbstractMultistep):
         stable = a_stable(self.family, self.past_points)
         candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
-        tangents, scales = self._tangents_after(state.tangents, along)
+        tangents, scales = self.tangents_after(state.tangents, along)
         for end, scale in zip(along, scales, strict=True):
             sizes = jnp.maximum(sizes, self._sizes(end.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
@@ -338,7 +342,7 @@ class Hermite(AbstractMultistep):
             step_counts=state.step_counts + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
             work=state.work + newton.work,
             chart=renewed,
-            sizes=self._grown(state.sizes, step.after),
+            sizes=self.grown_sizes(state.sizes, step.after),
             tangents=tangents,
         )
         used = (index < nodes + 2)[:, None]
@@ -362,7 +366,7 @@ class Hermite(AbstractMultistep):
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
         matrix, inverses = freeze((newton.matrix, newton.inverses))
         errors = matrix.errors(inverses, free, changes)
-        return jnp.stack([self._size(error, scale, like) for error in errors])
+        return jnp.stack([self.weighted_norm(error, scale, like) for error in errors])
 
     def _recorded(self, y, f, g):
         """The values that the history holds, and their time derivatives."""

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import with_inner
-from ._evaluation import freeze
+from .evaluation import freeze
+from .scales import ends_of
 
 # The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
 _LOOSER, _FLOOR = 10.0, 0.01
@@ -30,13 +31,13 @@ class TangentControl(eqx.Module):
     **Fields:**
 
     - `units`: the natural sizes of the components of the raveled state.
-    - `blocks`: groups of components that are measured by the largest one among them, `(start, end)`.
+    - `blocks`: sizes of the blocks of components that are measured by the largest one among them.
     - `direction`: a tangent of the term, None where derivatives are not along a known direction. The tangent of the
         state that it causes, `d' = J d + f_p`, is carried along in addition.
     """
 
     units: Float[Array, " n"]
-    blocks: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    blocks: tuple[int, ...] = eqx.field(static=True)
     direction: PyTree = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
@@ -56,7 +57,7 @@ class TangentControl(eqx.Module):
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""
         relative = jnp.abs(w) / self.units
-        groups = [jnp.full(b - a, jnp.max(relative[a:b], initial=0.0), w.dtype) for a, b in self.blocks]
+        groups = [jnp.full(b - a, jnp.max(relative[a:b], initial=0.0), w.dtype) for a, b in ends_of(self.blocks)]
         return self.units * jnp.concatenate(groups)
 
     def scale(self, rtol: Any, tangent: "Tangent", after: Float[Array, " n"]) -> Float[Array, " n"]:

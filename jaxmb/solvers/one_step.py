@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrappedSolver, with_loops
-from ._evaluation import ravel, unravel_like
-from ._multistep import AbstractMultistep
-from ._scales import RunningScales
-from ._tangent import Tangent, TangentControl, pushed, pushed_only
-from ._tolerances import MultistepNorm, Tolerances
+from .controller import AbstractControllerState
+from .evaluation import ravel, unravel_like
+from .multistep import AbstractMultistep
+from .scales import RunningScales
+from .tangent import Tangent, TangentControl, pushed, pushed_only
+from .tolerances import MultistepNorm, Tolerances
 
 
 class WithTangents(WrappedSolver):
@@ -25,7 +26,7 @@ class WithTangents(WrappedSolver):
     control: TangentControl
     rtol: Any
     # What `solver` is wrapped in, if anything: diffrax looks for Runge–Kutta methods in one wrapper only.
-    outer: WrappedSolver | None = None
+    outer: diffrax.AbstractWrappedSolver | None = None
 
     @property
     def inner(self) -> Any:
@@ -82,11 +83,16 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
     found = [x for x in jax.tree.leaves(controller, is_leaf=is_known) if is_known(x)]
     if not found:
         return solver, controller, lambda state: state
-    watched = lambda x: dataclasses.replace(x if hasattr(x, "scales") else OneStepController.around(x), tangents=True)
-    controller = jax.tree.map(lambda x: watched(x) if is_known(x) else x, controller, is_leaf=is_known)
-    inner = getattr(solver, "solver", None)
-    outer = None if inner is None else solver
-    return WithTangents(inner or solver, control, found[0].rtol, outer), controller, lambda state: state[0]
+
+    def watched(x):
+        if not is_known(x):
+            return x
+        own = OneStepController.around(x) if isinstance(x, diffrax.PIDController) else x
+        return dataclasses.replace(own, tangents=True)
+
+    controller = jax.tree.map(watched, controller, is_leaf=is_known)
+    inner, outer = (solver.solver, solver) if isinstance(solver, diffrax.AbstractWrappedSolver) else (solver, None)
+    return WithTangents(inner, control, found[0].rtol, outer), controller, lambda state: state[0]
 
 
 class ErrorWithTangents(NamedTuple):
@@ -96,7 +102,7 @@ class ErrorWithTangents(NamedTuple):
     of_tangents: list[Float[Array, " n"]]
 
 
-class OneStepState(NamedTuple):
+class OneStepState(AbstractControllerState):
     """The state of `OneStepController`: that of the controller inside, the running sizes, the least step that is tried,
     and the `intended` length of the next step.
     """
@@ -105,13 +111,6 @@ class OneStepState(NamedTuple):
     sizes: Float[Array, " groups"] | None
     least: Float[Array, ""]
     intended: Float[Array, ""]
-
-
-def intended_step(controller_state: Any) -> Float[Array, ""] | None:
-    """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
-    while hasattr(controller_state, "inner_state"):
-        controller_state = controller_state.inner_state
-    return getattr(controller_state, "intended", None)
 
 
 class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
@@ -144,7 +143,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
         # The first step is chosen in units of these sizes, and of the time that they change in: it then depends on no
         # others, and the absolute tolerance is the same for all components.
-        unit, rate = self.scales.of_components(sizes), (sizes[1] / sizes[0]).astype(t0.dtype)
+        unit, rate = self.scales.of_components(sizes), self.scales.rate(sizes).astype(t0.dtype)
 
         def field(terms, t, y, args):
             f = func(terms, t / rate, unravel_like(y0, ravel(y) * unit), args)
@@ -157,7 +156,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         return t0 + intended, OneStepState(state, sizes, least, intended)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        state, sizes, least, _ = controller_state
+        state, sizes, least = controller_state.inner, controller_state.sizes, controller_state.least
         of_state, of_tangents = (y_error.error, y_error.of_tangents) if self.tangents else (y_error, [])
         scale = Tolerances(self.rtol, self.atol, MultistepNorm(self.norm, self.scales)).scale(
             ravel(y0), ravel(y1_candidate), sizes

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from ._evaluation import unravel_like
-from ._scales import RunningScales
+from .evaluation import unravel_like
+from .scales import RunningScales
 
 # The part of the tolerance that the error of one step may take. A method of variable order settles at the order where
 # the estimates of neighbouring orders are equal: the step taken with local extrapolation is hardly better than its
@@ -41,15 +41,15 @@ class MultistepNorm(eqx.Module):
 
 
 class Tolerances(eqx.Module):
-    """Tolerances and norm, under the names that diffrax expects of a root finder.
+    """Tolerances and norm of a multistep method, from `tolerances_of`.
 
-    Made by `diffrax.with_stepsize_controller_tols(Tolerances)()`, they are filled in from the step size controller;
-    otherwise they are `fixed`, for steps that no error estimate controls.
+    They are filled in from the step size controller, in the only way that diffrax has to tell a solver of it (see
+    `from_controller` of `jaxmb._compat`); otherwise they are `fixed`, for steps that no error estimate controls.
     """
 
     rtol: Any
     atol: Any
-    norm: Callable[[PyTree], Any]
+    norm: MultistepNorm
     fixed: bool = eqx.field(static=True, default=False)
 
     def check(self, solver: str) -> None:
@@ -65,7 +65,7 @@ class Tolerances(eqx.Module):
     @property
     def scales(self) -> RunningScales | None:
         """What the absolute tolerance is relative to."""
-        return getattr(self.norm, "scales", None)
+        return self.norm.scales
 
     def scale(self, y0: Array, y1: Array, sizes: Array | None) -> Array:
         """The tolerance of each component over a step from `y0` to `y1`; `sizes` are those of the running scales so

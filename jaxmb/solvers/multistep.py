@@ -8,15 +8,16 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import any_of_batch, from_controller
-from ._evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
-from ._order import StepEstimate, refuse
-from ._tangent import Tangent, TangentControl, pushed, pushed_only
-from ._tolerances import Tolerances, norm_of
+from .evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
 from .manifold_term import Args, Chart, Y
+from .order import StepEstimate, refuse
+from .tangent import Tangent, TangentControl, pushed, pushed_only
+from .tolerances import MultistepNorm, Tolerances, norm_of
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -28,11 +29,54 @@ else:
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
+class AbstractMultistepState(eqx.Module):
+    """What a multistep method keeps between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+
+    **Fields:**
+
+    - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
+    - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
+    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    """
+
+    chart: AbstractVar[Chart | None]
+    sizes: AbstractVar[Float[Array, " groups"] | None]
+    tangents: AbstractVar[tuple[Tangent, ...] | None]
+
+    @property
+    @abc.abstractmethod
+    def memory(self) -> PyTree[Array]:
+        """The numbers of the past that a step depends on smoothly: fields, or parts of them."""
+
+
+class AbstractAttempt(eqx.Module):
+    """The numbers of a step before it is judged.
+
+    **Fields:** `after`: the raveled state at its end.
+    """
+
+    after: AbstractVar[Float[Array, " n"]]
+
+    @property
+    @abc.abstractmethod
+    def memory(self) -> PyTree[Array]:
+        """The `memory` of the state at the end of the step."""
+
+
 class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method under a `MultistepController`.
 
-    `solves_implicitly` says whether a step solves an equation for the independent components of the state, which an
-    `AbstractManifoldTerm` then has to name (`free`). `tangent_control` is set where a tangent's error is controlled.
+    A method of one's own is a subclass with diffrax's `term_structure`, `interpolation_cls` and `order`, with the
+    fields below, and with the four methods `initial_state`, `attempt`, `advance` and `statistics`; the base calls them
+    at starts, after jumps and in every step. States are raveled, one vector of all components; `evaluate` is the vector
+    field of any term at such a vector, and `next_chart` follows the charts of a manifold.
+
+    **Fields:**
+
+    - `tolerances`: from `tolerances_of`, filled in from the controller before the solver is asked for anything.
+    - `tangent_control`: None; set where a tangent's error is controlled.
+    - `solves_implicitly`: whether a step solves an equation for the independent components of the state, which an
+        `AbstractManifoldTerm` then has to name (`free`).
     """
 
     tolerances: AbstractVar[Tolerances]
@@ -55,7 +99,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         self.tolerances.check(type(self).__name__)
         check_term(terms)
         check_real(y0)
-        return self._initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
+        return self.initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
     # Nested jit: a step is traced once, and not for each loop and transformation around it.
     @eqx.filter_jit
@@ -72,10 +116,10 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         def restart():
             after = after_jump(terms, t0, y0, args)
             chart = next_chart(terms, t0, after, solver_state.chart, args)
-            return after, self._initial_state(terms, t0, t1, after, args, chart, solver_state)
+            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
 
         y0, state = _restart_after(made_jump, restart, (y0, solver_state))
-        y1, estimate, dense_info, state, failed = self._advance(terms, t1, y0, args, state)
+        y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
         off = refused(terms, state.chart)
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
@@ -92,23 +136,45 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         """
 
     @abc.abstractmethod
-    def _initial_state(self, terms, t0, t1, y0, args, chart: Chart | None, before: Any) -> Any:
-        """The initial solver state; `before`: the state before a jump, None at the first start."""
+    def initial_state(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        args: Args,
+        chart: Chart | None,
+        before: Any,
+    ) -> AbstractMultistepState:
+        """The solver state at a start.
+
+        `first_sizes` and `first_tangents` give two of its fields.
+
+        **Arguments:** `t1`: the end of the first step; `chart`: one at `y0`; `before`: the state before a jump, None at
+        the first start.
+        """
 
     @abc.abstractmethod
-    def _attempt(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> Any:
-        """The numbers of a step, before it is judged, as a tuple of arrays with the raveled state `after` it."""
+    def attempt(
+        self, terms: PyTree[diffrax.AbstractTerm], t1: Any, before: Float[Array, " n"], like: Y, args: Args, state: Any
+    ) -> AbstractAttempt:
+        """The numbers of a step to `t1`, before it is judged; differentiable.
+
+        **Arguments:** `before`: the raveled state at the start of the step; `like`: the same before raveling.
+        """
 
     @abc.abstractmethod
-    def _advance(self, terms, t1, y0, args, state: Any) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
-        """A step: the outputs of `step`, with a failure flag instead of the result."""
+    def advance(
+        self, terms: PyTree[diffrax.AbstractTerm], t1: Any, y0: Y, args: Args, state: Any
+    ) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
+        """A step from y0 to `t1`: `(y1, estimate, dense_info, state, failed)`.
 
-    @staticmethod
-    @abc.abstractmethod
-    def _memory(state: Any) -> PyTree[Array]:
-        """The part of a solver's state that a step depends on smoothly; that at its end, from the step's numbers."""
+        `attempted` makes the attempt, `tolerances.of_step` and `weighted_norm` measure its error, `choose_order` makes
+        the estimate; `tangents_after`, `grown_sizes` and `next_chart` give fields of the new state. `dense_info` are
+        the arguments of the interpolation; `failed`: whether a constraint or an implicit equation was not solved.
+        """
 
-    def _first_tangents(
+    def first_tangents(
         self, numbers: Callable[..., tuple[Array, PyTree]], terms, flat: Float[Array, " n"], before: Any
     ) -> tuple[Tangent, ...] | None:
         """The tangents at a start whose errors are controlled.
@@ -123,16 +189,16 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         pushes = [pushed_only(numbers, (terms, flat), at) for at in zip(control.of_terms(terms), starts, strict=True)]
         return tuple(Tangent(w, memory, control.largest(w)) for w, memory in pushes)
 
-    def _attempted(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> tuple[Any, list[Any]]:
+    def attempted(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> tuple[Any, list[Any]]:
         """The numbers of a step, and their derivatives along the tangents whose error is controlled."""
         if self.tangent_control is None:
-            return self._attempt(terms, t1, before, like, args, state), []
+            return self.attempt(terms, t1, before, like, args, state), []
         step = eqx.Partial(_step_from, self, t1, like, args, state)
         of_terms = self.tangent_control.of_terms(terms)
         along = tuple((of, x.w, x.memory) for of, x in zip(of_terms, state.tangents, strict=True))
-        return pushed(step, (terms, before, self._memory(state)), along)
+        return pushed(step, (terms, before, state.memory), along)
 
-    def _tangents_after(
+    def tangents_after(
         self, tangents: tuple[Tangent, ...] | None, along: list[Any]
     ) -> tuple[tuple[Tangent, ...] | None, list[Float[Array, " n"]]]:
         """The tangents at the end of a step, from the derivatives of its numbers, and the errors tolerated in them."""
@@ -142,11 +208,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         out, scales = [], []
         for tangent, end in zip(tangents, along, strict=True):
             peak = jnp.maximum(tangent.peak, control.largest(end.after))
-            out.append(Tangent(end.after, self._memory(end), peak))
+            out.append(Tangent(end.after, end.memory, peak))
             scales.append(control.scale(self.tolerances.rtol, tangent, end.after))
         return tuple(out), scales
 
-    def _first_sizes(
+    def first_sizes(
         self, flat: Float[Array, " n"], f: Float[Array, " n"], before: Any
     ) -> Float[Array, " groups"] | None:
         """The sizes that the absolute tolerance is relative to, at a start."""
@@ -155,31 +221,36 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
             return None
         return scales.start(flat, f) if before is None else before.sizes
 
-    def _grown(
+    def grown_sizes(
         self, sizes: Float[Array, " groups"] | None, after: Float[Array, " n"]
     ) -> Float[Array, " groups"] | None:
         """The same after a step."""
         scales = self.tolerances.scales
         return None if scales is None or sizes is None else scales.grown(sizes, after)
 
-    def _size(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
+    def weighted_norm(self, error: Float[Array, " n"], scale: Float[Array, " n"], like: Y) -> Any:
         """The weighted norm of an error."""
         return norm_of(self.tolerances.norm, error / scale, like)
 
 
 def _step_from(solver, t1, like, args, state, terms, before, memory):
-    return solver._attempt(terms, t1, before, like, args, eqx.tree_at(solver._memory, state, memory))
+    return solver.attempt(terms, t1, before, like, args, eqx.tree_at(lambda state: state.memory, state, memory))
 
 
-def tolerances_of(solver: str, rtol: Any, atol: Any, norm: Callable[[PyTree], Any]) -> Tolerances:
-    """The tolerances of a solver, by default those of the step size controller."""
+def tolerances_of(
+    solver: str, rtol: Any = None, atol: Any = None, norm: Callable[[PyTree], Any] = optx.rms_norm
+) -> Tolerances:
+    """The tolerances of a solver, by default those of the step size controller.
+
+    **Raises:** `ValueError` for one tolerance without the other.
+    """
     if (rtol is None) != (atol is None):
         raise ValueError(
             f"`{solver}` takes both of `rtol` and `atol`, or neither; got `rtol={rtol}` and `atol={atol}`."
         )
     if rtol is None:
         return from_controller(Tolerances)
-    return Tolerances(rtol, atol, norm, fixed=True)
+    return Tolerances(rtol, atol, MultistepNorm(norm), fixed=True)
 
 
 def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:

@@ -1,0 +1,79 @@
+"""Sizes of coordinates and velocities that follow the motion, for tolerances that do not depend on units."""
+
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+# What a block counts as at least, in its natural units, as a power of eps: 1e-4 in double precision. Much more hides a
+# small motion that starts at zero; much less asks for the digits of rounding errors.
+_LEAST = 0.25
+
+
+class Block(eqx.Module):
+    """A block of components of a state that are measured by the largest one among them.
+
+    **Fields:** its `name`; `size`: the number of its components; `initial`: what the block counts as at the start of a
+    motion, in natural units of its components, where it is zero, and None for a block that counts as 1e-4 at least;
+    `rate_of`: the name of the block before it whose rate of change it is, or None.
+    """
+
+    name: str = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    initial: Any = None
+    rate_of: str | None = eqx.field(static=True, default=None)
+
+
+def ends_of(sizes: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """The first index of each block in the raveled state, and that after its last."""
+    return tuple(itertools.pairwise(itertools.accumulate(sizes, initial=0)))
+
+
+class RunningScales(eqx.Module):
+    """Sizes of the components of a state: the largest in each block that a motion has shown so far, in natural units of
+    each component.
+
+    With them an absolute tolerance is a pure number, and a component that never moves may be zero.
+
+    **Fields:** `units`: the natural sizes of the components of the raveled state, those of rates for one unit of time;
+    `blocks` of it, in order.
+    """
+
+    units: Float[Array, " n"]
+    blocks: tuple[Block, ...]
+
+    def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " groups"]:
+        """The sizes at the start of a motion, from the state and its derivative."""
+        sizes: dict[str, Array] = {}
+        for block, size, rate in zip(self.blocks, self._largest(y), self._largest(f), strict=True):
+            if block.rate_of is not None:
+                # From rest, a rate causes a motion of the size of the other block with this one.
+                ahead = jnp.sqrt(sizes[block.rate_of] * rate)
+                size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
+            if block.initial is None:
+                sizes[block.name] = jnp.maximum(size, jnp.finfo(y.dtype).eps ** _LEAST)
+            else:
+                sizes[block.name] = jnp.where(size > 0, size, jnp.asarray(block.initial, y.dtype))
+        return lax.stop_gradient(jnp.stack(list(sizes.values())))
+
+    def grown(self, sizes: Float[Array, " groups"], y: Float[Array, " n"]) -> Float[Array, " groups"]:
+        """The sizes after a step to y."""
+        return lax.stop_gradient(jnp.maximum(sizes, jnp.stack(self._largest(y))))
+
+    def of_components(self, sizes: Float[Array, " groups"]) -> Float[Array, " n"]:
+        """The size of each component."""
+        return self.units * jnp.concatenate([jnp.full(block.size, sizes[k]) for k, block in enumerate(self.blocks)])
+
+    def rate(self, sizes: Float[Array, " groups"]) -> Float[Array, ""]:
+        """The size of the first block of rates over that of the block whose rates they are [1/s]."""
+        names = [block.name for block in self.blocks]
+        k, of = next((k, names.index(block.rate_of)) for k, block in enumerate(self.blocks) if block.rate_of)
+        return sizes[k] / sizes[of]
+
+    def _largest(self, y):
+        relative = jnp.abs(y) / self.units
+        return tuple(jnp.max(relative[a:b], initial=0.0) for a, b in ends_of(block.size for block in self.blocks))
