@@ -289,6 +289,10 @@ class RigidBodySystem(AbstractSystem):
         return state_fields(self.forces)
 
     @property
+    def nz(self) -> int:
+        return self.state_ends[-1] if self.state_ends else 0
+
+    @property
     def state_ends(self) -> tuple[int, ...]:
         return tuple(own.stop for own in self._state_fields)
 
