@@ -20,9 +20,21 @@ from .bodies import RigidBodySystem as RigidBodySystem
 from .bodies.scene import Scene as Scene
 from .linalg import rotations as rotations
 from .parts import contact as contact, shapes as shapes, terrain as terrain
-from .parts.actuators import Actuator as Actuator
-from .parts.combinations import FixedTendon as FixedTendon, JointCoupling as JointCoupling, Tendon as Tendon
+from .parts.actuators import Actuator as Actuator, Motor as Motor
+from .parts.combinations import (
+    FixedTendon as FixedTendon,
+    JointCoupling as JointCoupling,
+    JointInertia as JointInertia,
+    Tendon as Tendon,
+)
 from .parts.controller import Controller as Controller
+from .parts.coordinate_parts import (
+    JointDriver as JointDriver,
+    JointForce as JointForce,
+    JointFriction as JointFriction,
+    JointSpring as JointSpring,
+    JointStop as JointStop,
+)
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
     Constraint as Constraint,
@@ -30,13 +42,6 @@ from .parts.functions import (
     NonIdeal as NonIdeal,
     VelocityConstraint as VelocityConstraint,
 )
-from .parts.joint_inertia import JointInertia as JointInertia
-from .parts.joint_laws import (
-    JointActuator as JointActuator,
-    JointFriction as JointFriction,
-    JointStop as JointStop,
-)
-from .parts.joint_parts import JointDriver as JointDriver, JointForce as JointForce, JointSpring as JointSpring
 from .parts.names import UnknownNameError as UnknownNameError
 from .parts.series import Series as Series
 from .parts.servo import Servo as Servo

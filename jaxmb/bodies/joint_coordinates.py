@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar
-from ..parts.joint_parts import JointDriver
+from ..parts.coordinate_parts import JointDriver
 from ..system.catalogue import AbstractSystem
 from ..system.quantities import Quantity
 from .constraint_groups import ConstraintGroup
@@ -109,7 +109,8 @@ def held_groups(
         part = JointDriver(
             name,
             name,
-            joint=group.single(own.member, t),
+            joints={"0": group.single(own.member, t)},
+            places=(tuple(range(len(group.bodies[own.member]))),),
             within=own.field,
             value=value - rates[name] * jnp.asarray(t, value.dtype),
             rate=rates[name],

@@ -12,6 +12,7 @@ from .._types import State
 from ..linalg.arrays import is_traced
 from ..parts.base import (
     GROUND,
+    AbstractActor,
     AbstractBody,
     AbstractCompound,
     AbstractConstraint,
@@ -20,6 +21,7 @@ from ..parts.base import (
     AbstractNonIdeal,
     AbstractTendon,
     AbstractVelocityConstraint,
+    KnownParts,
     rows_of,
 )
 from ..parts.boundary import check_kernels
@@ -27,11 +29,9 @@ from ..parts.contents import anonymous, inner_parts
 from ..parts.fields import as_parameter, declarations, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
-from ..parts.joint_parts import AbstractCoordinatePart
 from ..parts.names import unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
-from ..parts.sources import AbstractOfSources
 from ..parts.spatial.kinematics import SPACE
 from ..system.description import Description
 from ..system.equation import Ranks
@@ -41,9 +41,6 @@ from .groups import BodyGroup, CoordinateGroup, FrameGroup, stack
 from .layout import Layout
 from .rigid_bodies import RigidBodySystem
 from .structure import with_structure
-
-# Parts that act on other parts, given by their names.
-_OF_OTHERS = (AbstractNonIdeal, AbstractCoordinatePart, AbstractOfSources)
 
 
 class Scene(eqx.Module):
@@ -107,7 +104,9 @@ class Scene(eqx.Module):
 
         frames = frames_by_name(self.frames, self.bodies)
         index |= {name: index[frame.of_body] for name, frame in frames.items()}
-        parts, laws, gravity = _resolved(self, layout, index, of_parts, frames, given)
+        observed = frozenset(frame.name for frame in self.frames)
+        known = KnownParts(space, index, of_parts, frames, observed, given, {})
+        parts, laws, gravity = _settled(self, known, layout)
 
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
@@ -138,65 +137,30 @@ class Scene(eqx.Module):
         return with_structure(system.with_initial_states().with_initial_scalars())
 
 
-def _resolved(
-    scene: Scene,
-    layout: Layout,
-    index: dict[str, int],
-    scalars: dict[str, tuple[int, ...]],
-    frames: dict[str, AbstractFrame],
-    given: Any,
-):
-    """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity.
-
-    **Arguments:** `index`: the numbers of bodies by the names of these and of frames; `scalars`: those of the scalar
-    coordinates of parts by their names; `given`: the poses of all bodies and scalar coordinates.
-    """
-    space = layout.space
-    gravity, parts, laws, joints = None, [], [], {}
-    # Parts of joints after the joints that they act on, and after tendons along joints.
-    level = lambda part: isinstance(part, _OF_OTHERS) * (1 if isinstance(part, AbstractTendon) else 2)
-    for part in sorted((*scene.joints, *scene.forces), key=level):
-        if isinstance(part, AbstractNonIdeal):
-            joint, own = joints[part.joint]
-            law = part.with_fields(body_frames=joint.body_frames)
-            # The law sees what its joint sees.
-            seen = law.seen_poses(space, given[list(own)])
-            laws.append((law.resolve(space, joint.with_fields(body_frames={}), seen), own))
-        elif isinstance(part, AbstractCoordinatePart):
-            joint, own = joints[part.joint_name]
-            parts.append((part.of_joint(joint).resolve(space, given[list(own)]), own))
-        elif isinstance(part, AbstractOfSources):
-            held = [_source(name, joints, scene.frames, frames, index) for name in part.sources]
-            own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
-            placed = [tuple(own.index(k) for k in bodies) for _, bodies in held]
-            resolved = part.of_sources([source for source, _ in held], placed).resolve(space, given[list(own)])
-            own = (*own, *scalars.get(part.name, ()))
-            joints[part.name] = resolved, own
-            parts.append((resolved, own))
-        elif isinstance(part, AbstractLink):
-            own = tuple(index[name] for name in part.bodies)
-            moving = [k for k in own if k < len(scene.bodies)]
-            if len({*moving}) < len(moving):
-                raise ValueError(f"{part.label} connects two frames of one body: {', '.join(part.bodies)}.")
-            on = {str(k): frames[name] for k, name in enumerate(part.bodies) if name in frames}
-            part, poses = _call(part, "with_fields", body_frames=on), given[list(own)]
-            resolved = _call(part, "resolve", space, _call(part, "seen_poses", space, poses))
-            joints[part.name] = resolved, own
-            components = resolved.components() if isinstance(resolved, AbstractCompound) else (resolved,)
-            components = tuple(_call(component, "with_fields", body_frames=on) for component in components)
-            _check_rotation(resolved, components, own, layout, poses)
-            parts += [(component, own) for component in components]
-        else:
-            part.check(space.dimension)
+def _settled(scene: Scene, known: KnownParts, layout: Layout):
+    """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity."""
+    gravity, parts, laws = None, [], []
+    # A concrete class: gravity is of no kind but its own, since it acts on every body.
+    for part in scene.forces:
+        if isinstance(part, Gravity):
+            part.check(layout.space.dimension)
             gravity = part
+    for part in sorted((part for part in (*scene.joints, *scene.forces) if part is not gravity), key=_stage):
+        settled, own = _call(part, "settled", known)
+        if isinstance(settled, AbstractNonIdeal):
+            laws.append((settled, own))
+            continue
+        known.joints[part.name] = settled, own
+        frames = settled.body_frames
+        components = [_call(one, "with_fields", body_frames=frames) for one in _call(settled, "components")]
+        if not part.stage:
+            _check_rotation(settled, components, own, layout, known.poses[list(own)])
+        parts += [(component, own) for component in components]
     return parts, laws, gravity
 
 
-def _source(name, joints, named, frames, index):
-    """A joint, a frame, or None for a body, with the numbers of its bodies."""
-    if name in joints:
-        return joints[name]
-    return (frames[name] if any(name == frame.name for frame in named) else None), (index[name],)
+def _stage(part):
+    return part.stage
 
 
 def _check_program(servo, space, bodies):
@@ -250,16 +214,18 @@ def _check_names(scene: Scene):
     known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
-    of_joints = AbstractCoordinatePart | AbstractOfSources
-    is_joint = lambda part: (
-        isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not isinstance(part, of_joints))
+    joints = dict.fromkeys(
+        part.name
+        for part in scene.joints
+        if isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not part.sources)
     )
-    joints = dict.fromkeys(part.name for part in scene.joints if is_joint(part))
+    places = [*joints, *(name for name in known if name != GROUND)]
     for part in (*scene.joints, *scene.forces):
-        if isinstance(part, AbstractOfSources) and part.takes_bodies:
-            _check_sources(part, "joint, body or frame", [*joints, *(name for name in known if name != GROUND)])
-        elif isinstance(part, _OF_OTHERS):
-            _check_sources(part, "joint", joints)
+        if isinstance(part, AbstractActor) and part.sources:
+            what, allowed = ("joint, body or frame", places) if part.takes_bodies else ("joint", joints)
+            for name in part.sources:
+                if name not in allowed or name == part.name:
+                    raise unknown(what, name, allowed, part.label)
         elif isinstance(part, AbstractLink):
             own = part.bodies
             for name in own:
@@ -268,17 +234,6 @@ def _check_names(scene: Scene):
             twice = [name for name in own if own.count(name) > 1]
             if twice and (twice[0] != GROUND or set(own) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
-
-
-def _check_sources(part, what, known):
-    """Check that the parts that a part acts on are known, and other parts than itself."""
-    if isinstance(part, AbstractNonIdeal):
-        sources = (part.joint,)
-    else:
-        sources = part.sources if isinstance(part, AbstractOfSources) else (part.joint_name,)
-    for name in sources:
-        if name not in known or name == part.name:
-            raise unknown(what, name, known, part.label)
 
 
 def _check_rotation(part, components, own, layout, poses):

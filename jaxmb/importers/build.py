@@ -7,12 +7,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from ..bodies.scene import Scene
+from ..parts.actuators import Actuator
 from ..parts.base import GROUND
-from ..parts.combinations import FixedTendon, JointCoupling, Tendon
+from ..parts.combinations import FixedTendon, JointCoupling, JointInertia, Tendon
+from ..parts.coordinate_parts import JointDriver, JointFriction, JointSpring, JointStop
 from ..parts.forces import Damper, Gravity, PointForce
-from ..parts.joint_inertia import JointInertia
-from ..parts.joint_laws import JointActuator, JointFriction, JointStop
-from ..parts.joint_parts import JointDriver, JointSpring
 from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body
 from ..parts.spatial.forces import RotationalDamper
@@ -369,7 +368,7 @@ class _Builder:
             name = self._named(actuator.name, "actuator")
             self.controls[actuator.name] = f"{name}.control"
             self.forces.append(
-                JointActuator(
+                Actuator(
                     name,
                     coordinate,
                     control=actuator.control,

@@ -112,7 +112,7 @@ class TendonPath:
 
 @dataclasses.dataclass
 class Actuator:
-    """An actuator of a joint, or of a tendon; its numbers as in `jaxmb.JointActuator`."""
+    """An actuator of a joint, or of a tendon; its numbers as in `jaxmb.Actuator`."""
 
     name: str
     of: str

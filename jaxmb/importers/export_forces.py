@@ -120,7 +120,7 @@ class _Writer:
         self.tree.elements[balls[0].name].set("damping", numbers(part.part.damping))
         return None
 
-    def write_JointActuator(self, part):
+    def write_Actuator(self, part):
         own = part.part
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)

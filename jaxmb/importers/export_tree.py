@@ -115,9 +115,7 @@ def _acts_on(group, part, k):
     """The coordinates that a part acts on: stacked parts know their joints by number only."""
     within = getattr(part, "within", ())
     within = (within,) if isinstance(within, str) else within
-    is_joint = lambda keys: keys[-1] == "joint" or keys[-2:-1] == ("joints",)
-    depth = min((len(keys) for keys, _ in group.inner if is_joint(keys)), default=0)
-    names = [own[k] for keys, own in group.inner if is_joint(keys) and len(keys) == depth]
+    names = [own[k] for keys, own in group.inner if len(keys) == 2 and keys[0] == "joints"]
     return tuple(f"{name}.{own}" for name, own in zip(names, within, strict=False))
 
 

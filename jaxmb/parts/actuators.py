@@ -1,4 +1,8 @@
-"""Motors on the coordinates of joints, with lag and limits."""
+"""Motors and actuators on the coordinates of joints, with lag and limits.
+
+A `Motor` is given by what it regulates, a force, a speed or a position, and its force lags behind the demand. An
+`Actuator` is given by a control and a force that is affine in the coordinate and its rate, and its control may lag.
+"""
 
 from typing import Literal
 
@@ -7,11 +11,11 @@ import numpy as np
 
 from . import fields
 from .base import AbstractDynamicForce
+from .coordinate_parts import AbstractCoordinatePart, AbstractScalarPart
 from .forces import generalized_force
-from .joint_parts import AbstractCoordinatePart
 
 
-class Actuator(AbstractCoordinatePart, AbstractDynamicForce):
+class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     """A motor on a joint's coordinate, which follows a command with lag, and within a limit.
 
     The demanded force is, for a coordinate x,
@@ -46,8 +50,7 @@ class Actuator(AbstractCoordinatePart, AbstractDynamicForce):
 
     def with_numbers(self, given):
         self._check_shape("command", given)
-        part = self.with_fields(force=fields.as_parameter(np.broadcast_to(self.force, given.shape)))
-        return part
+        return self.with_fields(force=fields.as_parameter(np.broadcast_to(self.force, given.shape)))
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: self.force.reshape(-1)
@@ -69,3 +72,70 @@ class Actuator(AbstractCoordinatePart, AbstractDynamicForce):
         largest = jnp.max(jnp.abs(self.command)) if self.mode == "force" else self.gain
         size = largest if self.limit is None else self.limit
         return {"force": jnp.where(size > 0, size, 1.0)}
+
+
+class Actuator(AbstractScalarPart, AbstractDynamicForce):
+    """An actuator with a control: a motor, or a position or velocity servo, with a gear.
+
+    With the length `l = gear x` of the coordinate x, it exerts the generalized force `gear f`,
+    `f = (gain · (1, l, l̇)) control + bias · (1, l, l̇)`: a motor has gain (1, 0, 0) and no bias; a position servo has
+    gain (k, 0, 0) and bias (0, −k, −d); a velocity servo gain (d, 0, 0) and bias (0, 0, −d).
+
+    With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
+    `lag · d(activation)/dt = control − activation`. Of a `Motor` it is the force that follows.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`, of which x counts in (−π, π] about `middle`; `control`, default
+    zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`;
+    `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by default they are not;
+    `lag` [s] > 0, default none; `activation`, its initial value, default zero.
+    """
+
+    control: fields.Number = fields.parameter(default=0.0)
+    gear: fields.Number = fields.parameter(default=1.0)
+    gain: fields.Number = fields.parameter(shape=(3,), default=(1.0, 0.0, 0.0))
+    bias: fields.Number = fields.parameter(shape=(3,), default=(0.0, 0.0, 0.0))
+    middle: fields.Number = fields.parameter(unit="rad or m", default=0.0)
+    control_range: fields.Number = fields.parameter(shape=(2,), optional=True)
+    force_range: fields.Number = fields.parameter(shape=(2,), optional=True)
+    lag: fields.Number = fields.parameter(unit="s", sign="positive", optional=True)
+    activation: fields.Number = fields.internal_state(optional=True)
+
+    def validate(self):
+        for name in ("control_range", "force_range"):
+            given = getattr(self, name)
+            if given is not None and not given[0] < given[1]:
+                raise ValueError(f"{self.label}: {name} must be two numbers that increase, got {given.tolist()}.")
+        if self.lag is None and self.activation is not None:
+            raise ValueError(f"{self.label}: an activation needs a lag.")
+
+    def with_numbers(self, given):
+        part = super().with_numbers(given)
+        return part if self.lag is None else part.filled(activation=0.0)
+
+    def force(self, length, rate):
+        """f [N m, N] at a length [rad, m] and its rate."""
+        terms = jnp.stack([jnp.ones_like(length), length, rate])
+        control = self._clipped_control() if self.lag is None else self.activation
+        force = jnp.dot(self.gain, terms) * control + jnp.dot(self.bias, terms)
+        return _clipped(force, self.force_range)
+
+    def wrenches(self, space, poses, velocities, t):
+        def law(x, v):
+            x = self.near(x, self.middle)
+            return self.gear * self.force(self.gear * x[0], self.gear * v[0])[None]
+
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+    def state_rates(self, space, poses, velocities, t):
+        return {} if self.lag is None else {"activation": (self._clipped_control() - self.activation) / self.lag}
+
+    def state_sizes(self):
+        size = jnp.abs(self.control) if self.control_range is None else jnp.max(jnp.abs(self.control_range))
+        return {"activation": jnp.where(size > 0, size, 1.0)}
+
+    def _clipped_control(self):
+        return _clipped(self.control, self.control_range)
+
+
+def _clipped(value, limits):
+    return value if limits is None else jnp.clip(value, limits[0], limits[1])

@@ -55,6 +55,29 @@ class ScalarCoordinate(NamedTuple):
     moves: bool = False
 
 
+class KnownParts(NamedTuple):
+    """The parts of a scene that are settled so far, from which others are.
+
+    **Fields:** the `space`; the `numbers` of bodies by the names of these and of frames; `scalars`: those of the scalar
+    coordinates of parts, by their names; `frames` by name, and of these the `observed`, those that the scene names;
+    `poses` of all bodies and scalar coordinates, as given; the `joints` by name, each with the numbers of its bodies.
+    """
+
+    space: AbstractSpace
+    numbers: Mapping[str, int]
+    scalars: Mapping[str, tuple[int, ...]]
+    frames: Mapping[str, Any]
+    observed: frozenset[str]
+    poses: Any
+    joints: dict[str, tuple[Any, tuple[int, ...]]]
+
+    def source(self, name: str) -> tuple[Any, tuple[int, ...]]:
+        """A joint, a frame, or None for a body, with the numbers of its bodies."""
+        if name in self.joints:
+            return self.joints[name]
+        return self.frames[name] if name in self.observed else None, (self.numbers[name],)
+
+
 class AbstractPart(eqx.Module):
     """A named element of a scene. `dimensions` lists the spaces that it supports: 2 for the plane, 3 for space."""
 
@@ -181,12 +204,25 @@ class AbstractActor(AbstractPart):
     """
 
     body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
+    # When a scene settles the part: 0 from its bodies, 1 after the joints between them, 2 after tendons as well.
+    stage: ClassVar[int] = 0
+    # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
+    takes_bodies: ClassVar[bool] = False
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         out = super().__new__(cls, *args, **kwargs)
         # Here, so that parts with an `__init__` of their own have it as well.
         object.__setattr__(out, "body_frames", {})
         return out
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Hook: the names of the parts that it acts on or measures, where these are not bodies that it names itself."""
+        return ()
+
+    @abc.abstractmethod
+    def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
+        """The part in a scene, with every number filled in, and the numbers of its bodies."""
 
     def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
         """The poses that the kernels see, from those of the bodies."""
@@ -248,6 +284,20 @@ class AbstractLink(AbstractActor):
         """Hook: a copy with omitted numbers computed from the given poses; see `filled`."""
         del space, poses
         return self
+
+    def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
+        cls, names = type(self), self.bodies
+        own = tuple(known.numbers[name] for name in names)
+        moving = [k for k in own if k != known.numbers[GROUND]]
+        if len({*moving}) < len(moving):
+            raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
+        frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}
+        part = cls.with_fields(self, body_frames=frames)
+        return cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(own)])), own
+
+    def components(self) -> tuple["AbstractLink", ...]:
+        """Hook: the parts that it consists of, by default itself; called after the numbers have been filled in."""
+        return (self,)
 
     def scalar_coordinates(self, parts: Mapping[str, "AbstractLink"]) -> tuple[ScalarCoordinate, ...]:
         """Hook: the scalar coordinates that the part adds, from all parts of the scene by name.
@@ -432,6 +482,18 @@ class AbstractNonIdeal(AbstractActor):
     """
 
     joint: AbstractVar[str]
+    stage: ClassVar[int] = 2
+
+    @property
+    def sources(self):
+        return (self.joint,)
+
+    def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
+        joint, own = known.joints[self.joint]
+        # The law sees what its joint sees.
+        law = self.with_fields(body_frames=joint.body_frames)
+        poses = law.seen_poses(known.space, known.poses[list(own)])
+        return law.resolve(known.space, joint.with_fields(body_frames={}), poses), own
 
     def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
         """A checked copy with every number filled in, from its joint and the poses of the joint's bodies.

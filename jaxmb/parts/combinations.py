@@ -1,4 +1,4 @@
-"""Parts of several coordinates of joints: couplings between them, and tendons along them."""
+"""Couplings between coordinates of joints, tendons along them, and inertias that move with them."""
 
 import abc
 from collections.abc import Sequence
@@ -13,22 +13,17 @@ from jaxtyping import Array, Float
 from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractConstraint, AbstractTendon, ScalarCoordinate
-from .joint_parts import given_coordinate, shortest, turns
-from .sources import AbstractOfSources
+from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
+from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns
 
 
-class AbstractCombination(AbstractOfSources):
-    """A part that acts on several coordinates of joints or tendons.
+class AbstractCombination(AbstractOfJoints):
+    """A part that acts on several coordinates of joints or tendons, each a number.
 
-    **Fields:** a scene fills in the `joints`, by number, and `places`: for each of them the numbers of its bodies among
-    those of the part.
+    **Fields:** a scene fills in the names of the coordinates `within` their joints.
     """
 
-    name: str = fields.name()
-    joints: Any = fields.parts()
     within: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
-    places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     @abc.abstractmethod
@@ -39,21 +34,14 @@ class AbstractCombination(AbstractOfSources):
     def sources(self):
         return tuple(name.split(".")[0] for name in self.combined)
 
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for joint in self.joints.values() for name in joint.bodies))
-
     def of_sources(self, parts, places):
-        return self.with_fields(
-            joints={str(k): joint for k, joint in enumerate(parts)},
-            within=tuple(name.partition(".")[2] for name in self.combined),
-            places=tuple(places),
-        )
+        within = tuple(name.partition(".")[2] for name in self.combined)
+        return super().of_sources(parts, places).with_fields(within=within)
 
     def complete(self, space, poses):
         given = []
         for k, name in enumerate(self.combined):
-            value = given_coordinate(self, self.joints[str(k)], name, space, poses[list(self.places[k])])
+            value = self.given_coordinate(k, name, space, poses)
             if value.size != 1:
                 raise ValueError(f"{self.label}: {name!r} must be a number, it has shape {value.shape}.")
             given.append(float(value.reshape(())))
@@ -66,8 +54,7 @@ class AbstractCombination(AbstractOfSources):
 
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
-        own = enumerate(zip(self.within, self.places, strict=True))
-        return [self.joints[str(k)].coordinates_at(space, poses[np.array(at)])[w].reshape(()) for k, (w, at) in own]
+        return [self.coordinates_of(k, space, poses)[own].reshape(()) for k, own in enumerate(self.within)]
 
     def is_periodic(self, k: int) -> bool:
         """Whether a coordinate is an angle known up to full turns."""
@@ -128,6 +115,42 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
         return shortest(out[None]) if self.is_periodic(0) else out[None]
 
 
+class JointInertia(AbstractCombination, AbstractInertialConstraint):
+    """An inertia that moves with a coordinate of a joint or tendon: kinetic energy `½ inertia ẋ²`, and nothing else.
+
+    The rotor of a motor with inertia J behind a gear of ratio n adds `n² J` to its joint: the reflected inertia, the
+    armature of MuJoCo. It has no mass, no weight and no momentum of its own. The gyroscopic moment of the rotor and the
+    reaction of its acceleration on the housing are neglected, as is usual for gears of high ratio; where they count,
+    model the rotor as a body and the gear by a `JointCoupling`.
+
+    The scene has one coordinate, one velocity and one row more for each: the coordinate x itself, `"rotor.angle"` of an
+    angle, `"rotor.displacement"` of a displacement or length, which counts on through full turns. The reaction of the
+    part is the generalized force `−inertia ẍ`, on the last body of the joint.
+
+    **Arguments:** `coordinate`, a number, such as `"hip.angle"`; `inertia` [kg m² of an angle, kg of a displacement]
+    > 0.
+    """
+
+    coordinate: str = fields.name()
+    inertia: fields.Number = fields.parameter(unit="kg m² or kg", sign="positive", constant=True)
+    rows: ClassVar[int] = 1
+    rheonomic: ClassVar[bool] = False
+
+    @property
+    def combined(self):
+        return (self.coordinate,)
+
+    def scalar_coordinates(self, parts):
+        length = is_length(self.coordinate.partition(".")[2])
+        name = f"{self.name}.{'displacement' if length else 'angle'}"
+        return (ScalarCoordinate(name, is_length=length, moves=True),)
+
+    def residual(self, space, poses, t):
+        (value,) = self.values(space, poses[:-1])
+        out = (poses[-1, 0] - value)[None]
+        return shortest(out) if self.is_periodic(0) else out
+
+
 class FixedTendon(AbstractCombination, AbstractTendon):
     """A weighted sum of coordinates of joints, `length = Σ coefficients[k] x_k`, as a tendon around pulleys has.
 
@@ -141,6 +164,7 @@ class FixedTendon(AbstractCombination, AbstractTendon):
     """
 
     along: fields.Names = fields.names()
+    stage: ClassVar[int] = 1
     coefficients: fields.Number = fields.parameter(shape=None, unit="m/rad or 1")
 
     @property

@@ -10,10 +10,10 @@ import numpy as np
 
 from . import fields
 from .base import AbstractDynamicForce
+from .coordinate_parts import AbstractOfJoints
 from .forces import generalized_force
 from .frames import AbstractFrame
 from .names import unknown
-from .sources import AbstractOfSources
 
 # What is seen of a body or a frame, and in which space if not in both.
 _OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
@@ -27,7 +27,7 @@ def _names(names: Any) -> Any:
     return (names,) if isinstance(names, str) else tuple(names)
 
 
-class Controller(AbstractOfSources, AbstractDynamicForce):
+class Controller(AbstractOfJoints, AbstractDynamicForce):
     """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
     parameters) -> forces, rates`.
 
@@ -56,17 +56,13 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
                    states={"integral": 0.0}, parameters={"kp": 50.0, "ki": 20.0, "kd": 5.0, "target": 0.3})
     """
 
-    name: str = fields.name()
     function: Callable[..., Any] = fields.function()
     measures: Any = eqx.field(static=True, converter=_pairs)  # pyright: ignore[reportGeneralTypeIssues]
     acts_on: Any = eqx.field(static=True, converter=_names)  # pyright: ignore[reportGeneralTypeIssues]
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
-    # Filled in by the scene: joints and frames, the places of their bodies among all bodies, and the names by which the
-    # function returns several forces. Numbers then stand for the names of sources in `measures` and `acts_on`, so that
-    # equal controllers of other parts stack.
-    held: Any = fields.parts()
-    places: Any = eqx.field(static=True, default=(), kw_only=True)
+    # A scene fills in the names of the sources, and those by which the function returns several forces. In `measures`
+    # and `acts_on` the number of a source then stands for its name, so that controllers of other joints are stacked.
     source_names: tuple[str, ...] = fields.names(optional=True)
     force_names: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
     takes_bodies: ClassVar[bool] = True
@@ -95,8 +91,10 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     @property
     def bodies(self):
-        of_source = lambda k: self.held[k].bodies if self._is_joint(k) else (self.source_names[int(k)],)
-        return tuple(dict.fromkeys(body for k, _ in self.places for body in of_source(k)))
+        of_source = lambda k, name: self.joints[k].bodies if self._is_joint(k) else (name,)
+        return tuple(
+            dict.fromkeys(body for k, name in enumerate(self.source_names) for body in of_source(str(k), name))
+        )
 
     def of_sources(self, parts, places):
         numbers = {name: str(k) for k, name in enumerate(self.sources)}
@@ -105,13 +103,15 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
             source, quantity = name.split(".")
             return f"{numbers[source]}.{quantity}"
 
-        return self.with_fields(
-            held={str(k): part for k, part in enumerate(parts) if part is not None},
-            places=tuple((str(k), own) for k, own in enumerate(places)),
-            measures=tuple((label, numbered(name)) for label, name in self.measures),
-            acts_on=tuple(numbered(name) for name in self.acts_on),
-            source_names=self.sources,
-            force_names=self.acts_on if len(self.acts_on) > 1 else (),
+        return (
+            super()
+            .of_sources(parts, places)
+            .with_fields(
+                measures=tuple((label, numbered(name)) for label, name in self.measures),
+                acts_on=tuple(numbered(name) for name in self.acts_on),
+                source_names=self.sources,
+                force_names=self.acts_on if len(self.acts_on) > 1 else (),
+            )
         )
 
     def complete(self, space, poses):
@@ -138,12 +138,12 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
         return f"{self.source_names[int(source)]}.{quantity}"
 
     def _is_joint(self, source):
-        return source in self.held and not isinstance(self.held[source], AbstractFrame)
+        return source in self.joints and not isinstance(self.joints[source], AbstractFrame)
 
     def _known(self, source, space):
         if self._is_joint(source):
-            poses = jnp.tile(space.prepare(np.asarray(space.ground)), (len(dict(self.places)[source]), 1))
-            return list(jax.eval_shape(lambda x: self.held[source].coordinates_at(space, x), poses))
+            poses = jnp.tile(space.prepare(np.asarray(space.ground)), (len(self.places[int(source)]), 1))
+            return list(jax.eval_shape(lambda x: self.joints[source].coordinates_at(space, x), poses))
         return [name for name, dimension in _OF_BODIES.items() if dimension in (None, space.dimension)]
 
     def wrenches(self, space, poses, velocities, t):
@@ -191,7 +191,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
 
     def _coordinate(self, space, poses, name):
         source, quantity = name.split(".")
-        return self.held[source].coordinates_at(space, poses[np.array(dict(self.places)[source])])[quantity]
+        return self.coordinates_of(int(source), space, poses)[quantity]
 
     def _measured(self, space, poses, velocities, name):
         source, quantity = name.split(".")
@@ -204,7 +204,7 @@ class Controller(AbstractOfSources, AbstractDynamicForce):
         return jax.jvp(lambda x: self._coordinate(space, x, f"{source}.{base}"), (poses,), (rates,))[1]
 
     def _of_body(self, space, poses, velocities, source, quantity):
-        (k,), frame, d = dict(self.places)[source], self.held.get(source), space.dimension
+        (k,), frame, d = self.places[int(source)], self.joints.get(source), space.dimension
         pose, velocity = poses[k], velocities[k]
         if isinstance(frame, AbstractFrame):
             pose, velocity = frame.pose(space, pose), frame.velocity(space, pose, velocity)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractCompound, AbstractNonIdeal, rows_of
+from .base import AbstractNonIdeal, rows_of
 from .smooth import dry_friction
 
 
@@ -47,8 +47,7 @@ class Friction(AbstractNonIdeal):
 
     def _check_slip(self, space, joint, poses):
         columns = poses.shape[0] * space.velocity_size
-        components = joint.components() if isinstance(joint, AbstractCompound) else (joint,)
-        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in components]
+        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in joint.components()]
         _, sizes, directions = np.linalg.svd(np.concatenate(rows))
         allowed = directions[np.sum(sizes > 1e-9 * sizes[0]) :].reshape(-1, poses.shape[0], space.velocity_size)
         slips = jax.vmap(lambda v: self.slip(space, poses, v))(jnp.asarray(allowed))

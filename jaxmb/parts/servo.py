@@ -4,8 +4,7 @@ from typing import Any
 
 from . import fields
 from .base import AbstractConstraint, AbstractLink
-from .joint_parts import AbstractCoordinatePart
-from .sources import AbstractOfSources
+from .coordinate_parts import AbstractOfJoints
 
 
 class Servo(AbstractLink):
@@ -29,7 +28,7 @@ class Servo(AbstractLink):
     stiffness: fields.Number = fields.parameter(unit="1/s²", sign="non-negative", default=0.0, kw_only=False)
 
     def __check_init__(self):
-        if isinstance(self.program, AbstractCoordinatePart | AbstractOfSources):
+        if isinstance(self.program, AbstractOfJoints):
             raise ValueError(
                 f"{self.label}: the program must be a constraint between bodies, such as a Driver or a Constraint; a "
                 f"{self.program.kind} acts on coordinates of joints. Prescribe a coordinate of a body with a Driver, "

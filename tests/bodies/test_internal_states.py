@@ -96,7 +96,7 @@ def test_small_states_that_start_at_zero_are_as_accurate(method):
     unit, w, lag, t = 1e-9, 5.0, 0.05, 3.0
     rod = planar.Body("rod", mass=1.0, inertia=0.1 * unit)
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
-    motor = mb.Actuator("motor", "pin.angle", command=0.0, lag=lag)
+    motor = mb.Motor("motor", "pin.angle", command=0.0, lag=lag)
     system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
     command = {"motor.command": lambda t: unit * jnp.sin(w * t)}
     sol = mb.simulate(system, mb.assemble(system), t1=t, inputs=command, **METHODS[method])
@@ -164,7 +164,7 @@ def test_a_failure_of_friction_is_named_beside_internal_states():
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
     floor = planar.PointOnLine("floor", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0), axis_a=(1.0, 0.0))
     rub = planar.Friction("rub", "floor", coefficient=1.5, transition_speed=1e-2)
-    motor = mb.Actuator("motor", "floor.displacement", command=0.0, lag=0.1)
+    motor = mb.Motor("motor", "floor.displacement", command=0.0, lag=0.1)
     forces = [mb.Gravity((0.0, -9.81)), rub, motor]
     system = mb.Scene([rod], joints=[floor], forces=forces).compile()
     state = mb.assemble(system, fix={"rod.angle": 0.5}, rates={"rod.x": -3.0, "rod.angle": 6.0})
@@ -220,7 +220,7 @@ def test_linear_equations_of_a_controlled_machine():
 
 def motor_on_four_bar(**changes):
     own = {"mode": "speed", "command": 6.0, "gain": 30.0, "lag": 0.05, "limit": 40.0} | changes
-    return with_forces(mechanisms.four_bar, mb.Actuator("motor", "A.angle", **own))
+    return with_forces(mechanisms.four_bar, mb.Motor("motor", "A.angle", **own))
 
 
 def with_forces(mechanism, *forces):
@@ -260,7 +260,7 @@ def test_modes_of_an_actuator():
         ({"mode": "position", "command": -8.0, "gain": 3.0}, 3.0 * (-8.0 + 2 * np.pi)),
         ({"mode": "force", "command": 2.0, "limit": 1.5}, 1.5 * np.tanh(2.0 / 1.5)),
     ):
-        system = mb.Scene([rod], joints=[pin], forces=[mb.Actuator("m", "pin.angle", lag=0.1, **options)]).compile()
+        system = mb.Scene([rod], joints=[pin], forces=[mb.Motor("m", "pin.angle", lag=0.1, **options)]).compile()
         state = mb.assemble(system, fix={"m.force": 0.3}, rates={"rod.angle": 0.5})
         rate = system.with_states(state.z).state_rates(0.0, state.q, state.u)
         np.testing.assert_allclose(rate, [(demand - 0.3) / 0.1], rtol=1e-12)
@@ -348,7 +348,7 @@ def chain_of_motors(n):
         planar.Revolute(f"pin{k}", "ground" if k == 0 else f"rod{k - 1}", f"rod{k}", point=(float(k), 0.0))
         for k in range(n)
     ]
-    motor = lambda k: mb.Actuator(f"motor{k}", f"pin{k}.angle", command=1.0 + 0.1 * k, lag=0.1, limit=3.0)
+    motor = lambda k: mb.Motor(f"motor{k}", f"pin{k}.angle", command=1.0 + 0.1 * k, lag=0.1, limit=3.0)
     forces = [mb.Gravity((0.0, -9.81)), *map(motor, range(n))]
     return mb.Scene(rods, joints=pins, forces=forces).compile()
 
@@ -557,7 +557,7 @@ REFUSED = {
     ),
     "gain of a force": (
         lambda: motor_on_four_bar(mode="force"),
-        "Actuator 'motor': gain and damping belong to the modes 'speed' and 'position'",
+        "Motor 'motor': gain and damping belong to the modes 'speed' and 'position'",
     ),
     "shape of a command": (
         lambda: motor_on_four_bar(command=[1.0, 2.0]),

@@ -30,8 +30,8 @@ def small_scene():
         mb.Gravity((0.0, 0.0, -9.81)),
         mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.2, free=0.3),
         mb.JointSpring("pull", "rope.length", stiffness=3.0, free=0.5),
-        mb.JointActuator("motor", "reach.displacement", gear=2.0, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -1.0)),
-        mb.JointActuator("winch", "cord.length", gear=2.0),
+        mb.Actuator("motor", "reach.displacement", gear=2.0, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -1.0)),
+        mb.Actuator("winch", "cord.length", gear=2.0),
         spatial.SpringDamper("rubber", "hand", "float", stiffness=20.0, damping=0.5, free_length=0.8),
     ]
     return mb.Scene(bodies, joints=joints, forces=forces, frames=[spatial.Frame("tip", "hand", position=(0.1, 0, 0))])

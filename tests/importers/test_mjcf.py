@@ -247,7 +247,7 @@ def test_inertia_names_and_frames():
             HINGE,
             '<actuator><motor name="m" joint="hip" ctrlrange="-1 1"/></actuator>',
             "m",
-            "JointActuator",
+            "Actuator",
             "clipped to their ranges.*'m'",
         ),
         (

@@ -91,7 +91,7 @@ def test_stress_of_a_scene_with_internal_states():
     """A rod with a motor that lags: its force counts among the errors, and variants start with it."""
     rod = planar.Body("rod", mass=2.0, inertia=0.3)
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
-    motor = mb.Actuator("motor", "pin.angle", command=1.2, lag=0.1)
+    motor = mb.Motor("motor", "pin.angle", command=1.2, lag=0.1)
     system = mb.Scene([rod], joints=[pin], forces=[motor]).compile()
     state = mb.assemble(system, fix={"motor.force": 4.0}, rates={"pin.angle": 1.0})
     report = stress_test(system, state, t1=0.5, rtol=1e-8, only=["rtol", "lengths", "initial speed", "doubled joint"])

@@ -250,11 +250,11 @@ def coupled():
 FUNCTIONS = [
     of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
     of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
-    of_joint(mb.JointActuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
+    of_joint(mb.Actuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
     of_joint(
-        mb.JointActuator,
+        mb.Actuator,
         "lag",
-        name="JointActuator with a lag",
+        name="Actuator with a lag",
         lag=0.05,
         control=0.3,
         gain=(5.0, 0.0, 0.0),
@@ -268,9 +268,7 @@ FUNCTIONS = [
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
     of_joint(mb.JointInertia, "inertia", inertia=0.4),
-    of_joint(
-        mb.Actuator, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False
-    ),
+    of_joint(mb.Motor, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False),
     controlled(),
     on_body_2d(mb.Constraint, "curvature", function=on_parabola, parameters={"curvature": 0.4}, rheonomic=False),
     on_body_2d(mb.VelocityConstraint, "angle", function=skate, parameters={"angle": 0.1}, homogeneous=True),

@@ -15,7 +15,7 @@ from ...linalg import rotations as rot
 from ...linalg.arrays import namespace
 from .. import fields
 from ..base import AbstractJoint, AbstractSpatialPart
-from ..joint_parts import shortest
+from ..coordinate_parts import shortest
 from ..shapes import ball, pin, sleeve
 from ..space import both_points
 from .axes import (

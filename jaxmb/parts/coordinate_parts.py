@@ -1,0 +1,299 @@
+"""Parts that act on joints and tendons by their coordinates, such as `"hip.angle"`: springs, forces, stops, friction,
+prescribed motions.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from . import fields
+from .base import AbstractConstraint, AbstractForce, AbstractLink, AbstractPart, AbstractPotentialForce, KnownParts
+from .forces import generalized_force
+from .names import unknown
+from .smooth import ramp
+
+
+class AbstractOfJoints(AbstractLink):
+    """A part that acts on joints and tendons, or measures them, and if it `takes_bodies` bodies and frames as well.
+
+    **Fields:** a scene fills in the `joints`, by the number of the source (a joint, a tendon or a frame, none for a
+    body), and `places`: for each source the numbers of its bodies among those of the part.
+    """
+
+    name: str = fields.name()
+    joints: Any = fields.parts()
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
+    stage: ClassVar[int] = 2
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for joint in self.joints.values() for name in joint.bodies))
+
+    def settled(self, known: KnownParts):
+        held = [known.source(name) for name in self.sources]
+        own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
+        places = [tuple(own.index(k) for k in bodies) for _, bodies in held]
+        part = self.of_sources([source for source, _ in held], places)
+        return part.resolve(known.space, known.poses[list(own)]), (*own, *known.scalars.get(self.name, ()))
+
+    def of_sources(self, parts: Sequence[AbstractPart | None], places: Sequence[tuple[int, ...]]) -> Any:
+        """A copy that holds its sources.
+
+        **Arguments:** `parts`: a joint, tendon or frame for each of `sources`, None for a body; `places`: for each the
+        numbers of its bodies among those of this part.
+        """
+        held = {str(k): part for k, part in enumerate(parts) if part is not None}
+        return self.with_fields(joints=held, places=tuple(places))
+
+    def coordinates_of(self, k: int, space, poses) -> dict[str, Array]:
+        """The coordinates of a source, by their names within it."""
+        at = self.places[k]
+        return self.joints[str(k)].coordinates_at(
+            space, poses if at == tuple(range(len(poses))) else poses[np.array(at)]
+        )
+
+    def given_coordinate(self, k: int, coordinate: str, space: Any, poses: Any) -> np.ndarray:
+        """A coordinate of a source at the given poses.
+
+        **Raises:** `ValueError` if the joint has no such coordinate; see its class for those that it has.
+        """
+        known = self.coordinates_of(k, space, poses)
+        name, _, within = coordinate.partition(".")
+        if within not in known:
+            names = [f"{name}.{own}" for own in known]
+            if not names:
+                raise ValueError(f"{self.label}: {self.joints[str(k)].label} has no coordinate of its own.")
+            raise unknown("coordinate", coordinate, names, self.label)
+        return np.asarray(known[within])
+
+
+class AbstractCoordinatePart(AbstractOfJoints):
+    """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
+
+    **Fields:** `coordinate`: `"joint.coordinate"`, a coordinate that the joint's class documents. A scene fills in its
+    name `within` the joint.
+    """
+
+    coordinate: str = fields.name()
+    within: str = eqx.field(static=True, default="", kw_only=True)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        return (self.coordinate.split(".")[0],)
+
+    @property
+    def joint(self) -> AbstractLink:
+        """The joint or tendon."""
+        return self.joints["0"]
+
+    def of_sources(self, parts, places):
+        return super().of_sources(parts, places).with_fields(within=self.coordinate.partition(".")[2])
+
+    def complete(self, space, poses):
+        return self.with_numbers(self.given_coordinate(0, self.coordinate, space, poses))
+
+    def unit(self, alternatives: str) -> str:
+        """Of the units of an angle and of a displacement, `"N m or N"`, that of the coordinate."""
+        of_angle, of_displacement = alternatives.split(" or ")
+        return of_displacement if is_length(self.within) else of_angle
+
+    @abc.abstractmethod
+    def with_numbers(self, given: np.ndarray) -> Any:
+        """A checked copy with omitted numbers filled in, from the coordinate at the given poses."""
+
+    def measured(self, space, poses) -> Float[Array, "n"]:
+        """The coordinate, raveled."""
+        return self.coordinates_of(0, space, poses)[self.within].reshape(-1)
+
+    def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+        """The coordinate and its rate, raveled."""
+        rates = jax.vmap(space.rates)(poses, velocities)
+        return jax.jvp(lambda x: self.measured(space, x), (poses,), (rates,))
+
+    def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """`value − target`; of angles that are known up to full turns the smallest such difference."""
+        out = value - target.reshape(-1)
+        return shortest(out) if self.within in self.joint.periodic else out
+
+    def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """`value − target`; of an angle less full turns, in [−π, π]."""
+        out = value - target.reshape(-1)
+        return shortest(out) if self.within in self.joint.angles else out
+
+    def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
+        """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
+        return middle.reshape(-1) + self.difference(value, middle) if self.within in self.joint.periodic else value
+
+    def _check_shape(self, field: str, given: np.ndarray) -> None:
+        shape = np.shape(getattr(self, field))
+        if shape != given.shape:
+            raise ValueError(
+                f"{self.label}: {field} must have the shape of {self.coordinate!r}, {given.shape}, got {shape}."
+            )
+
+
+def is_length(within: str) -> bool:
+    """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
+    return within.startswith(("displacement", "length"))
+
+
+def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The angle [rad] less full turns, in [−π, π]."""
+    return angle - turns(angle)
+
+
+def turns(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The full turns [rad] that are nearest to an angle."""
+    return 2 * np.pi * lax.stop_gradient(jnp.round(angle / (2 * np.pi)))
+
+
+class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
+    """A linear spring and damper on a coordinate: generalized force `−stiffness (value − free) − damping rate`.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
+    ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
+    spring of an angle takes the shortest way to it, up to half a turn; with `middle` [rad], of the range in which the
+    angle stays, it takes the way within half a turn of that.
+    """
+
+    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
+    free: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    middle: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+
+    def with_numbers(self, given):
+        part = self.filled(free=given)
+        for field in ("free",) if part.middle is None else ("free", "middle"):
+            part._check_shape(field, given)
+        return part
+
+    def _stretch(self, value):
+        if self.middle is None:
+            return self.difference(value, self.free)
+        return self.near(value, self.middle) - self.free.reshape(-1)
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: -self.stiffness * self._stretch(x) - self.damping * v
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+    def energy(self, space, poses, t):
+        return 0.5 * self.stiffness * jnp.sum(self._stretch(self.measured(space, poses)) ** 2)
+
+
+class JointForce(AbstractCoordinatePart, AbstractForce):
+    """A force along a coordinate, or a moment about it, with its reaction on the other body: a motor on a hinge.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m of an angle, N of a displacement], of the
+    coordinate's shape, positive where it increases the coordinate. As an input of `simulate`, `"motor.force"` is a
+    function of time.
+    """
+
+    force: fields.Number = fields.parameter(shape=None, unit="N m or N")
+
+    def with_numbers(self, given):
+        self._check_shape("force", given)
+        return self
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: self.force.reshape(-1)
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+
+class JointDriver(AbstractCoordinatePart, AbstractConstraint):
+    """A coordinate that is prescribed, `value + rate t`. Rows: one for each of its components.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `value` [rad, m], default that at the given poses; `rate`
+    [rad/s, m/s], default zero; both of the coordinate's shape. As an input of `simulate`, `"drive.value"` is any
+    function of time.
+    """
+
+    value: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    rate: fields.Number = fields.parameter(shape=None, unit="rad/s or m/s", optional=True)
+    rows: int = eqx.field(static=True, default=1, kw_only=True)
+    rheonomic: ClassVar[bool] = True
+
+    def with_numbers(self, given):
+        part = self.filled(value=given, rate=np.zeros_like(given))
+        part._check_shape("value", given)
+        part._check_shape("rate", given)
+        return part.with_fields(rows=given.size)
+
+    def residual(self, space, poses, t):
+        return self.difference(self.measured(space, poses), self.value + self.rate * t)
+
+
+class AbstractScalarPart(AbstractCoordinatePart):
+    """A part of a coordinate that is a number."""
+
+    def with_numbers(self, given):
+        if given.size != 1:
+            raise ValueError(f"{self.label}: {self.coordinate!r} must be a number, it has shape {given.shape}.")
+        return self
+
+
+class JointStop(AbstractScalarPart, AbstractPotentialForce):
+    """Compliant stops at the ends of a coordinate's range: a spring and a damper where it is outside.
+
+    The depth δ beyond a stop is that of a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or
+    value − upper. The stop has the potential `½ stiffness δ²` and the dissipation `damping δ̇²`.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0;
+    `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends. The range of an angle must be
+    less than a full turn.
+    """
+
+    lower: fields.Number = fields.parameter(unit="rad or m")
+    upper: fields.Number = fields.parameter(unit="rad or m")
+    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
+    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
+    smoothing: fields.Number = fields.parameter(unit="rad or m", sign="positive", default=1e-3)
+
+    def validate(self):
+        if not self.lower < self.upper:
+            raise ValueError(f"{self.label}: lower must be less than upper, got {self.lower} and {self.upper}.")
+
+    def with_numbers(self, given):
+        if self.within in self.joint.periodic and self.upper - self.lower >= 2 * np.pi:
+            raise ValueError(
+                f"{self.label}: the range of an angle must be less than a full turn, got {self.lower} to {self.upper}."
+            )
+        return super().with_numbers(given)
+
+    def _depths(self, value):
+        value = self.near(value, 0.5 * (self.lower + self.upper))
+        return ramp(jnp.concatenate([self.lower - value, value - self.upper]), self.smoothing)
+
+    def wrenches(self, space, poses, velocities, t):
+        def law(x, v):
+            depth, rate = jax.jvp(self._depths, (x,), (v,))
+            (force,) = jax.vjp(self._depths, x)[1](self.stiffness * depth + self.damping * rate)
+            return -force
+
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+
+    def energy(self, space, poses, t):
+        return 0.5 * self.stiffness * jnp.sum(self._depths(self.measured(space, poses)) ** 2)
+
+
+class JointFriction(AbstractScalarPart, AbstractForce):
+    """Dry friction of constant size on a coordinate: generalized force `−force tanh(rate / transition_speed)`.
+
+    Unlike `Friction` it does not depend on the reaction of the joint.
+
+    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0,
+    below which friction is viscous.
+    """
+
+    force: fields.Number = fields.parameter(unit="N m or N", sign="non-negative")
+    transition_speed: fields.Number = fields.parameter(unit="rad/s or m/s", sign="positive", default=1e-2)
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)
+        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
