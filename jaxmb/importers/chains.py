@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ..linalg.rotations import from_matrix
 from ..parts.spatial.composite import Composite, coordinate_names, degenerate, flat_angle
 from ..parts.spatial.joints import Prismatic, Revolute, Spherical
-from .description import Joint, quaternion, turned
+from .description import Joint, turn_about
 
 # Axes that miss each other by less [m] meet.
 _CLOSE = 1e-12
@@ -87,7 +88,7 @@ def _composite(joints, a, b, name):
         axes.append(axis)
         points.append(point)
         if joint.kind == "hinge":
-            own = turned(axis, joint.reference)
+            own = turn_about(axis, joint.reference)
             turn, shift = turn @ own, turn @ (point - own @ point) + shift
         elif joint.kind == "slide":
             shift = turn @ (joint.reference * axis) + shift
@@ -110,7 +111,7 @@ def _composite(joints, a, b, name):
         axes=[a.direction(axis) for axis in axes],
         point_a=a.point(point),
         point_b=b_at_zero.point(point),
-        orientation=quaternion(a.rotation.T @ b_at_zero.rotation),
+        orientation=from_matrix(a.rotation.T @ b_at_zero.rotation),
         **options,
     )
     fields = zip(joints, coordinate_names(sequence), strict=True)

@@ -13,7 +13,7 @@ from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.on_frames import framed
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
-from .description import matrix, turned
+from .description import rotation_of, turn_about
 from .notes import Notes
 
 
@@ -38,11 +38,11 @@ class Part:
     def point(self, k: int) -> np.ndarray:
         """The part's point on its k-th body, in the world [m]."""
         pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
-        return pose[:3] + matrix(pose[3:7]) @ point
+        return pose[:3] + rotation_of(pose[3:7]) @ point
 
     def direction(self, field: str, k: int = 0) -> np.ndarray:
         """A direction of the part that is fixed in its k-th body, in the world."""
-        return matrix(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
+        return rotation_of(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
 
     def coordinates(self) -> dict[str, np.ndarray]:
         found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
@@ -213,14 +213,14 @@ def _gimbal(part):
     own = part.part
     values = part.coordinates()
     first, second = np.asarray(own.axis_1), np.asarray(own.axis_2)
-    to_world, angle = matrix(part.poses[0][3:7]), float(values["angle_1"])
-    turned = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
-    back = matrix(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
+    to_world, angle = rotation_of(part.poses[0][3:7]), float(values["angle_1"])
+    axis_2 = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
+    back = rotation_of(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
     return _hinges(
         part,
         angle_1=("hinge", to_world @ first),
-        angle_2=("hinge", to_world @ turned),
-        angle_3=("hinge", matrix(part.poses[1][3:7]) @ back),
+        angle_2=("hinge", to_world @ axis_2),
+        angle_3=("hinge", rotation_of(part.poses[1][3:7]) @ back),
     )
 
 
@@ -229,7 +229,7 @@ def _composite(part):
     own, values, out = part.part, part.coordinates(), []
     start = np.asarray(own.point_a)
     points = itertools.repeat(start) if own.points is None else iter(np.asarray(own.points))
-    place, turn = part.poses[0][:3], matrix(part.poses[0][3:7])
+    place, turn = part.poses[0][:3], rotation_of(part.poses[0][3:7])
     for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
         value, point = values[field], next(points) if word == "hinge" else start
         joint = TreeJoint(f"{part.name} {field}", word, place + turn @ point, turn @ axis)
@@ -241,7 +241,7 @@ def _composite(part):
         if word == "slide":
             place = place + turn @ (joint.value * axis)
         else:
-            own_turn = turned(axis, angle)
+            own_turn = turn_about(axis, angle)
             place, turn = place + turn @ (point - own_turn @ point), turn @ own_turn
         out.append((f"{part.name}.{field}", joint))
     return out
@@ -286,7 +286,7 @@ def _ends(part):
 def _connect(part, tree, name, point):
     bodies, k = _ends(part)
     place = tree.place(part.bodies[k])
-    anchor = matrix(place[3:]).T @ (point - place[:3])
+    anchor = rotation_of(place[3:]).T @ (point - place[:3])
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
 
 

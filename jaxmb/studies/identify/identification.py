@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..._types import State
 from ...system import AbstractSystem
+from ...system.quantities import component_names
 from . import verdict
 from .covariance import combinations, covariance
 from .density import LogDensity, logdensity
@@ -208,7 +209,7 @@ def identification(
     """
     free = problem.free
     values = {name: np.asarray(value) for name, value in free(z).items()}
-    components = tuple(component for name, value in values.items() for component in _components(name, value.shape))
+    components = tuple(component for name, value in values.items() for component in component_names(name, value.shape))
     ahead = np.asarray(jax.jacfwd(free.flat)(z))
     ahead = ahead if along is None else ahead @ along
     squares, slope = None if known_noise else float(np.sum(data**2)), 1.0
@@ -317,10 +318,6 @@ def _message(warnings: Sequence[str], far: Sequence[Outlier], robust: bool) -> s
         return "converged"
     cure = "" if robust else "; if these are errors of measurement, loss='soft_l1' or 'huber' lets them weigh less"
     return f"converged, with residuals beyond 5 σ (`outliers`), {len(far)} in number{cure}"
-
-
-def _components(name: str, shape: tuple[int, ...]) -> list[str]:
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
 
 
 def _flat(values: Mapping[str, Any]) -> np.ndarray:

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...parts.names import unknown
+from ...system.quantities import component_names
 from ..ranges import FreeParameters
-from .space import Space, component_names
+from .space import Space
 
 # Reverse mode costs about as much as this many tangents in forward mode, for every row.
 _TANGENTS_A_ROW = 8

@@ -13,6 +13,7 @@ from ..._types import VectorLike
 from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
+from ...system.quantities import component_names
 from .constrained import multipliers, slsqp, trust_constr
 from .evaluation import (
     Limits,
@@ -24,9 +25,9 @@ from .evaluation import (
     rows_of_batch,
     takes_adjoint,
 )
-from .space import Space, component_names, space
+from .space import Space, space
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate, first_feasible
-from .unconstrained import bfgs, descend
+from .unconstrained import bfgs, first_order
 
 # Local optimisations from the best of several starts.
 _LOCAL = 4
@@ -301,7 +302,7 @@ def _run(program: Program, limited: Limits, box: Any, z: np.ndarray, method: Any
     free = Program(program.function, here.unbounded(), program.names, program.forward, program.takes_adjoint)
     begin = evaluate(free, np.zeros(here.size))
     trials = Trials(free, limited, (np.full(here.size, -np.inf), np.full(here.size, np.inf)), begin)
-    ended = bfgs(trials, begin, tol, limit) if method == "bfgs" else descend(method, trials, begin, tol, limit)
+    ended = bfgs(trials, begin, tol, limit) if method == "bfgs" else first_order(method, trials, begin, tol, limit)
     return _in_space(trials, here, program), dataclasses.replace(begin, z=z), *ended
 
 

@@ -15,6 +15,7 @@ from ...linalg.arrays import is_traced
 from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
+from ...system.quantities import component_names
 from ..ranges import FreeParameters, HalfLine, Interval, Line
 
 
@@ -98,11 +99,6 @@ class Space(eqx.Module):
                 raise ValueError(f"Several starts are spread between bounds: give {name!r} both of them.")
         points = qmc.Sobol(self.size, rng=np.random.default_rng(seed)).random_base2(max(count - 1, 1).bit_length())
         return jnp.asarray(low + (high - low) * points[:count])
-
-
-def component_names(name: str, shape: tuple[int, ...]) -> list[str]:
-    """The names of all components of an array."""
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
 
 
 def space(
