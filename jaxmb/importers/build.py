@@ -59,7 +59,7 @@ class Built:
     collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
 
-def build(machine: Machine, notes: Notes) -> Built:
+def build_scene(machine: Machine, notes: Notes) -> Built:
     """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
     without_ends(machine, notes)
     return _Builder(machine, notes).build()
@@ -165,7 +165,7 @@ class _Builder:
         place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": from_matrix(link.rotation)}
         self.joints.append(Fixed(self._named(f"{link.name} motion"), GROUND, link.name, **place))
 
-    def _passive(self, joint: Joint, a: str, b: chains.Body):
+    def _passive(self, joint: Joint, a: str, b: chains.PlacedLink):
         """What acts on a joint of itself."""
         coordinate = self.coordinates[joint.name]
         values = {

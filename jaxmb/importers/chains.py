@@ -1,4 +1,4 @@
-"""Which joint of the library the elementary joints make that lead from one link with mass to the next."""
+"""Joints of the library that chains of elementary joints make, from one link with mass to the next."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _FLAT = 1e-6
 
 
 @dataclasses.dataclass
-class Body:
+class PlacedLink:
     """A body of the scene, or the ground: its name, and position and rotation of its frame."""
 
     name: str
@@ -44,7 +44,7 @@ class Found:
     half_turn: str = ""
 
 
-def joint_of(joints: Sequence[Joint], a: Body, b: Body, name: str) -> Found:
+def joint_of(joints: Sequence[Joint], a: PlacedLink, b: PlacedLink, name: str) -> Found:
     """The part that joints in succession from body A to body B make.
 
     **Arguments:** `name` of the part.
@@ -96,7 +96,7 @@ def _composite(joints, a, b, name):
     why = degenerate(sequence, np.array(axes), [f"{joint.kind} {joint.name!r}" for joint in joints])
     if why:
         raise ValueError(why)
-    b_at_zero = Body(b.name, turn.T @ (b.position - shift), turn.T @ b.rotation)
+    b_at_zero = PlacedLink(b.name, turn.T @ (b.position - shift), turn.T @ b.rotation)
     options, half_turn = _second_of_three(joints, axes)
     turning = [k for k, kind in enumerate(sequence) if kind != "slide"] or [0]
     point = _meeting([points[k] for k in turning], [axes[k] for k in turning])

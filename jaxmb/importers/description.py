@@ -111,7 +111,7 @@ class TendonPath:
 
 
 @dataclasses.dataclass
-class Actuator:
+class ActuatorElement:
     """An actuator of a joint, or of a tendon; its numbers as in `jaxmb.JointActuator`."""
 
     name: str
@@ -150,7 +150,7 @@ class Machine:
     loops: list[Loop] = dataclasses.field(default_factory=list)
     couplings: list[Coupling] = dataclasses.field(default_factory=list)
     tendons: list[TendonPath] = dataclasses.field(default_factory=list)
-    actuators: list[Actuator] = dataclasses.field(default_factory=list)
+    actuators: list[ActuatorElement] = dataclasses.field(default_factory=list)
     marks: list[Mark] = dataclasses.field(default_factory=list)
     shapes: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
     collisions: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)

@@ -13,7 +13,7 @@ from ..linalg.rotations import conjugate, multiply
 from ..parts.base import GROUND
 from .description import rotation_of
 from .export_forces import write_forces
-from .export_tree import Node, Tree, numbers, spanning_tree
+from .export_tree import Tree, TreeBody, numbers, spanning_tree
 from .notes import Notes, checked_ignore
 
 
@@ -65,7 +65,7 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     )
 
 
-def _body(parent, node: Node, tree: Tree, mass, inertia):
+def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
     above: Any = tree.place(node.parent)
     own: Any = tree.place(node.body)
     back = rotation_of(above[3:]).T

@@ -23,7 +23,7 @@ def numbers(values: Any) -> str:
 
 
 @dataclasses.dataclass
-class Part:
+class PlacedPart:
     """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, and the coordinates
     of joints that it acts on.
     """
@@ -61,7 +61,7 @@ class TreeJoint:
 
 
 @dataclasses.dataclass
-class Node:
+class TreeBody:
     """A body of the tree, with its joints from the parent on."""
 
     body: str
@@ -70,7 +70,7 @@ class Node:
 
 
 @dataclasses.dataclass
-class Loop:
+class LoopEqualities:
     """Equality constraints: tags, each with its attributes."""
 
     name: str
@@ -88,8 +88,8 @@ class Tree:
     """
 
     poses: dict[str, np.ndarray]
-    nodes: list[Node] = dataclasses.field(default_factory=list)
-    loops: list[Loop] = dataclasses.field(default_factory=list)
+    nodes: list[TreeBody] = dataclasses.field(default_factory=list)
+    loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
     coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
     elements: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -98,7 +98,7 @@ class Tree:
         return self.poses[body]
 
 
-def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[Part]:
+def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[PlacedPart]:
     """The parts of some groups."""
     # Scalar coordinates are no bodies.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
@@ -111,7 +111,7 @@ def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray])
             if isinstance(held, dict):
                 places = np.asarray(framed(SPACE, tuple(held.get(str(j)) for j in range(len(bodies))), places))
                 own = own.part
-            out.append(Part(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
+            out.append(PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
     return out
 
 
@@ -143,11 +143,11 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
         if part is None:
             body, joints = left[0], _free(left[0], places[left[0]], rotates[left[0]])
-            tree.nodes.append(Node(body, GROUND, joints))
+            tree.nodes.append(TreeBody(body, GROUND, joints))
         else:
             waiting.remove(part)
             parent, body = sorted(part.bodies, key=lambda own: own not in reached)
-            tree.nodes.append(Node(body, parent, _oriented(part, tree, body)))
+            tree.nodes.append(TreeBody(body, parent, _oriented(part, tree, body)))
         reached.add(body)
         left.remove(body)
     for velocity in (*system.velocity_constraints, *system.servos, *system.nonideal):
@@ -159,7 +159,7 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
         if equalities is None:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed where it closes a loop.")
         else:
-            tree.loops.append(Loop(part.name, equalities))
+            tree.loops.append(LoopEqualities(part.name, equalities))
     return tree
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._types import State
 from ..parts.shapes import Box, Cylinder, Ellipsoid, Ground, Mesh, Sphere, capsule
-from .build import build
+from .build import build_scene
 from .description import GROUND, Coupling, Joint, Link, Loop, Machine, Mark, TendonPath, rotation_of
 from .geometry import color_of
 from .mjcf_actuators import read_actuators
@@ -59,7 +59,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
         machine.actuators = read_actuators(mujoco, model, names, notes, off)
     _read_marks(model, names, machine)
     _read_shapes(mujoco, model, names, machine, notes)
-    built = build(machine, notes)
+    built = build_scene(machine, notes)
     said = notes.finish(file)
     locate = _Locate(mujoco, model, names, built)
     states = {

@@ -14,7 +14,7 @@ from ..linalg.newton import newton
 from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, internal_states, prescribe, split_names
+from .held_coordinates import holding, prescribe, split_internal_states, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200
@@ -35,7 +35,7 @@ def assembly_gap(
     """How far a mechanism is from closing, zero where `assemble` finds a configuration.
 
     A coupler that is too short leaves a gap between its joint and the rocker. `assemble(..., throw=False)` then returns
-    a state that is not a number, which an optimiser learns nothing from. The gap tells it which way to go: as a
+    a state of NaN, which an optimiser learns nothing from. The gap tells it which way to go: as a
     constraint of `optimise`, `{"gap": (None, 0)}`, and as what to make small first where a start cannot be assembled.
 
     The gap is the norm of the residuals of all position constraints at the configuration, found from the guess by
@@ -54,7 +54,7 @@ def assembly_gap(
     check_system("assembly_gap", system)
     guess = checked_guess("assembly_gap", system, guess)
     t = checked_time("assembly_gap", t, guess.q.dtype)
-    _, fix = internal_states(system, guess.z, fix)
+    _, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     system = holding(system, of_joints, {}, t)
     q, fixed = prescribe("coordinate", system.coordinate_names(), fix, guess.q)

@@ -1,4 +1,4 @@
-"""What a picture shows of a motion."""
+"""Contents of a picture of a motion."""
 
 from typing import NamedTuple
 

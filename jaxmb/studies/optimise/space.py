@@ -16,7 +16,7 @@ from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
 from ...system.quantities import component_names
-from ..ranges import FreeParameters, HalfLine, Interval, Line
+from ..ranges import FreeParameters, HalfLine, Interval, WholeLine
 
 
 class Space(eqx.Module):
@@ -80,7 +80,7 @@ class Space(eqx.Module):
             elif below or above:
                 ranges.append(HalfLine(start, low if below else high))
             else:
-                ranges.append(Line(start, scale))
+                ranges.append(WholeLine(start, scale))
         return FreeParameters(self.names, tuple(ranges))
 
     def sample(self, count: int, seed: int) -> Float[Array, "count n"]:
