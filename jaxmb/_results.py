@@ -1,4 +1,4 @@
-"""How a simulation ended."""
+"""Outcomes of a simulation."""
 
 import diffrax
 

@@ -145,7 +145,7 @@ class Trajectory(eqx.Module):
 
         At a jump that was announced to `simulate` velocities are those after it, as in states that are saved; those
         before it are at the time `numpy.nextafter(t, -numpy.inf)`. Where Newton's method finds no state on the
-        constraints, as between steps that are too long, and outside of the run, the state is not a number.
+        constraints, as between steps that are too long, and outside of the run, the state is NaN.
         """
         if self.interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")

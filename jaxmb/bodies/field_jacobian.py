@@ -15,8 +15,8 @@ from jaxtyping import Array, Complex, Float
 
 from .._types import Scalar, State
 from ..linalg.arrays import unchecked_take
+from ..linalg.block_elimination import BlockFactor, eliminate_blocks
 from ..linalg.block_jacobian import BlockJacobian
-from ..linalg.block_lu import BlockLU, eliminate_unsymmetric
 from ..linalg.blocks import transpose_vector_products, vector_products
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import MassProjector
@@ -135,7 +135,7 @@ class MotionJacobian(AbstractFieldJacobian):
             blocks += [of_joints, of_joints.swapaxes(1, 2), identities]
         blocks = jnp.concatenate([*blocks, jnp.zeros((1, widest, widest), dtype)])
         lower, upper = unchecked_take(blocks, order.lower), unchecked_take(blocks, order.upper)
-        return MotionResolvent(self, r, eliminate_unsymmetric(lower, upper, order.nodes))
+        return MotionResolvent(self, r, eliminate_blocks(lower, order.nodes, upper))
 
     @property
     def widest(self) -> int:
@@ -158,7 +158,7 @@ class MotionResolvent(AbstractResolvent):
 
     jacobian: MotionJacobian
     r: Complex[Array, ""]
-    factor: BlockLU
+    factor: BlockFactor
 
     def solve(self, x):
         own = self.jacobian

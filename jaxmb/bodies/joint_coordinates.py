@@ -107,8 +107,8 @@ def held_groups(
         own = known[name]
         group = groups[own.group].group
         part = JointDriver(
-            name,
-            name,
+            name=name,
+            coordinate=name,
             joints={"0": group.single(own.member, t)},
             places=(tuple(range(len(group.bodies[own.member]))),),
             within=own.field,

@@ -21,7 +21,7 @@ from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from ..system.catalogue import AbstractSystem
-from ..system.design_variables import DesignVariables, in_range
+from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Ranks
 from ..system.quantities import Quantity
 from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
@@ -353,7 +353,7 @@ class RigidBodySystem(AbstractSystem):
     def parameters_in_range(self):
         gravity = () if self.gravity is None else (self._gravity,)
         parts = (*gravity, *map(stacked_part, itertools.chain(*self._groups.values())))
-        return are_in_range(parts) & in_range(self.design)
+        return are_in_range(parts) & variables_in_range(self.design)
 
     @property
     def _gravity(self):

@@ -59,7 +59,8 @@ def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechan
         raise ValueError(
             f"{arguments.mechanism}: {error}; --set NAME=VALUE gives an argument, and the others need defaults."
         ) from None
-    given, *rest = made if isinstance(made := function(**dict(arguments.set)), tuple) else (made,)
+    made = function(**dict(arguments.set))
+    given, *rest = made if isinstance(made, tuple) else (made,)
     system = given.compile() if hasattr(given, "compile") else given
     if hasattr(system, "references"):
         return system

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from ..bodies.scene import Scene
+from ..linalg.rotations import from_matrix
 from ..parts.actuators import Actuator
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, JointInertia, Tendon
@@ -18,7 +19,7 @@ from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Spherical
 from . import chains
-from .description import Joint, Machine, quaternion
+from .description import Joint, Machine
 from .fuse import Fused, fuse
 from .light import rigid, with_rotors, without_ends
 from .notes import Notes
@@ -57,7 +58,7 @@ class Built:
     collision_shapes: dict[str, tuple[AbstractShape, ...]]
 
 
-def build(machine: Machine, notes: Notes) -> Built:
+def build_scene(machine: Machine, notes: Notes) -> Built:
     """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
     without_ends(machine, notes)
     with_rotors(machine, notes)
@@ -121,7 +122,7 @@ class _Builder:
         return out
 
     def _body(self, carrier):
-        place = {"position": carrier.position, "orientation": quaternion(carrier.rotation)}
+        place = {"position": carrier.position, "orientation": from_matrix(carrier.rotation)}
         inertia = rigid(carrier, self.notes)
         try:
             body = Body(carrier.name, mass=carrier.mass, inertia=inertia, centre=carrier.centre, **place)
@@ -161,10 +162,10 @@ class _Builder:
 
     def _moved(self, link):
         """A body whose motion is prescribed: that of its joint."""
-        place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": quaternion(link.rotation)}
+        place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": from_matrix(link.rotation)}
         self.joints.append(Fixed(self._named(f"{link.name} motion"), GROUND, link.name, **place))
 
-    def _passive(self, joint: Joint, a: str, b: chains.Body):
+    def _passive(self, joint: Joint, a: str, b: chains.PlacedLink):
         """What acts on a joint of itself."""
         coordinate = self.coordinates[joint.name]
         values = {
@@ -274,7 +275,7 @@ class _Builder:
                 self.joints.append(Spherical(name, a, b, point_a=point_a, point_b=point_b))
             else:
                 turn_a, turn_b = self.fused.rotation(loop.link_a), self.fused.rotation(loop.link_b)
-                attitude = quaternion(turn_a @ loop.rotation @ turn_b.T)
+                attitude = from_matrix(turn_a @ loop.rotation @ turn_b.T)
                 self.joints.append(Fixed(name, a, b, point_a=point_a, point_b=point_b, orientation=attitude))
 
     def _couplings(self):
@@ -402,12 +403,12 @@ class _Builder:
 
     def _marks(self):
         for name, (carrier, position, rotation) in self.fused.frames.items():
-            own = {"position": position, "orientation": quaternion(rotation)}
+            own = {"position": position, "orientation": from_matrix(rotation)}
             self.frames.append(Frame(self._named(name, "link"), carrier, **own))
         for mark in self.machine.marks:
             carrier, position = self.fused.point(mark.link, mark.position)
             rotation = self.fused.rotation(mark.link) @ mark.rotation
-            own = {"position": position, "orientation": quaternion(rotation)}
+            own = {"position": position, "orientation": from_matrix(rotation)}
             self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **own))
 
     def _buoyancy(self, name, share):
@@ -425,7 +426,7 @@ class _Builder:
         out: dict[str, tuple[AbstractShape, ...]] = {}
         for link, shape in shapes:
             body, position = self.fused.point(link, np.zeros(3))
-            placed = shape.moved(position, quaternion(self.fused.rotation(link)))
+            placed = shape.moved(position, from_matrix(self.fused.rotation(link)))
             out[body] = (*out.get(body, ()), placed)
         return out
 

@@ -1,4 +1,4 @@
-"""Which joint of the library the elementary joints make that lead from one link with mass to the next."""
+"""Joints of the library that chains of elementary joints make, from one link with mass to the next."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ..linalg.rotations import from_matrix
 from ..parts.spatial.composite import Composite, coordinate_names, degenerate, flat_angle
 from ..parts.spatial.joints import Prismatic, Revolute, Spherical
-from .description import Joint, quaternion, turned
+from .description import Joint, turn_about
 
 # Axes that miss each other by less [m] meet.
 _CLOSE = 1e-12
@@ -17,7 +18,7 @@ _FLAT = 1e-6
 
 
 @dataclasses.dataclass
-class Body:
+class PlacedLink:
     """A body of the scene, or the ground: its name, and position and rotation of its frame."""
 
     name: str
@@ -43,7 +44,7 @@ class Found:
     half_turn: str = ""
 
 
-def joint_of(joints: Sequence[Joint], a: Body, b: Body, name: str) -> Found:
+def joint_of(joints: Sequence[Joint], a: PlacedLink, b: PlacedLink, name: str) -> Found:
     """The part that joints in succession from body A to body B make.
 
     **Arguments:** `name` of the part.
@@ -87,7 +88,7 @@ def _composite(joints, a, b, name):
         axes.append(axis)
         points.append(point)
         if joint.kind == "hinge":
-            own = turned(axis, joint.reference)
+            own = turn_about(axis, joint.reference)
             turn, shift = turn @ own, turn @ (point - own @ point) + shift
         elif joint.kind == "slide":
             shift = turn @ (joint.reference * axis) + shift
@@ -95,7 +96,7 @@ def _composite(joints, a, b, name):
     why = degenerate(sequence, np.array(axes), [f"{joint.kind} {joint.name!r}" for joint in joints])
     if why:
         raise ValueError(why)
-    b_at_zero = Body(b.name, turn.T @ (b.position - shift), turn.T @ b.rotation)
+    b_at_zero = PlacedLink(b.name, turn.T @ (b.position - shift), turn.T @ b.rotation)
     options, half_turn = _second_of_three(joints, axes)
     turning = [k for k, kind in enumerate(sequence) if kind != "slide"] or [0]
     point = _meeting([points[k] for k in turning], [axes[k] for k in turning])
@@ -110,7 +111,7 @@ def _composite(joints, a, b, name):
         axes=[a.direction(axis) for axis in axes],
         point_a=a.point(point),
         point_b=b_at_zero.point(point),
-        orientation=quaternion(a.rotation.T @ b_at_zero.rotation),
+        orientation=from_matrix(a.rotation.T @ b_at_zero.rotation),
         **options,
     )
     fields = zip(joints, coordinate_names(sequence), strict=True)

@@ -1,4 +1,4 @@
-"""What a file says of a machine, in one form for all formats: links, joints, loops, and what acts on them.
+"""Description of a machine in a file, in one form for all formats: links, joints, loops, and what acts on them.
 
 Places and axes are those of the reference pose, in the world; `[...]` gives shapes and units. Orientations are rotation
 matrices from the link to the world.
@@ -111,7 +111,7 @@ class TendonPath:
 
 
 @dataclasses.dataclass
-class Actuator:
+class ActuatorElement:
     """An actuator of a joint, or of a tendon; its numbers as in `jaxmb.Actuator`."""
 
     name: str
@@ -150,7 +150,7 @@ class Machine:
     loops: list[Loop] = dataclasses.field(default_factory=list)
     couplings: list[Coupling] = dataclasses.field(default_factory=list)
     tendons: list[TendonPath] = dataclasses.field(default_factory=list)
-    actuators: list[Actuator] = dataclasses.field(default_factory=list)
+    actuators: list[ActuatorElement] = dataclasses.field(default_factory=list)
     marks: list[Mark] = dataclasses.field(default_factory=list)
     shapes: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
     collisions: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
@@ -160,24 +160,8 @@ class Machine:
 # Rotations
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit Euler parameters, scalar first, of a rotation matrix."""
-    r = np.asarray(rotation, float)
-    # The largest of the four squares is well conditioned.
-    squares = np.array([1 + np.trace(r), *(1 + 2 * np.diag(r) - np.trace(r))])
-    k = int(np.argmax(squares))
-    if k == 0:
-        out = np.array([squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    else:
-        i, j, l = k - 1, k % 3, (k + 1) % 3
-        out = np.zeros(4)
-        out[0], out[k] = r[l, j] - r[j, l], squares[k]
-        out[j + 1], out[l + 1] = r[j, i] + r[i, j], r[l, i] + r[i, l]
-    return out / np.linalg.norm(out)
-
-
-def matrix(quaternion: Any) -> np.ndarray:
-    """The rotation matrix of Euler parameters, scalar first."""
+def rotation_of(quaternion: Any) -> np.ndarray:
+    """The rotation matrix of Euler parameters of any length, scalar first, orthogonal to the last digit."""
     w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -188,13 +172,13 @@ def matrix(quaternion: Any) -> np.ndarray:
     )
 
 
-def turned(axis: np.ndarray, angle: float) -> np.ndarray:
+def turn_about(axis: np.ndarray, angle: float) -> np.ndarray:
     """The rotation matrix of a turn [rad] about a unit axis."""
-    return matrix([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    return rotation_of([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
 
 
 def roll_pitch_yaw(angles: Any) -> np.ndarray:
     """The rotation matrix of angles [rad] about the fixed axes x, y and z in turn."""
     roll, pitch, yaw = angles
     x, y, z = np.eye(3)
-    return turned(z, yaw) @ turned(y, pitch) @ turned(x, roll)
+    return turn_about(z, yaw) @ turn_about(y, pitch) @ turn_about(x, roll)

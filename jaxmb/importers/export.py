@@ -2,16 +2,18 @@
 
 import dataclasses
 from collections.abc import Collection
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from .._types import State
 from ..bodies import RigidBodySystem
+from ..linalg.rotations import conjugate, multiply
 from ..parts.base import GROUND
-from .description import matrix
+from .description import rotation_of
 from .export_forces import write_forces
-from .export_tree import Node, Tree, numbers, spanning_tree
+from .export_tree import Tree, TreeBody, numbers, spanning_tree
 from .notes import Notes, checked_ignore
 
 
@@ -63,17 +65,17 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     )
 
 
-def _body(parent, node: Node, tree: Tree, mass, inertia):
-    above, own = tree.place(node.parent), tree.place(node.body)
-    back = matrix(above[3:]).T
+def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
+    above: Any = tree.place(node.parent)
+    own: Any = tree.place(node.body)
+    back = rotation_of(above[3:]).T
     element = ElementTree.SubElement(parent, "body", name=node.body, pos=numbers(back @ (own[:3] - above[:3])))
-    conjugate = above[3:] * np.array([1, -1, -1, -1])
-    element.set("quat", numbers(_product(conjugate, own[3:])))
+    element.set("quat", numbers(multiply(conjugate(above[3:]), own[3:])))
     full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
     ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))
     for joint in node.joints:
         written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.type)
-        turn = matrix(own[3:]).T
+        turn = rotation_of(own[3:]).T
         if joint.type != "free":
             written.set("pos", numbers(turn @ (joint.point - own[:3])))
         if joint.type in ("hinge", "slide"):
@@ -81,9 +83,3 @@ def _body(parent, node: Node, tree: Tree, mass, inertia):
             written.set("ref", numbers(joint.value))
         tree.elements[joint.name] = written
     return element
-
-
-def _product(a, b):
-    """The product of two Euler parameters."""
-    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([a[0] * b[0] - a[1:] @ b[1:], *vector])

@@ -6,9 +6,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..bodies import RigidBodySystem
+from ..linalg.rotations import from_matrix
 from ..parts.base import AbstractInertialConstraint
 from ..parts.spatial.kinematics import SPACE
-from .description import matrix, quaternion
+from .description import rotation_of
 from .export_tree import Tree, numbers, parts_of
 from .notes import Notes
 
@@ -43,16 +44,16 @@ class _Writer:
     def site(self, name: str, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
         """A site at a place and attitude in the world."""
         place = self.tree.place(body)
-        back = matrix(place[3:]).T
+        back = rotation_of(place[3:]).T
         own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
         if rotation is not None:
-            own.set("quat", numbers(quaternion(back @ rotation)))
+            own.set("quat", numbers(from_matrix(back @ rotation)))
 
     def frame(self, name, group, k, system):
         number = group.group.bodies[k][0]
         body = system.body_names[number] if number < len(system.body_names) else "ground"
         pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.place(body)))
-        self.site(name, body, pose[:3], matrix(pose[3:7]))
+        self.site(name, body, pose[:3], rotation_of(pose[3:7]))
 
     def tendon(self, part):
         own = part.part

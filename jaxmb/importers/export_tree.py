@@ -12,7 +12,7 @@ from ..bodies import RigidBodySystem
 from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
-from .description import matrix, turned
+from .description import rotation_of, turn_about
 from .notes import Notes
 
 
@@ -22,7 +22,7 @@ def numbers(values: Any) -> str:
 
 
 @dataclasses.dataclass
-class Part:
+class PlacedPart:
     """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, and the coordinates
     of joints that it acts on.
     """
@@ -37,11 +37,11 @@ class Part:
     def point(self, k: int) -> np.ndarray:
         """The part's point on its k-th body, in the world [m]."""
         pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
-        return pose[:3] + matrix(pose[3:7]) @ point
+        return pose[:3] + rotation_of(pose[3:7]) @ point
 
     def direction(self, field: str, k: int = 0) -> np.ndarray:
         """A direction of the part that is fixed in its k-th body, in the world."""
-        return matrix(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
+        return rotation_of(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
 
     def coordinates(self) -> dict[str, np.ndarray]:
         found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
@@ -60,7 +60,7 @@ class TreeJoint:
 
 
 @dataclasses.dataclass
-class Node:
+class TreeBody:
     """A body of the tree, with its joints from the parent on."""
 
     body: str
@@ -69,7 +69,7 @@ class Node:
 
 
 @dataclasses.dataclass
-class Loop:
+class LoopEqualities:
     """Equality constraints: tags, each with its attributes."""
 
     name: str
@@ -87,8 +87,8 @@ class Tree:
     """
 
     poses: dict[str, np.ndarray]
-    nodes: list[Node] = dataclasses.field(default_factory=list)
-    loops: list[Loop] = dataclasses.field(default_factory=list)
+    nodes: list[TreeBody] = dataclasses.field(default_factory=list)
+    loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
     coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
     elements: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -97,7 +97,7 @@ class Tree:
         return self.poses[body]
 
 
-def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[Part]:
+def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[PlacedPart]:
     """The parts of some groups."""
     # Scalar coordinates are no bodies.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
@@ -107,7 +107,7 @@ def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray])
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
             places = np.stack([poses[body] for body in bodies])
             places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(Part(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
+            out.append(PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
     return out
 
 
@@ -137,11 +137,11 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
         if part is None:
             body, joints = left[0], _free(left[0], places[left[0]], rotates[left[0]])
-            tree.nodes.append(Node(body, GROUND, joints))
+            tree.nodes.append(TreeBody(body, GROUND, joints))
         else:
             waiting.remove(part)
             parent, body = sorted(part.bodies, key=lambda own: own not in reached)
-            tree.nodes.append(Node(body, parent, _oriented(part, tree, body)))
+            tree.nodes.append(TreeBody(body, parent, _oriented(part, tree, body)))
         reached.add(body)
         left.remove(body)
     for velocity in (*system.velocity_constraints, *system.servos, *system.nonideal):
@@ -153,7 +153,7 @@ def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> T
         if equalities is None:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed where it closes a loop.")
         else:
-            tree.loops.append(Loop(part.name, equalities))
+            tree.loops.append(LoopEqualities(part.name, equalities))
     return tree
 
 
@@ -207,14 +207,14 @@ def _gimbal(part):
     own = part.part
     values = part.coordinates()
     first, second = np.asarray(own.axis_1), np.asarray(own.axis_2)
-    to_world, angle = matrix(part.poses[0][3:7]), float(values["angle_1"])
-    turned = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
-    back = matrix(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
+    to_world, angle = rotation_of(part.poses[0][3:7]), float(values["angle_1"])
+    axis_2 = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
+    back = rotation_of(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
     return _hinges(
         part,
         angle_1=("hinge", to_world @ first),
-        angle_2=("hinge", to_world @ turned),
-        angle_3=("hinge", matrix(part.poses[1][3:7]) @ back),
+        angle_2=("hinge", to_world @ axis_2),
+        angle_3=("hinge", rotation_of(part.poses[1][3:7]) @ back),
     )
 
 
@@ -223,7 +223,7 @@ def _composite(part):
     own, values, out = part.part, part.coordinates(), []
     start = np.asarray(own.point_a)
     points = itertools.repeat(start) if own.points is None else iter(np.asarray(own.points))
-    place, turn = part.poses[0][:3], matrix(part.poses[0][3:7])
+    place, turn = part.poses[0][:3], rotation_of(part.poses[0][3:7])
     for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
         value, point = values[field], next(points) if word == "hinge" else start
         joint = TreeJoint(f"{part.name} {field}", word, place + turn @ point, turn @ axis)
@@ -235,7 +235,7 @@ def _composite(part):
         if word == "slide":
             place = place + turn @ (joint.value * axis)
         else:
-            own_turn = turned(axis, angle)
+            own_turn = turn_about(axis, angle)
             place, turn = place + turn @ (point - own_turn @ point), turn @ own_turn
         out.append((f"{part.name}.{field}", joint))
     return out
@@ -280,7 +280,7 @@ def _ends(part):
 def _connect(part, tree, name, point):
     bodies, k = _ends(part)
     place = tree.place(part.bodies[k])
-    anchor = matrix(place[3:]).T @ (point - place[:3])
+    anchor = rotation_of(place[3:]).T @ (point - place[:3])
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
 
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from .chains import Body
+from .chains import PlacedLink
 from .description import GROUND, Joint, Link, Machine
 from .light import bodies_of
 from .notes import Notes
@@ -34,13 +34,13 @@ class Fused:
     frames: dict[str, tuple[str, np.ndarray, np.ndarray]]
     chains: list[Chain]
 
-    def placed(self, link: str) -> Body:
+    def placed(self, link: str) -> PlacedLink:
         """The body of a link, at the reference pose."""
         carrier = self.of[link]
         if carrier == GROUND:
-            return Body(GROUND, np.zeros(3), np.eye(3))
+            return PlacedLink(GROUND, np.zeros(3), np.eye(3))
         own = self.carriers[carrier]
-        return Body(own.name, own.position, own.rotation)
+        return PlacedLink(own.name, own.position, own.rotation)
 
     def point(self, link: str, at: np.ndarray) -> tuple[str, np.ndarray]:
         """The body of a link, and a point of the link in that body's frame."""

@@ -8,18 +8,8 @@ import numpy as np
 
 from .._types import State
 from ..parts.shapes import Box, Cylinder, Ellipsoid, Ground, Mesh, Sphere, capsule
-from .build import build
-from .description import (
-    GROUND,
-    Coupling,
-    Joint,
-    Link,
-    Loop,
-    Machine,
-    Mark,
-    TendonPath,
-    matrix,
-)
+from .build import build_scene
+from .description import GROUND, Coupling, Joint, Link, Loop, Machine, Mark, TendonPath, rotation_of
 from .geometry import color_of
 from .mjcf_actuators import read_actuators
 from .mjcf_file import compiled, load_mujoco
@@ -69,7 +59,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
         machine.actuators = read_actuators(mujoco, model, names, notes, off)
     _read_marks(model, names, machine)
     _read_shapes(mujoco, model, names, machine, notes)
-    built = build(machine, notes)
+    built = build_scene(machine, notes)
     said = notes.finish(file)
     locate = _Locate(mujoco, model, names, built)
     states = {
@@ -104,7 +94,7 @@ class _Names:
 
 def _read_links(model, data, names, machine):
     for k in range(1, model.nbody):
-        turn = matrix(model.body_iquat[k])
+        turn = rotation_of(model.body_iquat[k])
         name = names("body", k)
         machine.links[name] = Link(
             name,
@@ -214,12 +204,12 @@ def _loop(mujoco, model, names, name, k, data):
     weld = model.eq_type[k] == mujoco.mjtEq.mjEQ_WELD
     if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
         a, b = (names("body", model.site_bodyid[site]) for site in (one, two))
-        turns = [matrix(model.site_quat[site]) for site in (one, two)]
+        turns = [rotation_of(model.site_quat[site]) for site in (one, two)]
         points = [np.array(model.site_pos[site]) for site in (one, two)]
         return Loop(name, a, b, points[0], points[1], turns[0] @ turns[1].T if weld else None)
     a, b = names("body", one), names("body", two)
     if weld:
-        return Loop(name, a, b, data[3:6], data[0:3], matrix(data[6:10]))
+        return Loop(name, a, b, data[3:6], data[0:3], rotation_of(data[6:10]))
     return Loop(name, a, b, data[0:3], data[3:6])
 
 
@@ -251,7 +241,7 @@ def _read_tendons(mujoco, model, names, machine, off):
 def _read_marks(model, names, machine):
     for k in range(model.nsite):
         link = names("body", model.site_bodyid[k])
-        machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), matrix(model.site_quat[k])))
+        machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), rotation_of(model.site_quat[k])))
 
 
 def _read_shapes(mujoco, model, names, machine, notes):

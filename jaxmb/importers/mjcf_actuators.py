@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from .description import Actuator
+from .description import ActuatorElement
 from .notes import Notes
 
 
-def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes, off: Collection[str]) -> list[Actuator]:
+def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes, off: Collection[str]) -> list[ActuatorElement]:
     """The actuators of a model; the others are refused. `off`: names of MuJoCo's flags that are disabled."""
     out = []
     for k in range(len(model.actuator_trntype)):
@@ -81,7 +81,7 @@ def _read(mujoco, model, names, notes, k, name):
         for joint in np.flatnonzero(model.jnt_actfrclimited):
             if k in _acting_on(mujoco, model, joint):
                 return refuse(f"acts on joint {names.joint(joint)!r}, which limits the force of its actuators")
-    return Actuator(
+    return ActuatorElement(
         name,
         of,
         on_tendon=kind == transmissions.mjTRN_TENDON,

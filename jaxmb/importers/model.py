@@ -1,4 +1,4 @@
-"""What an import returns."""
+"""Results of an import."""
 
 import dataclasses
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""What an import says aloud: what it approximates and leaves out, and what it refuses."""
+"""Notes of an import: approximations, elements that are left out, and those that are refused."""
 
 import dataclasses
 from collections.abc import Collection

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .description import GROUND, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
+from ..linalg.rotations import from_matrix
+from .description import GROUND, Joint, Kind, Link, Machine, roll_pitch_yaw
 from .geometry import read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
@@ -181,7 +182,7 @@ def _read_link(element, scope, machine, place, notes, files):
 
     def seen(element):
         position, rotation = _pose(element, notes)
-        return {"position": position, "orientation": quaternion(rotation), "color": _GREY}
+        return {"position": position, "orientation": from_matrix(rotation), "color": _GREY}
 
     read_shapes(element, name, machine, notes, files, seen)
 

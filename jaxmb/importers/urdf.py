@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..linalg.rotations import from_matrix
 from ..parts.names import unknown
-from .description import GROUND, Coupling, Joint, Kind, Link, Machine, quaternion, roll_pitch_yaw
+from .description import GROUND, Coupling, Joint, Kind, Link, Machine, roll_pitch_yaw
 from .geometry import color_of, read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
@@ -106,7 +107,7 @@ def _seen(element):
     material = element.first("material")
     given = None if material is None else material.first("color")
     rgba = (0.5, 0.5, 0.5, 1.0) if given is None else given.numbers(given.attributes.get("rgba", "0.5 0.5 0.5 1"), 4)
-    return {"position": position, "orientation": quaternion(rotation), "color": color_of(rgba)}
+    return {"position": position, "orientation": from_matrix(rotation), "color": color_of(rgba)}
 
 
 def _read_joint(element, machine, notes):

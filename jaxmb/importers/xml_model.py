@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 
-from .build import build
+from .build import build_scene
 from .description import Machine
 from .model import ImportedModel
 from .notes import Notes
@@ -24,7 +24,7 @@ def model_of(root: Element, machine: Machine, notes: Notes, file: str, effectles
     listed = sorted({element.tag for element in unread} & set(effectless))
     if listed:
         notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
-    built = build(machine, notes)
+    built = build_scene(machine, notes)
     coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
     said = notes.finish(file)
     return ImportedModel(

@@ -25,7 +25,6 @@ from .nonideal import (
 )
 from .quasi import (
     QuasiVelocities as QuasiVelocities,
-    johnsen_hamel_residual as johnsen_hamel_residual,
     kinetostatic_forces as kinetostatic_forces,
 )
 from .system import LagrangianSystem as LagrangianSystem

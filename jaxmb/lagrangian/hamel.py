@@ -112,8 +112,8 @@ def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) ->
     """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
 
     **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
-    `jaxmb.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the coordinates
-    that the pivots leave.
+    `jaxmb.linalg.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the
+    coordinates that the pivots leave.
     """
     basis = lambda t, q, p: eliminate(jnp.asarray(matrix(t, q, p)), order, rank).null_space
     return QuasiVelocityFrame(basis, columns=order.n - rank)

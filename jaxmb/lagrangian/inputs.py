@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from ..parts.series import AbstractSignal
 from .dataflow import depends
-from .model import AbstractLagrangian, Input
+from .model import AbstractLagrangian, DrivenParameter
 
 
-def inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]) -> dict[str, Input]:
+def inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]) -> dict[str, DrivenParameter]:
     """Signals as inputs of a system, by name.
 
     **Raises:** `ValueError` for a value that jumps and that position constraints or rates of the coordinates depend on.
@@ -28,5 +28,5 @@ def inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal])
                 f"A position constraint or the rates of coordinates depend on {name!r}, so it must not jump: use "
                 "interpolation='linear' or 'cubic' instead of 'held'."
             )
-        out[name] = Input(signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u)))
+        out[name] = DrivenParameter(signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u)))
     return out

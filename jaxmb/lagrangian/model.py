@@ -39,7 +39,7 @@ class AbstractEquations(eqx.Module):
         """`F(t, q, u)`."""
 
 
-class Input(eqx.Module):
+class DrivenParameter(eqx.Module):
     """A parameter that is a function of time, and whether constraints or the meaning of velocities depend on it."""
 
     signal: AbstractSignal
@@ -67,7 +67,7 @@ class AbstractLagrangian(AbstractSystem):
     length: Float[Array, ""]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
-    inputs: dict[str, Input]
+    inputs: dict[str, DrivenParameter]
     design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]

@@ -76,7 +76,7 @@ class QuasiVelocities(AbstractKinematics):
     def rates_of_all(
         self, t: Scalar, q: Float[Array, "nq"], omega: Float[Array, "nq"], parameters: Parameters
     ) -> Float[Array, "nq"]:
-        """`q̇(t, q, ω)`; not a number where Newton's method does not converge."""
+        """`q̇(t, q, ω)`; NaN where Newton's method does not converge."""
         if callable(self.near):
             near = self.near(t, q, omega, parameters)
         else:
@@ -122,7 +122,10 @@ def kinetostatic_forces(
 
     `Λ_D = (∂q̇/∂ω_D)ᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q)`, the left sides of the equations of those velocities.
     """
-    kinematics, t = _quasi(system), jnp.asarray(t, q.dtype)
+    kinematics, t = system.kinematics, jnp.asarray(t, q.dtype)
+    # A concrete class: only it has dependent velocities that forces hold at zero.
+    if not isinstance(kinematics, QuasiVelocities):
+        raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(kinematics).__name__}.")
     omega = kinematics.all_of(q.size, u)
     columns = jax.jacfwd(lambda omega: kinematics.rates_of_all(t, q, omega, system.parameters_at(t)))(omega)
     v, one = system.rates(t, q, u), jnp.ones_like(t)
@@ -130,36 +133,3 @@ def kinetostatic_forces(
     _, rate = jax.jvp(momentum, (t, q, u), (one, v, udot))
     missing = rate - jax.grad(system.lagrangian, 1)(t, q, v, system.parameters_at(t)) - system.applied_force(t, q, v)
     return missing @ columns[:, list(kinematics.dependent)]
-
-
-def johnsen_hamel_residual(
-    system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
-) -> Float[Array, "nq"]:
-    r"""Residuals of the Johnsen-Hamel equations at accelerations u̇, for all ω_k in order: zero for the independent ones
-    of a motion, and Λ_k for the dependent ones. A diagnostic, in the equations' own terms:
-
-    $$\frac{d}{dt} \frac{\partial L^*}{\partial \omega_k} - \frac{\partial L^*}{\partial \theta_k}
-      - p_l \left(\frac{d}{dt} \frac{\partial \dot q_l}{\partial \omega_k}
-      - \frac{\partial \dot q_l}{\partial \theta_k} \right) - \Theta_k$$
-
-    with $L^*(t, q, \omega) = L(t, q, \dot q)$ and
-    $\partial / \partial \theta_k = (\partial \dot q_l / \partial \omega_k) \, \partial / \partial q_l$.
-    """
-    kinematics, at, t = _quasi(system), system.parameters_at, jnp.asarray(t, q.dtype)
-    omega, along = kinematics.all_of(q.size, u), kinematics.all_of(q.size, udot)
-    rates = lambda t, q, omega: kinematics.rates_of_all(t, q, omega, at(t))
-    star = lambda t, q, omega: system.lagrangian(t, q, rates(t, q, omega), at(t))
-    v = rates(t, q, omega)
-    moving = (t, q, omega), (jnp.ones_like(t), v, along)
-    columns, turned = jax.jvp(jax.jacfwd(rates, 2), *moving)
-    _, first = jax.jvp(jax.grad(star, 2), *moving)
-    second = jax.grad(star, 1)(t, q, omega) @ columns
-    bracket = turned - jax.jacfwd(rates, 1)(t, q, omega) @ columns
-    return first - second - system.momentum(t, q, v) @ bracket - system.applied_force(t, q, v) @ columns
-
-
-def _quasi(system: LagrangianSystem) -> QuasiVelocities:
-    # A concrete class: only it has dependent velocities that forces hold at zero.
-    if not isinstance(system.kinematics, QuasiVelocities):
-        raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(system.kinematics).__name__}.")
-    return system.kinematics

@@ -1,8 +1,10 @@
-"""Elimination of symmetric block-sparse matrices in a given order of their nodes.
+"""Elimination of block-sparse matrices in a given order of their nodes.
 
-`S = L D Lᵀ` with blocks of one size and no search for pivots, which positive definite matrices do not need, nor
-symmetric quasi-definite ones (positive definite in some nodes, negative definite in the others). One loop executes the
-steps of a stage of the order; each eliminates some nodes at once.
+Blocks are of one size, and the pattern is symmetric: there is a block for (i, j) if there is one for (j, i).
+`S = L D Lᵀ` of a symmetric matrix and `S = L D U` of another one, real or complex, without a search for pivots:
+positive definite matrices need none, nor do symmetric quasi-definite ones (positive definite in some nodes, negative
+definite in the others); of others the order must be one in which every pivot is regular. One loop executes the steps of
+a stage of the order; each eliminates some nodes at once.
 
 Sources: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIAM Review 34(1), 1992; R. J. Vanderbei,
 "Symmetric quasidefinite matrices", SIAM J. Optim. 5(1), 1995.
@@ -12,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from .arrays import add_up, unchecked_take
 from .elimination import gauss_jordan
@@ -22,30 +24,39 @@ from .elimination_order import NodeOrder
 class BlockFactor(eqx.Module):
     """A factored matrix; numbers without derivatives.
 
-    **Fields:** for each stage, step and lane the `inverses` (steps, b, b, w) of the pivots, and the `multiples`
-    (steps, b, b, d, w) of the pivots' rows that are subtracted from later ones; `rest`: the inverse of the dense matrix
-    of the nodes that are left; the `order`.
+    **Fields:** for each stage, step and lane the `inverses` (steps, b, b, w) of the pivots, and the columns of the
+    pivots (steps, b, b, d, w) in L, `below`, and in Uᵀ, `right`, which is None where the matrix is symmetric; `rest`:
+    the inverse of the dense matrix of the nodes that are left; the `order`.
     """
 
-    inverses: tuple[Float[Array, "s b b w"], ...]
-    multiples: tuple[Float[Array, "s b b d w"], ...]
-    rest: Float[Array, "k k"]
+    inverses: tuple[Inexact[Array, "s b b w"], ...]
+    below: tuple[Inexact[Array, "s b b d w"], ...]
+    right: tuple[Inexact[Array, "s b b d w"], ...] | None
+    rest: Inexact[Array, "k k"]
     order: NodeOrder = eqx.field(static=True)
 
-    def solve(self, x: Float[Array, "n b"]) -> Float[Array, "n b"]:
+    def solve(self, x: Inexact[Array, "n b"]) -> Inexact[Array, "n b"]:
         """`S⁻¹ x`."""
         order = self.order
+        right, backward = (self.below, _backward) if self.right is None else (self.right, _wide_backward)
         x = jnp.pad(x, ((0, 1), (0, 0)))
-        for stage, multiples in zip(order.stages, self.multiples, strict=True):
-            x = lax.scan(_forward, x, (stage.nodes, stage.later, multiples))[0]
+        for stage, below in zip(order.stages, self.below, strict=True):
+            x = lax.scan(_forward, x, (stage.nodes, stage.later, below))[0]
         if order.rest.size:
             rest = self.rest @ unchecked_take(x, order.rest).reshape(-1)
             x = x.at[order.rest].set(rest.reshape(-1, x.shape[1]), mode="promise_in_bounds", unique_indices=True)
-        for stage, inverses, multiples in reversed(list(zip(order.stages, self.inverses, self.multiples, strict=True))):
-            own = jnp.moveaxis(unchecked_take(x, stage.nodes), 2, 1)
-            own = add_up([inverses[:, :, j] * own[:, j, None] for j in range(own.shape[1])])
-            x = lax.scan(_backward, x, (stage.nodes, stage.later, own, multiples), reverse=True)[0]
+        for stage, inverses, above in reversed(list(zip(order.stages, self.inverses, right, strict=True))):
+            pivot = jnp.moveaxis(unchecked_take(x, stage.nodes), 2, 1)
+            pivot = add_up([inverses[:, :, j] * pivot[:, j, None] for j in range(pivot.shape[1])])
+            x = lax.scan(backward, x, (stage.nodes, stage.later, pivot, above), reverse=True)[0]
         return x[:-1]
+
+    def transpose(self) -> "BlockFactor":
+        """The factor of Sᵀ."""
+        if self.right is None:
+            return self
+        inverses = tuple(inverse.swapaxes(1, 2) for inverse in self.inverses)
+        return BlockFactor(inverses, self.right, self.below, self.rest.T, self.order)
 
     def pivots(self) -> Float[Array, "n b"]:
         """For each row the reciprocal of the diagonal entry of its pivot's inverse."""
@@ -57,63 +68,100 @@ class BlockFactor(eqx.Module):
         return out.at[order.rest].set(1 / jnp.diag(self.rest).reshape(-1, size))[:-1]
 
 
-def eliminate_blocks(blocks: Float[Array, "blocks b b"], order: NodeOrder) -> BlockFactor:
-    """The factor of a matrix from its stored blocks, those of fill zero; see `NodeOrder`."""
-    size = blocks.shape[1]
-    padding = jnp.stack([jnp.zeros((size, size), blocks.dtype), jnp.eye(size, dtype=blocks.dtype)])
-    blocks = jnp.concatenate([lax.stop_gradient(blocks), padding])
-    inverses, multiples = [], []
+def eliminate_blocks(
+    lower: Inexact[Array, "blocks b b"], order: NodeOrder, upper: Inexact[Array, "blocks b b"] | None = None
+) -> BlockFactor:
+    """The factor of a matrix from its stored blocks, those of fill zero; see `NodeOrder`.
+
+    **Arguments:** `lower`: the blocks whose row is the later node, and those on the diagonal; `upper`: the others of a
+    matrix that is not symmetric, each at the place of the block that mirrors it; on the diagonal anything.
+    """
+    sides = [lower] if upper is None else [lower, upper.swapaxes(1, 2)]
+    size, dtype = lower.shape[1], lower.dtype
+    padding = jnp.stack([jnp.zeros((size, size), dtype), jnp.eye(size, dtype=dtype)])
+    blocks = _joined([jnp.concatenate([lax.stop_gradient(side), padding]) for side in sides], axis=1)
+    factors = []
     for stage in order.stages:
-        blocks, (inverse, multiple) = lax.scan(_eliminate, blocks, (stage.diagonal, stage.columns, stage.targets))
-        inverses.append(inverse)
-        multiples.append(multiple)
-    return BlockFactor(tuple(inverses), tuple(multiples), _dense_inverse(blocks, order), order)
+        blocks, factor = lax.scan(_eliminate, blocks, (stage.diagonal, stage.columns, stage.targets))
+        factors.append(factor)
+    below = tuple(columns[0] for _, columns in factors)
+    right = None if upper is None else tuple(columns[1] for _, columns in factors)
+    return BlockFactor(tuple(inverse for inverse, _ in factors), below, right, _dense_inverse(blocks, order), order)
 
 
 # In a step the lanes are the last axis, so that each operation is one on long vectors. The barriers keep XLA from
-# computing an operand of a product anew for each of its entries.
+# computing an operand of a product anew for each of its entries. Blocks are (n, b, b), those below the diagonal, or, of
+# a matrix that is not symmetric, (n, 2, b, b), with the transposes of those to the right of it.
+
+
+def _joined(sides, axis=0):
+    return sides[0] if len(sides) == 1 else jnp.stack(sides, axis)
 
 
 def _eliminate(blocks, step):
     diagonal, columns, targets = step
-    inverse = lax.optimization_barrier(_inverse(jnp.moveaxis(unchecked_take(blocks, diagonal), 0, 2)))
-    column = jnp.transpose(unchecked_take(blocks, columns), (2, 3, 1, 0))
+    symmetric = blocks.ndim == 3
+    pivot, column = unchecked_take(blocks, diagonal), unchecked_take(blocks, columns)
+    pivot = jnp.moveaxis(pivot if symmetric else pivot[:, 0], 0, 2)
+    inverse = lax.optimization_barrier((_inverse if symmetric else _wide_inverse)(pivot))
+    # Each (b, b, d, w): L times the pivots, and the transposed rows of the pivots.
+    column = jnp.transpose(column, (*range(2, column.ndim), 1, 0))
+    sides, inverses = ([column], [inverse]) if symmetric else (list(column), [inverse, inverse.swapaxes(0, 1)])
     size = inverse.shape[0]
-    multiple = add_up([column[:, j, None] * inverse[None, j, :, None] for j in range(size)])
+    multiples = [
+        add_up([side[:, j, None] * row[None, j, :, None] for j in range(size)])
+        for side, row in zip(sides, inverses, strict=True)
+    ]
+    multiples, sides = lax.optimization_barrier((multiples, sides))
     first, second = np.tril_indices(columns.shape[1])
-    multiple, column = lax.optimization_barrier((multiple, column))
-    left, right = lax.optimization_barrier((multiple[:, :, first], column[:, :, second]))
-    change = lax.optimization_barrier(add_up([left[:, j, None] * right[None, :, j] for j in range(size)]))
-    blocks = blocks.at[targets].add(-jnp.transpose(change, (3, 2, 0, 1)), mode="promise_in_bounds")
-    return blocks, (inverse, multiple)
+    # The change of the block (a, b) is L_a times b's part of U, that of (b, a), transposed, is its mirror image.
+    left = _joined([multiple[:, :, first] for multiple in multiples])
+    right = _joined([side[:, :, second] for side in reversed(sides)])
+    left, right = lax.optimization_barrier((left, right))
+    products = [left[..., j, None, :, :] * right[..., None, :, j, :, :] for j in range(size)]
+    change = lax.optimization_barrier(add_up(products))
+    change = jnp.transpose(change, (change.ndim - 1, change.ndim - 2, *range(change.ndim - 2)))
+    return blocks.at[targets].add(-change, mode="promise_in_bounds"), (inverse, multiples)
 
 
 def _forward(x, step):
-    nodes, later, multiples = step
-    own = unchecked_take(x, nodes).T
-    change = add_up([multiples[:, j] * own[None, j, None] for j in range(own.shape[0])])
+    nodes, later, below = step
+    pivot = unchecked_take(x, nodes).T
+    change = add_up([below[:, j] * pivot[None, j, None] for j in range(pivot.shape[0])])
     return x.at[later].add(-change.T, mode="promise_in_bounds"), None
 
 
 def _backward(x, step):
-    nodes, later, own, multiples = step
-    ahead = unchecked_take(x, later).T
-    size, d = ahead.shape[:2]
-    ahead = add_up([own, *(-multiples[i, :, k] * ahead[None, i, k] for i in range(size) for k in range(d))])
-    return x.at[nodes].set(ahead.T, mode="promise_in_bounds"), None
+    nodes, later, pivot, right = step
+    solved = unchecked_take(x, later).T
+    size, d = solved.shape[:2]
+    pivot = add_up([pivot, *(-right[i, :, k] * solved[None, i, k] for i in range(size) for k in range(d))])
+    return x.at[nodes].set(pivot.T, mode="promise_in_bounds"), None
+
+
+def _wide_backward(x, step):
+    """As `_backward`, of blocks so wide that their products are not written out."""
+    nodes, later, pivot, right = step
+    solved = unchecked_take(x, later).T
+    change = add_up([right[i] * solved[i, None] for i in range(solved.shape[0])])
+    return x.at[nodes].set((pivot - jnp.sum(change, axis=1)).T, mode="promise_in_bounds"), None
 
 
 def _dense_inverse(blocks, order):
-    k, size = order.rest.size, blocks.shape[1]
-    lower = unchecked_take(blocks, order.rest_blocks)
+    k, size = order.rest.size, blocks.shape[-1]
+    stored = unchecked_take(blocks, order.rest_blocks)
+    lower, upper = (stored, stored) if blocks.ndim == 3 else (stored[:, :, 0], stored[:, :, 1])
     # Blocks above the diagonal are stored as their transposes.
     above = np.triu(np.ones((k, k), bool), 1)[:, :, None, None]
-    full = jnp.where(above, lower.swapaxes(2, 3), lower)
-    return gauss_jordan(full.swapaxes(1, 2).reshape(k * size, k * size), k * size)
+    full = jnp.where(above, upper.swapaxes(2, 3), lower)
+    matrix = full.swapaxes(1, 2).reshape(k * size, k * size)
+    if blocks.ndim == 3:
+        return gauss_jordan(matrix, k * size)
+    return _wide_inverse(matrix[:, :, None])[:, :, 0] if k else matrix
 
 
 def _inverse(a):
-    """Inverses of small symmetric blocks (b, b, w), by Gauss–Jordan elimination on the diagonal."""
+    """Inverses of small blocks (b, b, w), by Gauss–Jordan elimination on the diagonal."""
     r = a.shape[0]
     rows = [[a[i, j] for j in range(r)] for i in range(r)]
     for k in range(r):
@@ -124,3 +172,20 @@ def _inverse(a):
         ]
         rows = [row if i == k else swept(i) for i in range(r)]
     return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _wide_inverse(a):
+    """As `_inverse`, in a loop over the pivots."""
+    size = a.shape[0]
+    number = np.arange(size)
+
+    def sweep(k, a):
+        row, column = (lax.dynamic_slice_in_dim(a, k, 1, axis) for axis in (0, 1))
+        pivot = 1 / lax.dynamic_slice_in_dim(row, k, 1, 1)
+        in_row, in_column = (number == k)[:, None, None], (number == k)[None, :, None]
+        zero = jnp.zeros((), a.dtype)
+        row = jnp.where(in_column, pivot, row * pivot)
+        swept = jnp.where(in_column, zero, a) - column * row
+        return jnp.where(in_row, row, swept)
+
+    return lax.fori_loop(0, size, sweep, a)

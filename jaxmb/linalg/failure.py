@@ -12,11 +12,11 @@ Tree = TypeVar("Tree")
 
 
 def not_a_number_where(failed: Bool[Array, ""], values: Tree, inputs: PyTree = None) -> Tree:
-    """The values, not a number where a computation failed, and with them their derivatives, also those with respect to
-    `inputs` that the computation had not come to use.
+    """The values, and NaN where a computation failed, as are their derivatives with respect to all `inputs`, also those
+    that the computation did not reach.
     """
     factor, total = jnp.where(failed, jnp.nan, 1.0), _sum(inputs)
-    # Zero, with a derivative of one with respect to every input; not a number if an input is infinite.
+    # Zero, with a derivative of one with respect to every input; NaN if an input is infinite.
     zero = total - lax.stop_gradient(total)
     lost = jnp.where(failed | (zero == 0), zero * jnp.where(failed, jnp.nan, 0.0), 0.0)
     spoil = lambda y: y * factor.astype(y.dtype) + lost.astype(y.dtype) if eqx.is_inexact_array(y) else y

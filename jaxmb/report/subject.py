@@ -1,4 +1,4 @@
-"""What a report is about: a mechanism of the library, or a system and a state of a user's."""
+"""Subjects of reports: a mechanism of the library, or a system and a state of a user's."""
 
 import dataclasses
 from typing import Any

@@ -20,7 +20,7 @@ from ..system import AbstractSystem
 from ..system.quantities import directions, rates_of
 from .arguments import check_system, checked_guess, checked_time
 from .closest import closest_configuration, closest_velocities
-from .held_coordinates import holding, internal_states, prescribe, split_names, split_rates
+from .held_coordinates import holding, prescribe, split_internal_states, split_names, split_rates
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
@@ -64,7 +64,7 @@ def assemble(
     check_system("assemble", system)
     guess = checked_guess("assemble", system, guess)
     t = checked_time("assemble", t, guess.q.dtype)
-    z, fix = internal_states(system, guess.z, fix)
+    z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     rates, rates_of_joints = split_rates(system, rates)
     u, fixed_rates = prescribe("rate", rates_of(system.rate_names()), rates, guess.u)

@@ -28,7 +28,7 @@ from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time
 from .assembly import configuration
 from .closest import tolerance
-from .held_coordinates import holding, internal_states, split_names
+from .held_coordinates import holding, split_internal_states, split_names
 
 _ITERATIONS = 200
 
@@ -92,7 +92,7 @@ def equilibrium(
         )
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)
-    z, fix = internal_states(system, guess.z, fix)
+    z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     system = holding(system if z is None else system.with_states(z), of_joints, {}, time)
     start, fixed, assembled = configuration(system, guess.q, fix, time, throw)

@@ -14,7 +14,7 @@ from ..linalg.newton import newton
 from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, internal_states, prescribe, split_names
+from .held_coordinates import holding, prescribe, split_internal_states, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200
@@ -54,7 +54,7 @@ def assembly_gap(
     check_system("assembly_gap", system)
     guess = checked_guess("assembly_gap", system, guess)
     t = checked_time("assembly_gap", t, guess.q.dtype)
-    _, fix = internal_states(system, guess.z, fix)
+    _, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     system = holding(system, of_joints, {}, t)
     q, fixed = prescribe("coordinate", system.coordinate_names(), fix, guess.q)

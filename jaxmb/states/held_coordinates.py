@@ -80,7 +80,7 @@ def split_rates(
     return split_names("rate", system, rates_of(system.rate_names()), values)
 
 
-def internal_states(
+def split_internal_states(
     system: AbstractSystem, z: Float[Array, "nz"] | None, values: Mapping[str, VectorLike] | None
 ) -> tuple[Float[Array, "nz"] | None, Mapping[str, VectorLike] | None]:
     """Internal states with some of them prescribed by name, and the prescribed values of all else.

@@ -136,13 +136,13 @@ def descend(
     memory = optimiser.init(z)
     best, best_value, good = z, np.inf, z
     for iteration in range(limit):
-        value, finite, step, ahead = _step(objective, optimiser, z, memory)
+        value, finite, step, later = _step(objective, optimiser, z, memory)
         if not bool(finite):
             z = 0.5 * (good + z)
             continue
         if float(value) < best_value:
             best, best_value = z, float(value)
-        good, memory, z = z, ahead, z + step
+        good, memory, z = z, later, z + step
         if float(jnp.max(jnp.abs(step))) <= tol:
             return Minimum(best, iteration + 1, True, best_value)
     return Minimum(best, limit, False, best_value)
@@ -155,7 +155,19 @@ def _step(objective: Objective, optimiser: optax.GradientTransformation, z: Floa
 
     value, gradient = jax.value_and_grad(loss)(z)
     finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
+    return value, finite, *next_step(optimiser, memory, z, value, gradient, loss)
+
+
+def next_step(
+    optimiser: optax.GradientTransformation,
+    memory: Any,
+    z: Float[Array, "n"],
+    value: Array,
+    gradient: Array,
+    objective: Callable[[Float[Array, "n"]], Array],
+) -> tuple[Float[Array, "n"], Any]:
+    """A step of an optax optimiser from a point, and its memory after it."""
     with jax.numpy_dtype_promotion("standard"):
         update = optax.with_extra_args_support(optimiser).update
-        step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=loss)
-    return value, finite, jnp.asarray(step, z.dtype), memory
+        step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=objective)
+    return jnp.asarray(step, z.dtype), memory

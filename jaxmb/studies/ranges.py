@@ -75,7 +75,7 @@ def _lost(distance: np.ndarray, before: np.ndarray, deviations: np.ndarray) -> n
     return (distance > np.abs(before) / _NEAR) & ~(distance > deviations)
 
 
-class Line(AbstractRange):
+class WholeLine(AbstractRange):
     """Any value: `start + scale z`."""
 
     start: Array
@@ -256,8 +256,8 @@ class FreeParameters(eqx.Module):
         """`log |∂ values / ∂ z|`, of as many components of the values as determine them."""
         parts = jnp.split(z, np.cumsum([r.size for r in self.ranges])[:-1])
         each = zip(self.ranges, parts, strict=True)
-        ahead = [jax.jacfwd(lambda z, r=r: r.free_components(r(z)))(part) for r, part in each]
-        return jnp.sum(jnp.stack([jnp.linalg.slogdet(matrix)[1] for matrix in ahead]))
+        jacobians = [jax.jacfwd(lambda z, r=r: r.free_components(r(z)))(part) for r, part in each]
+        return jnp.sum(jnp.stack([jnp.linalg.slogdet(matrix)[1] for matrix in jacobians]))
 
     def place(self, name: str) -> slice:
         """Where the components of a parameter stand in the vector."""
@@ -291,10 +291,10 @@ def range_of(
     if np.all(np.isfinite(low)) or np.all(np.isfinite(high)):
         return HalfLine(value, low if np.all(np.isfinite(low)) else high)
     if scale is not None:
-        return Line(value, jnp.broadcast_to(scale, value.shape))
+        return WholeLine(value, jnp.broadcast_to(scale, value.shape))
     largest = jnp.max(jnp.abs(value))
     typical = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    return Line(value, jnp.where(value == 0, typical, jnp.abs(value)))
+    return WholeLine(value, jnp.where(value == 0, typical, jnp.abs(value)))
 
 
 def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:

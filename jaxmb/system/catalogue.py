@@ -14,7 +14,7 @@ from .._types import Scalar, State
 from ..linalg.arrays import is_traced
 from ..parts.series import AbstractSignal
 from .description import Description, count_independent, count_rows, shorten, specialised_constraints
-from .design_variables import DesignVariables, description_rows, in_range
+from .design_variables import DesignVariables, description_rows, variables_in_range
 from .equation import AbstractEquation
 from .picture import Picture
 from .quantities import Quantity, Reaction
@@ -119,7 +119,7 @@ class AbstractSystem(AbstractEquation):
         """Whether all parameters that are traced are in their ranges; True if none are traced."""
         values = [self._parameter(name) for name in sorted(self.positive_parameters())]
         traced = [jnp.all(value > 0) for value in values if is_traced(value)]
-        return (jnp.all(jnp.stack(traced)) if traced else True) & in_range(self.design)
+        return (jnp.all(jnp.stack(traced)) if traced else True) & variables_in_range(self.design)
 
     def _parameter(self, name):
         where, index = self.parameter_paths()[name][0]

@@ -110,20 +110,21 @@ class DesignVariables(eqx.Module):
 
     def rows(self) -> list[tuple[str, str, str]]:
         """Name, value and remark of every variable, for the description of a system."""
-        gives = f"gives {', '.join(self.derived)}"
+        derived = ", ".join(self.derived)
         out = []
         for k, (name, variable) in enumerate(self.variables):
             value = self.values[name]
             shown = "traced" if is_traced(value) else _short(np.asarray(value))
             bounded = np.any(np.isfinite([variable.low, variable.high]))
             remark = [f"within {_interval(variable.low, variable.high)}"] * bool(bounded)
-            together = [gives] if len(self.variables) == 1 else [f"these variables together {gives[:4]}{gives[5:]}"]
+            alone = len(self.variables) == 1
+            together = [f"gives {derived}" if alone else f"these variables together give {derived}"]
             last = k == len(self.variables) - 1
             out.append((name, f"{shown} {variable.unit}".rstrip(), "; ".join(remark + together * last)))
         return out
 
 
-def in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array, ""]:
+def variables_in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array, ""]:
     """Whether all traced design variables are within their bounds; True if none are traced."""
     ok: Any = True
     for own in design:

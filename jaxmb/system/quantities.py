@@ -12,6 +12,7 @@ One grammar of rates holds wherever names are given or read. The rate of a coord
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -76,3 +77,8 @@ def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
 def directions(names: Mapping[str, list[int]]) -> dict[int, str]:
     """The direction of every velocity, from the names of a system's rates: `"rod.x"`, `"rod.wx"`, `"theta"`."""
     return {index[0]: name.removesuffix("_rate") for name, index in names.items() if len(index) == 1}
+
+
+def component_names(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Names of the components of an array, `"A.force[0]"`; of a number its own."""
+    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]

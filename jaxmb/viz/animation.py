@@ -14,7 +14,7 @@ from ..trajectory import Trajectory
 from . import scenery
 from .motion_nodes import Motion, chosen, motion
 from .solids import COLORS
-from .stage import Node, page
+from .stage import SceneNode, page
 
 Motions = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
 Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
@@ -109,7 +109,7 @@ def show(
     scale = view.cell / square if square else 0.0
     first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
     speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
-    played: list[tuple[np.ndarray, Sequence[Node]]] = []
+    played: list[tuple[np.ndarray, Sequence[SceneNode]]] = []
     for own, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
         drawn = {"points": points, "arrows": arrows, "scale": scale, "thickness": 0.0035 * view.size}
         nodes = own.nodes(offset, view.grain, **drawn)

@@ -114,7 +114,7 @@ class Motion:
         arrows: Mapping[str, tuple[np.ndarray, np.ndarray]],
         scale: float,
         thickness: float,
-    ) -> list[stage.Node]:
+    ) -> list[stage.SceneNode]:
         """All nodes, moved by an offset [m]; `arrows`: points and forces by name, drawn with `scale` [m/N] and with
         shafts of the radius `thickness` [m].
         """

@@ -1,4 +1,4 @@
-"""Where motions stand in a picture, where it is seen from, and what is around them: ground, grids and labels."""
+"""Places of motions in a picture, its camera, and what is around them: ground, grids and labels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def _camera(planar, up, low, high):
     return stage.Camera(middle + away, middle, up, _ANGLE, shadows=True)
 
 
-def nodes(motions: Sequence[Motion], view: View) -> list[stage.Node]:
+def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:
     """What does not move: the ground, or a grid, and the names of the motions."""
     up, planar = motions[0].picture.up, motions[0].picture.planar
     out, surfaces, level = [], [], []
@@ -135,10 +135,10 @@ def _names(motions, view):
 
 
 def _ball(name, position, radius, color):
-    return stage.Node(lambda scene: scene.add_icosphere(name, radius, color, position=position, cast_shadow=False))
+    return stage.SceneNode(lambda scene: scene.add_icosphere(name, radius, color, position=position, cast_shadow=False))
 
 
-def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], view: View) -> stage.Node:
+def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], view: View) -> stage.SceneNode:
     """A label with the time of the motion, the size of the grid, and notes."""
     digits = max(0, 2 - int(np.floor(np.log10(times[-1] - times[0]))))
     rest = "".join(f"  ·  {note}" for note in (f"grid {view.cell:g} m", *notes))
@@ -187,7 +187,7 @@ def _surface(name, mesh, position, orientation):
             wxyz=orientation,
         )
 
-    return stage.Node(add)
+    return stage.SceneNode(add)
 
 
 def _grid(name, view, position, orientation, *, share=1.7, solid=False):
@@ -217,4 +217,4 @@ def _grid(name, view, position, orientation, *, share=1.7, solid=False):
             wxyz=orientation,
         )
 
-    return stage.Node(add)
+    return stage.SceneNode(add)

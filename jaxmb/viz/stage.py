@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Node:
+class SceneNode:
     """A part of the scene that is added once and then changes.
 
     **Fields:** `add(scene, **first)`: adds it with its properties at the first time and returns viser's handle;
@@ -39,7 +39,7 @@ def viser() -> Any:
     return viser
 
 
-def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[Node]]], camera: "Camera") -> str:
+def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]], camera: "Camera") -> str:
     """A page that plays some nodes, each with the times [s] of its motion, from 0 on."""
     with _server() as server:
         scene = server.scene
@@ -126,7 +126,7 @@ def instances(
     scales: Float[np.ndarray, "times n 3"],
     colors: np.ndarray,
     grain: float,
-) -> Node:
+) -> SceneNode:
     """Copies of one mesh; `grain` [m]: the length below which their motion is not seen."""
 
     def add(scene: "SceneApi", batched_positions, batched_wxyzs, batched_scales):
@@ -148,19 +148,19 @@ def instances(
         "batched_wxyzs": rounded(orientations, 1e-4),
         "batched_scales": rounded(scales, grain),
     }
-    return Node(add, varying)
+    return SceneNode(add, varying)
 
 
-def lines(name: str, segments: Float[np.ndarray, "times n 2 3"], color, thickness: float, grain: float) -> Node:
+def lines(name: str, segments: Float[np.ndarray, "times n 2 3"], color, thickness: float, grain: float) -> SceneNode:
     """Straight segments; `thickness` in pixels."""
 
     def add(scene: "SceneApi", points):
         return scene.add_line_segments(name, points, colors=color, thickness=thickness, thickness_units="screen")
 
-    return Node(add, {"points": rounded(segments, grain)})
+    return SceneNode(add, {"points": rounded(segments, grain)})
 
 
-def arrows(name: str, ends: Float[np.ndarray, "times n 2 3"], color, radius: float, grain: float) -> Node:
+def arrows(name: str, ends: Float[np.ndarray, "times n 2 3"], color, radius: float, grain: float) -> SceneNode:
     """Arrows between two points each."""
 
     def add(scene: "SceneApi", points):
@@ -168,12 +168,12 @@ def arrows(name: str, ends: Float[np.ndarray, "times n 2 3"], color, radius: flo
             name, points, colors=color, shaft_radius=radius, head_radius=2.6 * radius, head_length=6.5 * radius
         )
 
-    return Node(add, {"points": rounded(ends, grain)})
+    return SceneNode(add, {"points": rounded(ends, grain)})
 
 
-def label(name: str, texts: Sequence[str], position: np.ndarray, anchor: Any = "bottom-center") -> Node:
+def label(name: str, texts: Sequence[str], position: np.ndarray, anchor: Any = "bottom-center") -> SceneNode:
     """A line of text that may change."""
-    return Node(lambda scene, text: scene.add_label(name, text, position=position, anchor=anchor), {"text": texts})
+    return SceneNode(lambda scene, text: scene.add_label(name, text, position=position, anchor=anchor), {"text": texts})
 
 
 def rounded(values: np.ndarray, grain: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from model_files import OFF, check_dynamics, random_states
 
 import jaxmb as mb
 from jaxmb import contact, importers, spatial, terrain
-from jaxmb.importers.description import matrix
+from jaxmb.importers.description import rotation_of
 
 pytestmark = pytest.mark.long
 mujoco = pytest.importorskip("mujoco")
@@ -222,9 +222,9 @@ def soles(model, system, state):
     for body in ("left-foot", "right-foot"):
         (roll,) = model.collision_shapes[body]
         for way in (-0.5, 0.5):
-            at = roll.position + way * roll.length * matrix(roll.orientation)[:, 2]
+            at = roll.position + way * roll.length * rotation_of(roll.orientation)[:, 2]
             pose = motions[body]
-            lowest = min(lowest, (pose[:3] + matrix(pose[3:]) @ (at - centres[body]))[2] - roll.radius)
+            lowest = min(lowest, (pose[:3] + rotation_of(pose[3:]) @ (at - centres[body]))[2] - roll.radius)
             balls.append((body, at, roll.radius))
     law = {"normal": contact.Linear(4e4), "damping": 400.0, "friction": contact.Coulomb(0.8, transition_speed=0.05)}
     floor = terrain.Flat(level=lowest - 0.002)

@@ -15,7 +15,7 @@ from oracles.sprung_chain import sprung_chain
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.field_jacobian import motion_jacobian
-from jaxmb.linalg.block_lu import eliminate_unsymmetric
+from jaxmb.linalg.block_elimination import eliminate_blocks
 from jaxmb.linalg.elimination_order import order_nodes
 from jaxmb.manifold import Partition, Projection, Unconstrained, default_manifold
 from jaxmb.solvers import Hermite
@@ -120,7 +120,7 @@ def test_elimination_of_unsymmetric_matrices(n, size):
         elif j in neighbours[i]:
             lower[k] = full[i, :, j] = entries()
             upper[k] = full[j, :, i] = entries()
-    factor = eliminate_unsymmetric(jnp.asarray(lower), jnp.asarray(upper), order)
+    factor = eliminate_blocks(jnp.asarray(lower), order, jnp.asarray(upper))
     x = entries()[:1].repeat(n, axis=0) * np.arange(1, n + 1)[:, None]
     matrix = full.reshape(n * size, n * size)
     found = factor.solve(jnp.asarray(x)), factor.transpose().solve(jnp.asarray(x))

@@ -1,4 +1,4 @@
-"""How well data determine unknowns: covariances, and the combinations that make no difference."""
+"""Covariances of estimates, and the combinations of unknowns that make no difference to the data."""
 
 from typing import NamedTuple
 
@@ -30,14 +30,14 @@ class Covariance(NamedTuple):
 
 def covariance(
     jacobian: Float[np.ndarray, "rows n"],
-    ahead: Float[np.ndarray, "components n"],
+    changes: Float[np.ndarray, "components n"],
     squares: float | None,
     count: int,
     slope: float = 1.0,
 ) -> Covariance:
     """The covariance of a fit.
 
-    **Arguments:** `jacobian` of the residuals along n directions, first of the `count` of data; `ahead`: changes of the
+    **Arguments:** `jacobian` of the residuals along n directions, first of the `count` of data; `changes` of the
     components along them; `squares`: sum of the squared residuals of data, which estimates the noise if it is not
     known. For a robust loss these are the squares of `ψ = r ρ'(r²)`, and `slope` is the mean of `ψ'`: the covariance is
     that of Huber's M-estimate, as from samples with noise of the variance `mean ψ² / (mean ψ')²`.
@@ -54,11 +54,11 @@ def covariance(
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
     sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
     weak = sizes <= _UNDETERMINED * sizes[0]
-    root = ahead @ (directions[~weak] / sizes[~weak][:, None]).T
-    lost = ahead @ directions[weak].T
+    root = changes @ (directions[~weak] / sizes[~weak][:, None]).T
+    lost = changes @ directions[weak].T
     root = root * noise
     matrix = root @ root.T
-    undetermined = np.max(np.abs(lost), axis=1, initial=0.0) > _SHARE * np.max(np.abs(ahead), axis=1)
+    undetermined = np.max(np.abs(lost), axis=1, initial=0.0) > _SHARE * np.max(np.abs(changes), axis=1)
     matrix[undetermined, :] = matrix[:, undetermined] = 0.0
     matrix[undetermined, undetermined] = np.inf
     return Covariance(matrix, root, lost, undetermined, float(noise))

@@ -77,7 +77,7 @@ class Seen(NamedTuple):
     result: RESULTS
 
 
-class Trial(eqx.Module):
+class ExperimentModel(eqx.Module):
     """An experiment as a function of its unknowns, which are called without the experiment's name.
 
     **Fields:** `unknowns`: their names and shapes; `changed`: which of them are parameters of the system; `initial`:
@@ -114,7 +114,7 @@ class Trial(eqx.Module):
         return with_parameters(system, self.known | {name: theta[name] for name in self.changed})
 
     def start(self, system: AbstractSystem, theta: Mapping[str, Array]) -> tuple[AbstractSystem, State]:
-        """The system with these unknowns, and its initial state; not a number if there is none."""
+        """The system with these unknowns, and its initial state; NaN if there is none."""
         system = self.changed_system(system, theta)
         fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
         rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
@@ -195,7 +195,7 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
     names = tuple(_by_name(experiment) or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
-        ts = checked_times(given, experiment.t0)
+        ts = measured_times(given, experiment.t0)
         return ts, dict.fromkeys(names, np.arange(ts.size))
     if not names:
         raise ValueError("Times by name belong to measured quantities; a residual function needs one vector ts.")
@@ -205,7 +205,7 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
     missing = [name for name in names if name not in given]
     if missing:
         raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all that was measured.")
-    each = {name: np.asarray(checked_times(given[name], experiment.t0, name)) for name in names}
+    each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
     return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
 
@@ -216,7 +216,7 @@ def _by_name(experiment: Experiment) -> Mapping[str, VectorLike] | None:
     return measured
 
 
-def checked_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
+def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
     """Measured times, of all or of one name, or a `ValueError` that says what is wrong with them."""
     label = f"ts[{name!r}]" if name else "ts"
     times = np.asarray(ts, dtype=float)

@@ -1,4 +1,4 @@
-"""Where an identification ended, for the studies that go on from it."""
+"""The end of an identification, for the studies that go on from it."""
 
 import dataclasses
 from typing import Any

@@ -1,4 +1,4 @@
-"""What `identify` returns: estimates, how certain they are, and what follows from them."""
+"""Results of `identify`: estimates, how certain they are, and what follows from them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..._types import State
 from ...system import AbstractSystem
+from ...system.quantities import component_names
 from . import verdict
 from .covariance import combinations, covariance
 from .density import LogDensity, logdensity
@@ -208,14 +209,15 @@ def identification(
     """
     free = problem.free
     values = {name: np.asarray(value) for name, value in free(z).items()}
-    components = tuple(component for name, value in values.items() for component in _components(name, value.shape))
-    ahead = np.asarray(jax.jacfwd(free.flat)(z))
-    ahead = ahead if along is None else ahead @ along
+    components = tuple(component for name, value in values.items() for component in component_names(name, value.shape))
+    by_directions = np.asarray(jax.jacfwd(free.flat)(z))
+    if along is not None:
+        by_directions = by_directions @ along
     squares, slope = None if known_noise else float(np.sum(data**2)), 1.0
     if problem.loss.robust:
         pull, slopes = problem.loss.influence(data)
         squares, slope = float(np.sum(pull**2)), float(np.mean(slopes))
-    found = covariance(jacobian, ahead, squares, data.size, slope)
+    found = covariance(jacobian, by_directions, squares, data.size, slope)
     dispersion = found.noise**2 * slope if problem.loss.robust else 1.0
     own = series(problem, values, readings, known_noise)
     far = outliers(own)
@@ -317,10 +319,6 @@ def _message(warnings: Sequence[str], far: Sequence[Outlier], robust: bool) -> s
         return "converged"
     cure = "" if robust else "; if these are errors of measurement, loss='soft_l1' or 'huber' lets them weigh less"
     return f"converged, with residuals beyond 5 σ (`outliers`), {len(far)} in number{cure}"
-
-
-def _components(name: str, shape: tuple[int, ...]) -> list[str]:
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
 
 
 def _flat(values: Mapping[str, Any]) -> np.ndarray:

@@ -279,9 +279,9 @@ def _check_start(problem: Problem, model: Model) -> None:
     if not np.all(np.isfinite(residuals)):
         raise ValueError("The residuals are not finite with the starting values.")
     size = max(trial.size for trial in problem.trials)
-    ahead = np.max(np.abs(jacobian), axis=0) / size
+    effect = np.max(np.abs(jacobian), axis=0) / size
     for name in problem.free.names:
-        if not np.any(ahead[problem.free.place(name)] > _NO_EFFECT):
+        if not np.any(effect[problem.free.place(name)] > _NO_EFFECT):
             raise ValueError(f"{name!r} has no effect on what was measured; leave it out of free, or measure more.")
     data = model.data + sum(int(np.size(mean)) for mean in problem.priors.means)
     if data < problem.free.size:

@@ -1,4 +1,4 @@
-"""How much a residual weighs: as its square, or less where it is large.
+"""Loss functions of residuals: the square, or less where a residual is large.
 
 A fit minimises `½ Σ ρ(r²)` of the residuals r, which are in units of the standard deviation σ of the noise. The names
 and the functions ρ are those of `scipy.optimize.least_squares`.

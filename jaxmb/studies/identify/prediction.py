@@ -1,4 +1,4 @@
-"""What the estimates predict, how certain that is, and how it compares with data that were held out."""
+"""Predictions of the estimates, how certain they are, and how they compare with data that were held out."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import ArrayLike
 
 from ...parts.names import unknown
-from .experiment import checked_times
+from .experiment import measured_times
 from .fit import Fit
 
 
@@ -23,7 +23,7 @@ class Prediction:
 
     **Fields:** `ts` [s]; by name of the quantity `values`, their standard `deviations`, and the ends of the band that
     holds the true value with probability `level`, `low` and `high`; times are axis 0. A deviation is infinite where the
-    quantity depends on what the data do not determine, and not a number where the fit did not converge, or does not
+    quantity depends on what the data do not determine, and NaN where the fit did not converge, or does not
     explain its data.
     """
 
@@ -54,7 +54,7 @@ def predict(
     for name in names:
         if name not in problem.system.quantities():
             raise unknown("quantity", name, problem.system.quantities())
-    ts = trial.ts if ts is None else checked_times(ts, float(trial.t0))
+    ts = trial.ts if ts is None else measured_times(ts, float(trial.t0))
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
     values, jacobians = _predicted(problem.system, trial, problem.options, names, ts, flat)

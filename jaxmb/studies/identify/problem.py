@@ -16,7 +16,7 @@ from ..._types import State
 from ...system import AbstractSystem
 from ..minimise import Linearised
 from ..ranges import FreeParameters
-from .experiment import Seen, Trial
+from .experiment import ExperimentModel, Seen
 from .loss import Loss
 from .unknowns import Priors
 
@@ -34,7 +34,7 @@ class Problem(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     sources: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     fitted: tuple[bool, ...] = eqx.field(static=True)
-    trials: tuple[Trial, ...]
+    trials: tuple[ExperimentModel, ...]
     options: dict[str, Any]
 
     @property
@@ -155,10 +155,10 @@ def numbers(tree: Any) -> Any:
 
 
 def _joined(problem, chart, found) -> Model:
-    _, ahead, prior_rows, prior_jacobian = chart
+    _, derivatives, prior_rows, prior_jacobian = chart
     residuals, jacobians, scores, score_jacobians, objective = [], [], [], [], 0.5 * prior_rows @ prior_rows
     for number, (seen, (of_residuals, of_scores)) in found.items():
-        inward, rows = ahead[problem.columns(number)], seen.rows
+        inward, rows = derivatives[problem.columns(number)], seen.rows
         residuals.append(rows.residuals[rows.present])
         jacobians.append(of_residuals[rows.present] @ inward)
         scores.append(rows.scores)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .experiment import RESIDUAL, Trial
+from .experiment import RESIDUAL, ExperimentModel
 from .problem import Problem
 from .sensors import Channel
 
@@ -48,7 +48,7 @@ class Series(NamedTuple):
 class Outlier(NamedTuple):
     """A residual beyond five standard deviations of the noise.
 
-    **Fields:** `experiment`, `sensor`; `sample`: the index in what was measured; `t` [s], not a number for what a
+    **Fields:** `experiment`, `sensor`; `sample`: the index in what was measured; `t` [s], NaN for what a
     residual function returns; `residual`: predicted minus measured, in standard deviations.
     """
 
@@ -78,7 +78,9 @@ def series(
     return tuple(out)
 
 
-def _of_channel(experiment: str, trial: Trial, channel: Channel, predicted, level, known_noise) -> Iterator[Series]:
+def _of_channel(
+    experiment: str, trial: ExperimentModel, channel: Channel, predicted, level, known_noise
+) -> Iterator[Series]:
     ts, measured, present = (np.asarray(x) for x in (trial.ts, channel.values, channel.present))
     sigma = np.broadcast_to(np.asarray(channel.sigma if level is None else level), measured.shape)
     own = np.full(ts.size, -1)
@@ -107,7 +109,7 @@ def _of_channel(experiment: str, trial: Trial, channel: Channel, predicted, leve
         )
 
 
-def _of_user(experiment: str, trial: Trial, residuals: np.ndarray) -> Iterator[Series]:
+def _of_user(experiment: str, trial: ExperimentModel, residuals: np.ndarray) -> Iterator[Series]:
     """Columns of one row for each time, or else one series."""
     rows = trial.ts.size if residuals.ndim and residuals.shape[0] == trial.ts.size else residuals.size
     label = " ".join(filter(None, (experiment, "what residual returns")))

@@ -14,7 +14,7 @@ from ..._types import State
 from ...states.assembly import assemble
 from ...system import AbstractSystem
 from ..minimise import Linearised
-from .experiment import Trial
+from .experiment import ExperimentModel
 from .problem import Problem, numbers, values_and_derivatives, weighted
 
 
@@ -22,8 +22,8 @@ class Lanes(NamedTuple):
     """The segments of one experiment: trials stacked along axis 0, and how many samples each has."""
 
     number: int
-    trials: Trial
-    static: Trial
+    trials: ExperimentModel
+    static: ExperimentModel
     samples: tuple[int, ...]
 
 
@@ -47,7 +47,7 @@ class Point(NamedTuple):
     alone: tuple[Any, ...]
 
 
-def segmented(name: str, number: int, trial: Trial, segments: int) -> Lanes:
+def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> Lanes:
     """An experiment in segments of nearly as many samples, shorter ones filled up with missing samples."""
     where = f" of experiment {name!r}" if name else ""
     if trial.residual is not None:
@@ -82,9 +82,9 @@ def _column(mask: np.ndarray, like: Array) -> np.ndarray:
 
 
 def _own_values(problem, lane, z):
-    values, ahead, *_ = values_and_derivatives(problem, z)
+    values, derivatives, *_ = values_and_derivatives(problem, z)
     columns = problem.columns(lane.number)
-    return jnp.asarray(values[columns]), ahead[columns]
+    return jnp.asarray(values[columns]), derivatives[columns]
 
 
 def initial_everywhere(problem, lane, z) -> State:
@@ -94,7 +94,7 @@ def initial_everywhere(problem, lane, z) -> State:
 
 
 def evaluated(problem: Problem, lanes: tuple[Lanes, ...], z, states) -> Point:
-    _, ahead, prior_rows, prior_jacobian = values_and_derivatives(problem, z)
+    _, derivatives, prior_rows, prior_jacobian = values_and_derivatives(problem, z)
     sizes = [len(lane.samples) * _freedoms(problem.system) for lane in lanes]
     first = np.cumsum([z.size, *sizes])
     total, freedoms = int(first[-1]), _freedoms(problem.system)
@@ -102,7 +102,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], z, states) -> Point:
     readings, alone, all_charts, objective = {}, [], [], 0.5 * prior_rows @ prior_rows
     for lane, state, begin in zip(lanes, states, first, strict=False):
         trial = problem.trials[lane.number]
-        flat, inward = jnp.asarray(_own_values(problem, lane, z)[0]), ahead[problem.columns(lane.number)]
+        flat, inward = jnp.asarray(_own_values(problem, lane, z)[0]), derivatives[problem.columns(lane.number)]
         charts = _charts(problem.system, trial, lane, flat, state)
         found = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
         seen, (rows, levels, starts, ends) = numbers(found)

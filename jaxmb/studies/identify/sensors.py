@@ -1,4 +1,4 @@
-"""What instruments show of a motion: gain, bias, delay and noise."""
+"""Sensors of a motion: gain, bias, delay and noise."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What is unknown of several experiments, by name: parameters, shared or not, sensors, and initial states."""
+"""Unknowns of several experiments, by name: parameters, shared or not, sensors, and initial states."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,16 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.design import design_bounds
 from ..ranges import Bounds, FreeParameters, range_of
-from .experiment import Experiment, Trial, arrays, channels_of, initial_unknown, known_parameters, times_of, with_times
+from .experiment import (
+    Experiment,
+    ExperimentModel,
+    arrays,
+    channels_of,
+    initial_unknown,
+    known_parameters,
+    times_of,
+    with_times,
+)
 from .loss import Loss
 from .sensors import SENSOR_FIELDS, Channel, Sensor
 
@@ -41,7 +50,7 @@ class Unknowns(NamedTuple):
     """Unknowns, the experiments as functions of theirs, and for each of those the names of its unknowns among all."""
 
     free: FreeParameters
-    trials: tuple[Trial, ...]
+    trials: tuple[ExperimentModel, ...]
     sources: tuple[tuple[str, ...], ...]
     priors: Priors
 
@@ -175,7 +184,7 @@ def _check_sigma(system, experiments, sensors, sigma) -> None:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
 
 
-def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[Trial, tuple[str, ...]]:
+def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[ExperimentModel, tuple[str, ...]]:
     """One experiment, whose unknowns are added to those that are found."""
     ts, places = times_of(experiment)
     label = lambda name: f"{prefix}/{name}" if prefix else name
@@ -228,7 +237,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
         for source, what in unknown_here.values():
             first = found.setdefault(source, what)
             found[source] = first._replace(below=min(first.below, what.below))
-    trial = Trial(
+    trial = ExperimentModel(
         unknowns=tuple((name, np.shape(what.like)) for name, (_, what) in unknown_here.items()),
         changed=tuple(changed),
         initial=initial,

@@ -1,4 +1,4 @@
-"""Whether a fit explains its data: tests of the residuals, of the estimates, and of the ends of several starts.
+"""Tests of a fit: of the residuals, of the estimates, and of the ends of several starts.
 
 Every test of residuals accuses a right fit with normal noise with a probability of less than one in a million, by
 Chernoff's bounds of the distributions' tails, which hold for few samples as well. It accuses only where the misfit is

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 from ..._types import State
 from ...linalg import rotations
 from ...linalg.rotations import cross, from_axis_angle, multiply, rotate, unrotate
-from ...linalg.shortest import pseudoinverse
 from ...system import AbstractSystem
+from .pseudoinverse import pseudoinverse
 
 # Terms of the series of a displacement by about one radian.
 _TERMS = 20

@@ -13,7 +13,6 @@ from jaxtyping import Array, Complex, Float
 from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
-from ...linalg.eigen import eigen
 from ...linalg.failure import not_a_number_where
 from ...parts.names import names_arguments, unknown
 from ...simulate import simulate
@@ -21,6 +20,7 @@ from ...states.arguments import check_no_states, check_system, checked_guess, ch
 from ...states.consistency import consistent
 from ...system import AbstractSystem
 from ...system.quantities import directions
+from .eigen import eigen
 from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names

@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
-from ...linalg.eigen import eigen
 from ...manifold import project_normalized
 from ...system import AbstractSystem
+from .eigen import eigen
 
 # A column of A below this fraction of the largest, in units of the states' sizes, has no effect.
 _NO_EFFECT = 1e-10

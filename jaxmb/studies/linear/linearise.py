@@ -13,7 +13,7 @@ from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem, parameters
-from ...system.quantities import directions
+from ...system.quantities import component_names, directions
 from .linear_equations import LinearEquations, linear_equations
 from .linearisation import Linearisation
 from .perturbations import (
@@ -23,7 +23,7 @@ from .perturbations import (
     displacement_names,
     rate_candidates,
 )
-from .quantities import component_names, components
+from .quantities import components
 
 
 @names_arguments

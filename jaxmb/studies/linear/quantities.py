@@ -10,11 +10,7 @@ from jaxtyping import Array, Float
 from ..._types import Scalar, State
 from ...parts.names import unknown
 from ...system import AbstractSystem, Solved
-
-
-def component_names(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Names of the components of an array, `"A.force[0]"`; of a number its own."""
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
+from ...system.quantities import component_names
 
 
 def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:

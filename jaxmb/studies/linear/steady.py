@@ -17,7 +17,6 @@ from ...linalg.arrays import is_traced
 from ...linalg.failure import not_a_number_where
 from ...linalg.newton import newton, root
 from ...linalg.rotations import unrotate
-from ...linalg.shortest import pseudoinverse
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...system import AbstractSystem
@@ -25,6 +24,7 @@ from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
 from .linear_equations import fastest, vector_field
 from .linearise import remaining
 from .perturbations import coordinate_function, rate_function
+from .pseudoinverse import pseudoinverse
 from .quantities import checked_names
 
 _ITERATIONS = 60

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...parts.names import unknown
+from ...system.quantities import component_names
 from ..ranges import FreeParameters
-from .space import Space, component_names
+from .space import Space
 
 # Reverse mode costs about as much as this many tangents in forward mode, for every row.
 _TANGENTS_A_ROW = 8
@@ -127,7 +128,7 @@ def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
 def chosen_objective(objective: str | None, shapes: Mapping[str, tuple[int, ...]], constraints: Any) -> str:
     """The name of the objective among the outputs.
 
-    **Raises:** `ValueError` for an unknown output, for one that is not a number, and where none is named.
+    **Raises:** `ValueError` for an unknown output, for one that is NaN, and where none is named.
     """
     if objective is None:
         left = [name for name in shapes if name not in (constraints or {})]
@@ -173,7 +174,7 @@ def _side(name: str, side: ArrayLike | None, shape: tuple[int, ...], empty: floa
     return np.broadcast_to(value, shape)
 
 
-def differentiable(program: Program, derivatives: Literal["auto", "forward", "reverse"], rows: int) -> Program:
+def with_derivatives(program: Program, derivatives: Literal["auto", "forward", "reverse"], rows: int) -> Program:
     """The program in the mode that is asked for; with `"auto"`, in the cheaper one that the function allows.
 
     **Raises:** `ValueError` where the function has no derivatives in that mode.

@@ -13,20 +13,21 @@ from ..._types import VectorLike
 from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
+from ...system.quantities import component_names
 from .constrained import multipliers, slsqp, trust_constr
 from .evaluation import (
     Limits,
     Program,
     chosen_objective,
-    differentiable,
     limits,
     output_shapes,
     rows_of_batch,
     takes_adjoint,
+    with_derivatives,
 )
-from .space import Space, component_names, space
+from .space import Space, space
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate, first_feasible
-from .unconstrained import bfgs, descend
+from .unconstrained import bfgs, first_order
 
 # Local optimisations from the best of several starts.
 _LOCAL = 4
@@ -39,7 +40,7 @@ _FIRST, _LAST = 3, 9
 
 
 @dataclasses.dataclass(frozen=True)
-class Constraint:
+class ConstrainedOutput:
     """A component of a constrained output at the optimum: its bounds, the values before and after, whether a bound is
     active, and its multiplier, what one unit more of that bound would gain of the objective.
     """
@@ -92,7 +93,7 @@ class Optimum:
     objective: float
     outputs: dict[str, np.ndarray]
     before: dict[str, np.ndarray]
-    constraints: tuple[Constraint, ...]
+    constraints: tuple[ConstrainedOutput, ...]
     iterations: tuple[Iteration, ...]
     trials: int
     failed: int
@@ -126,7 +127,8 @@ class Optimum:
         rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed")]
         for k, i in enumerate(self.iterations):
             if _FIRST <= k < len(self.iterations) - _LAST:
-                rows += [("…",)] * (k == _FIRST)
+                if k == _FIRST:
+                    rows.append(("…",))
                 continue
             numbers = f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}"
             rows.append((str(i.number), *numbers, str(i.trials), str(i.failed)))
@@ -171,7 +173,7 @@ def optimise(
     - `function(values)`: outputs by name, numbers or arrays, from parameters by name; or a number, which is the
         objective. It is made of JAX functions and compiled once. One that simulates should take `adjoint=None` and hand
         it on to `simulate`: without it there is reverse mode only. `simulate` and `assemble` need `throw=False`, so
-        that a trial that fails is not a number.
+        that a trial that fails is NaN.
     - `start`: starting values by name, or names alone of parameters of `system`.
     - `objective`: the output to make small, a number; may be left out if there is but one without a constraint.
     - `constraints`: outputs by name with their bounds `(low, high)`, either of them None, or with the number that they
@@ -192,7 +194,7 @@ def optimise(
         `"auto"` chooses by their numbers, among the modes that the function allows. Values and derivatives of all that
         is needed come from one program.
 
-    **Trials that fail**, where the mechanism cannot be assembled, the simulation fails or an output is not a number,
+    **Trials that fail**, where the mechanism cannot be assembled, the simulation fails or an output is NaN,
     are rejected: the step is shortened. **A start that fails** needs an output that tells how far it is from one that
     does not, such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`: violations of constraints
     that have a value are made small first, until all outputs have one. A gap is zero up to the edge of what can be
@@ -211,7 +213,7 @@ def optimise(
     limited = limits(constraints, shapes)
     _check(method, limited, starts, local, max_iterations, tol)
     names = (objective, *limited.names)
-    program = differentiable(
+    program = with_derivatives(
         Program(function, where, names, False, trial_program.takes_adjoint), derivatives, 1 + len(limited.components)
     )
     box = where.box
@@ -258,7 +260,7 @@ def optimise(
         outputs=best.outputs,
         before=before.outputs or {name: np.full(shape, np.nan) for name, shape in shapes.items()},
         constraints=tuple(
-            Constraint(name, float(low), float(high), float(a), float(b), bool(on), float(size))
+            ConstrainedOutput(name, float(low), float(high), float(a), float(b), bool(on), float(size))
             for name, low, high, a, b, on, size in zip(*columns, strict=True)
         ),
         iterations=tuple(trials.log),
@@ -301,7 +303,7 @@ def _run(program: Program, limited: Limits, box: Any, z: np.ndarray, method: Any
     free = Program(program.function, here.unbounded(), program.names, program.forward, program.takes_adjoint)
     begin = evaluate(free, np.zeros(here.size))
     trials = Trials(free, limited, (np.full(here.size, -np.inf), np.full(here.size, np.inf)), begin)
-    ended = bfgs(trials, begin, tol, limit) if method == "bfgs" else descend(method, trials, begin, tol, limit)
+    ended = bfgs(trials, begin, tol, limit) if method == "bfgs" else first_order(method, trials, begin, tol, limit)
     return _in_space(trials, here, program), dataclasses.replace(begin, z=z), *ended
 
 

@@ -15,7 +15,8 @@ from ...linalg.arrays import is_traced
 from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
-from ..ranges import FreeParameters, HalfLine, Interval, Line
+from ...system.quantities import component_names
+from ..ranges import FreeParameters, HalfLine, Interval, WholeLine
 
 
 class Space(eqx.Module):
@@ -79,7 +80,7 @@ class Space(eqx.Module):
             elif below or above:
                 ranges.append(HalfLine(start, low if below else high))
             else:
-                ranges.append(Line(start, scale))
+                ranges.append(WholeLine(start, scale))
         return FreeParameters(self.names, tuple(ranges))
 
     def sample(self, count: int, seed: int) -> Float[Array, "count n"]:
@@ -98,11 +99,6 @@ class Space(eqx.Module):
                 raise ValueError(f"Several starts are spread between bounds: give {name!r} both of them.")
         points = qmc.Sobol(self.size, rng=np.random.default_rng(seed)).random_base2(max(count - 1, 1).bit_length())
         return jnp.asarray(low + (high - low) * points[:count])
-
-
-def component_names(name: str, shape: tuple[int, ...]) -> list[str]:
-    """The names of all components of an array."""
-    return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]
 
 
 def space(

@@ -115,7 +115,7 @@ def first_feasible(
     box: tuple[np.ndarray, np.ndarray],
     most: int,
 ) -> tuple[Trial | None, int]:
-    """From a start where the objective is not a number to a trial where everything is finite.
+    """From a start where the objective is NaN to a trial where everything is finite.
 
     Gauss–Newton steps make the excess of those constraints small that have a value, such as a gap of assembly, and go
     beyond their bounds by a part of the way, since at the bounds themselves a mechanism is singular.

@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import optimistix as optx
 
+from ..minimise import next_step
 from .evaluation import Program
 from .trials import Trial, Trials
 
@@ -46,7 +47,7 @@ def _bfgs_step(solver: Any, program: Program, y: Any, state: Any, mode: str):
     return y, state, done, result
 
 
-def descend(
+def first_order(
     optimiser: optax.GradientTransformation, trials: Trials, start: Trial, tol: float, limit: int
 ) -> tuple[bool, str]:
     """Steps of an optax optimiser; where a trial fails, half its step is taken. It ends with a step below `tol`."""
@@ -70,8 +71,4 @@ def descend(
 
 @eqx.filter_jit
 def _update(optimiser: optax.GradientTransformation, program: Program, z: Any, memory: Any, value: Any, gradient: Any):
-    value_of = lambda z: program.rows(z)[0][0]
-    with jax.numpy_dtype_promotion("standard"):
-        update = optax.with_extra_args_support(optimiser).update
-        step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=value_of)
-    return jnp.asarray(step, z.dtype), memory
+    return next_step(optimiser, memory, z, value, gradient, lambda z: program.rows(z)[0][0])

@@ -1,4 +1,4 @@
-"""What a study is, as hashes: whether a store holds the results of this one or of another."""
+"""Identity of a study, as hashes: whether a store holds the results of this one or of another."""
 
 import dis
 import functools

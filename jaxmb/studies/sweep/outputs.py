@@ -1,4 +1,4 @@
-"""What a swept function returns: arrays by name, and how each member ended."""
+"""Outputs of a swept function: arrays by name, and how each member ended."""
 
 import inspect
 import traceback

@@ -1,4 +1,4 @@
-"""What is done of a sweep, in one line."""
+"""Progress of a sweep, in one line."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping

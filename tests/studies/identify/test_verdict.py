@@ -10,7 +10,7 @@ import jaxmb as mb
 from jaxmb.studies.identify import verdict
 from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.identify.residuals import Series, outliers
-from jaxmb.studies.ranges import HalfLine, Interval, Line, PositiveDefinite
+from jaxmb.studies.ranges import HalfLine, Interval, PositiveDefinite, WholeLine
 
 # Compiles faster than Adams, where the solver does not matter.
 TSIT5 = diffrax.Tsit5()
@@ -286,7 +286,7 @@ def test_estimates_at_the_ends_of_their_ranges():
     assert at(positive, 1e6, 1e8) and not at(positive, 1e6, 1e3)
     between = Interval(jnp.asarray(1.0), jnp.asarray(0.0), jnp.asarray(1e4))
     assert at(between, 1e4 - 1e-3, 1.0) and at(between, 1e-3, 1.0) and not at(between, 2.0, 1.0)
-    line = Line(jnp.asarray(1.0), jnp.asarray(1.0))
+    line = WholeLine(jnp.asarray(1.0), jnp.asarray(1.0))
     assert at(line, -1e5, 1e6) and not at(line, -1e5, 1.0)
     matrix = PositiveDefinite(jnp.eye(2))
     assert np.all(matrix.at_end(matrix.locate(jnp.diag(jnp.array([1.0, 1e-8]))), np.ones((2, 2))))

@@ -13,8 +13,8 @@ from scipy.special import jn_zeros
 
 import jaxmb as mb
 from jaxmb import lagrangian, mechanisms, planar, spatial
-from jaxmb.linalg.eigen import eigen
 from jaxmb.mechanisms.four_bar import circles_meet
+from jaxmb.studies.linear.eigen import eigen
 
 G = 9.81
 
