@@ -192,7 +192,7 @@ def test_derivatives_of_the_gap(machine, plain, rod):
 
 
 def test_a_gap_without_constraints():
-    body = planar.Body("disk", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    body = planar.Body("disc", mass=1.0, inertia=1.0, position=(0.0, 0.0))
     assert float(mb.assembly_gap(mb.Scene([body]).compile())) == 0.0
 
 
