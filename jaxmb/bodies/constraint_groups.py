@@ -4,19 +4,17 @@ import abc
 import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from .groups import Group, along_moves
+from ..parts.servo import Servo
+from .groups import AbstractGroup, Group, along_moves
 
 
-class AbstractConstraintGroup(eqx.Module):
+class AbstractConstraintGroup(AbstractGroup):
     """Kernels of stacked constraints."""
-
-    group: Group
 
     @abc.abstractmethod
     def velocity(
@@ -193,6 +191,9 @@ class ServoGroup(AbstractConstraintGroup):
 
     damping: Float[Array, "parts"]
     stiffness: Float[Array, "parts"]
+
+    def part(self, name=""):
+        return Servo(super().part(name), self.damping, self.stiffness)
 
     @property
     def program(self) -> ConstraintGroup:

@@ -6,13 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from .groups import Group, along_moves
+from .groups import AbstractGroup, along_moves
 
 
-class ForceGroup(eqx.Module):
+class ForceGroup(AbstractGroup):
     """Kernels of stacked forces."""
-
-    group: Group
 
     def wrenches(
         self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
@@ -63,10 +61,9 @@ class ForceGroup(eqx.Module):
         return jnp.sum(self.group.map(single, self.group.gather(poses)))
 
 
-class NonIdealGroup(eqx.Module):
+class NonIdealGroup(AbstractGroup):
     """Kernels of stacked non-ideal laws; `joints`: the joint's name for each."""
 
-    group: Group
     joints: tuple[str, ...] = eqx.field(static=True)
 
     def wrenches(

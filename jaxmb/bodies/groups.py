@@ -119,10 +119,18 @@ def _not_numbers(part: AbstractPart) -> str:
     )
 
 
-class BodyGroup(eqx.Module):
-    """Stacked bodies."""
+class AbstractGroup(eqx.Module):
+    """Stacked parts with the kernels of their kind."""
 
     group: Group
+
+    def part(self, name: str = "") -> AbstractPart:
+        """The part of a group of one without the leading axis; of others a part with that axis on every number."""
+        return self.group.part.named(name)
+
+
+class BodyGroup(AbstractGroup):
+    """Stacked bodies."""
 
     @property
     def mass(self) -> Float[Array, "parts"]:
@@ -135,10 +143,8 @@ class BodyGroup(eqx.Module):
         return jax.vmap(lambda body: body.inertia)(self.group.part)
 
 
-class CoordinateGroup(eqx.Module):
+class CoordinateGroup(AbstractGroup):
     """Stacked parts that have coordinates and no rows: tendons, and joints that leave all motions free."""
-
-    group: Group
 
     @property
     def rows(self) -> int:
@@ -150,10 +156,8 @@ class CoordinateGroup(eqx.Module):
         return self.group.map(lambda at, x: at(t).coordinates_at(space, x), self.group.gather(poses))
 
 
-class FrameGroup(eqx.Module):
+class FrameGroup(AbstractGroup):
     """Stacked frames."""
-
-    group: Group
 
     def poses(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts p"]:
         """Prepared poses of the frames."""

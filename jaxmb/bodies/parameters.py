@@ -13,7 +13,6 @@ from ..parts.checks import in_range
 from ..parts.contents import entry, inner_parts, paths
 from ..parts.fields import Declaration
 from ..parts.series import AbstractSignal
-from ..parts.servo import Servo
 from ..system.catalogue import ParameterPath
 from .groups import Input
 
@@ -88,13 +87,7 @@ def check_parts(groups: Iterable[Any], names: Collection[str], dimension: int) -
         for k, name in enumerate(group.group.names):
             if name in names and not is_traced(group):
                 single = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group)
-                stacked_part(single, name).check(dimension)
-
-
-def stacked_part(group: Any, name: str = "") -> Any:
-    """The part of a group, with a leading axis on every number unless it is a group of one without the axis."""
-    part = group.group.part.named(name)
-    return Servo(part, group.damping, group.stiffness) if hasattr(group, "damping") else part
+                single.part(name).check(dimension)
 
 
 def are_in_range(parts: Iterable[Any]) -> bool | Bool[Array, ""]:

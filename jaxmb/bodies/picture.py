@@ -74,7 +74,7 @@ def _shapes(part, space, width):
 
 def _centres(group):
     """The mass centres of bodies with their names, where they are not the origins."""
-    given = getattr(group.part, "centre", None)
+    given = group.part.mass_centre
     return () if given is None else zip(group.names, np.asarray(given), strict=True)
 
 

@@ -49,7 +49,6 @@ from .parameters import (
     parameter_paths,
     positive_parameters,
     signals_of,
-    stacked_part,
     with_signals,
 )
 from .picture import picture
@@ -325,9 +324,8 @@ class RigidBodySystem(AbstractSystem):
         return parameter_paths(self._gravity_name, self._groups, self.servos)
 
     def with_frames_of(self, before):
-        centre = lambda group: getattr(group.group.part, "centre", None)
         pairs = zip(self.bodies, before.bodies, strict=True)
-        moved = [(group, centre(group), centre(old)) for group, old in pairs]
+        moved = [(group, group.group.part.mass_centre, old.group.part.mass_centre) for group, old in pairs]
         changed = [(group, new - old) for group, new, old in moved if new is not None and new is not old]
         if not changed:
             return self
@@ -352,7 +350,7 @@ class RigidBodySystem(AbstractSystem):
 
     def parameters_in_range(self):
         gravity = () if self.gravity is None else (self._gravity,)
-        parts = (*gravity, *map(stacked_part, itertools.chain(*self._groups.values())))
+        parts = (*gravity, *(group.part() for group in itertools.chain(*self._groups.values())))
         return are_in_range(parts) & variables_in_range(self.design)
 
     @property

@@ -139,13 +139,13 @@ class Scene(eqx.Module):
 
 def _settled(scene: Scene, known: KnownParts, layout: Layout):
     """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity."""
-    gravity, parts, laws = None, [], []
-    # A concrete class: gravity is of no kind but its own, since it acts on every body.
-    for part in scene.forces:
-        if isinstance(part, Gravity):
-            part.check(layout.space.dimension)
-            gravity = part
-    for part in sorted((part for part in (*scene.joints, *scene.forces) if part is not gravity), key=_stage):
+    parts, laws = [], []
+    acting = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractActor)]
+    # Gravity is of no kind but its own, since it acts on every body.
+    gravity = next((part for part in scene.forces if not isinstance(part, AbstractActor)), None)
+    if gravity is not None:
+        gravity.check(layout.space.dimension)
+    for part in sorted(acting, key=_stage):
         settled, own = _call(part, "settled", known)
         if isinstance(settled, AbstractNonIdeal):
             laws.append((settled, own))

@@ -30,7 +30,7 @@ from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
 from .rod_chain import rod_chain as rod_chain
 from .roller_racer import roller_racer as roller_racer
-from .rolling_disk import rolling_disk as rolling_disk
+from .rolling_disc import rolling_disc as rolling_disc
 from .rough_ring import rough_ring as rough_ring
 from .slider_crank import slider_crank as slider_crank
 from .spatial_loop import spatial_loop as spatial_loop
@@ -74,7 +74,7 @@ _LIBRARY = {
         swash_plate,
         double_wishbone,
         flyball,
-        rolling_disk,
+        rolling_disc,
         roller_racer,
         nonholonomic_cart,
         three_platform_snake,

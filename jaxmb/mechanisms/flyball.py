@@ -49,14 +49,14 @@ def flyball(
     shaft = _DENSITY * _HEIGHT * _SECTION**2
     height = _HEIGHT - _ARM * np.sin(angle)
     # Mass centre of an arm with its ball, from the hinge.
-    center = (rod * _ARM / 2 + ball * _ARM) / (rod + ball)
-    offsets = rod * (_ARM / 2 - center) ** 2 + ball * (_ARM - center) ** 2
+    centre = (rod * _ARM / 2 + ball * _ARM) / (rod + ball)
+    offsets = rod * (_ARM / 2 - centre) ** 2 + ball * (_ARM - centre) ** 2
     inertia = spatial.box(rod, _ARM, _SECTION, _SECTION) + offsets * jnp.diag(jnp.array([0.0, 1.0, 1.0]))
 
     def arm(k, turn):
         along = np.array([np.cos(turn), 0.0, -np.sin(turn)])
         hinge = np.array([np.sign(along[0]) * _OFFSET, 0.0, _HEIGHT])
-        position = hinge + center * along
+        position = hinge + centre * along
         body = spatial.Body(
             f"arm{k}",
             mass=rod + ball,
@@ -75,7 +75,7 @@ def flyball(
             damping=damping,
             free_length=_ARM / 2,
             point_a=(hinge[0], 0.0, 0.0),
-            point_b=(_ARM / 2 - center, 0.0, 0.0),
+            point_b=(_ARM / 2 - centre, 0.0, 0.0),
         )
         return body, joint, spring
 

@@ -14,7 +14,7 @@ def spatial_slider_crank(
     *,
     crank: float = 0.08,
     rod: float = 0.3,
-    center: tuple[float, float] = (0.1, 0.12),
+    centre: tuple[float, float] = (0.1, 0.12),
     masses: tuple[float, float, float] = (0.12, 0.5, 2.0),
     speed: float = 6.0,
     gravity: float = 9.81,
@@ -29,13 +29,13 @@ def spatial_slider_crank(
     the test `sliderCrank3Dbenchmark` of EXUDYN. The reference values come from a model with one coordinate, checked by
     one with four coordinates and three multipliers, in extended precision.
 
-    **Arguments:** lengths of `crank` and `rod` [m]; `center` [m], y and z of A, shape (2,); `masses` [kg] of crank, rod
+    **Arguments:** lengths of `crank` and `rod` [m]; `centre` [m], y and z of A, shape (2,); `masses` [kg] of crank, rod
     and slider, shape (3,); `speed` [rad/s] of the crank at the start; `gravity` [m/s²].
 
     **Labels:** `x` [m] and `x_dot` [m/s] of the slider; `cos`, `sin` of the crank's angle θ about x, zero at the start;
     `theta_dot` [rad/s].
     """
-    A = np.array([0.0, *center])
+    A = np.array([0.0, *centre])
     B = A + np.array([0.0, 0.0, crank])
     C = np.array([np.sqrt(max(rod**2 - B @ B, 0.0)), 0.0, 0.0])
     x = np.array([1.0, 0.0, 0.0])

@@ -164,6 +164,11 @@ class AbstractBody(AbstractPart):
     rotates: ClassVar[bool]
 
     @property
+    def mass_centre(self) -> Array | None:
+        """The mass centre [m] in the frame, `centre`; None where it is the origin."""
+        return fields.values_of(self).get("centre")
+
+    @property
     def dimension(self) -> int:
         """2 in the plane, 3 in space."""
         return self.dimensions[0]
@@ -477,8 +482,8 @@ class AbstractNonIdeal(AbstractActor):
     """A non-ideal constraint force: it does virtual work.
 
     `joint` is the joint's name. The joint exerts its reactions and this force. The force may depend on the reactions,
-    and is solved for with them. What it has in directions that the joint blocks the reactions balance, and have that
-    much less themselves.
+    and is solved for with them. Components of the force in directions that the joint blocks do not change the motion:
+    the reactions are smaller by them.
     """
 
     joint: AbstractVar[str]

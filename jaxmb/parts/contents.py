@@ -1,4 +1,4 @@
-"""What a part contains: its parameters, its internal states, and other parts that it holds."""
+"""The contents of a part: its parameters, its internal states, and other parts that it holds."""
 
 import functools
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ def anonymous(part: Any) -> Any:
             value = ("",) * len(value)
         elif kind == "state":
             value = None
-        elif kind == "part" or (kind == "law" and hasattr(value, "bodies")):
+        elif kind in ("part", "law"):
             value = None if value is None else anonymous(value)
         elif kind == "parts":
             value = {key: anonymous(own) for key, own in value.items()}
@@ -58,9 +58,10 @@ def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
 
 
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
-    """For every parameter of a part, without those of other parts that it holds: its path of keys, the same path
-    without the names of dictionaries, as in the parameter's name, and its declaration, which for an entry of a
-    dictionary says nothing.
+    """The parameters of a part itself, not of parts that it holds.
+
+    For each: the path of keys to it; the path in its name, which leaves out the keys of dictionaries' fields; and its
+    declaration, an empty one for an entry of a dictionary.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):

@@ -116,7 +116,7 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
     out: dict[str, Any] = {
         name: LinkFrame(name=name, body=name, centre=centre)
         for name, body in known.items()
-        if (centre := getattr(body, "centre", None)) is not None
+        if (centre := body.mass_centre) is not None
     }
 
     def based(name, path):

@@ -15,10 +15,13 @@ from . import fields
 from .base import AbstractConstraint, AbstractNonIdeal, AbstractPotentialForce, AbstractVelocityConstraint
 
 
-def _shaped(part: Any, value: Any, shape: tuple[int, ...], *also: tuple[int, ...]) -> Array:
-    """The return value of a user function in the required shape; `also` lists equivalent shapes."""
+def _shaped(part: Any, value: Any, shape: tuple[int, ...]) -> Array:
+    """The return value of a user function in the required shape. It may lack the axis of a single row or body, and a
+    number may be an array of one.
+    """
     value = jnp.asarray(value)
-    if value.shape not in (shape, *also):
+    equivalent = shape[1:] if shape[:1] == (1,) else shape or (1,)
+    if value.shape not in (shape, equivalent):
         raise ValueError(f"the function of {part.label} must return shape {shape}, got {value.shape}")
     return value.reshape(shape)
 
@@ -45,7 +48,7 @@ class Constraint(AbstractConstraint):
 
     def residual(self, space, poses, t):
         value = self.function(poses[:, : space.pose_size], t, self.parameters)
-        return _shaped(self, value, (self.rows,), *[()][: self.rows == 1])
+        return _shaped(self, value, (self.rows,))
 
 
 class VelocityConstraint(AbstractVelocityConstraint):
@@ -66,7 +69,7 @@ class VelocityConstraint(AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
-        return _shaped(self, value, (self.rows,), *[()][: self.rows == 1])
+        return _shaped(self, value, (self.rows,))
 
 
 class Force(AbstractPotentialForce):
@@ -96,12 +99,12 @@ class Force(AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
-        size = space.velocity_size
-        return _shaped(self, value, (len(self.bodies), size), *[(size,)][: len(self.bodies) == 1])
+        shape = (len(self.bodies), space.velocity_size)
+        return _shaped(self, value, shape)
 
     def energy(self, space, poses, t):
         assert self.potential is not None
-        return _shaped(self, self.potential(poses[:, : space.pose_size], t, self.parameters), (), (1,))
+        return _shaped(self, self.potential(poses[:, : space.pose_size], t, self.parameters), ())
 
 
 class NonIdeal(AbstractNonIdeal):
@@ -112,9 +115,9 @@ class NonIdeal(AbstractNonIdeal):
 
     - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
     - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the wrenches that the joint
-        exerts on them besides, in the same axes, in the presence of all these forces. What the function returns in
-        directions that the joint blocks the reactions balance, and have that much less themselves. Moments of both are
-        about the origins of the frames.
+        exerts on them besides, in the same axes, in the presence of all these forces. Components that the function
+        returns in directions that the joint blocks do not change the motion: the reactions are smaller by them. Moments
+        of both are about the origins of the frames.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
     """
 
@@ -125,4 +128,4 @@ class NonIdeal(AbstractNonIdeal):
 
     def wrenches(self, space, poses, velocities, reactions, t):
         value = self.function(poses[:, : space.pose_size], velocities, reactions, t, self.parameters)
-        return _shaped(self, value, reactions.shape, *[reactions.shape[1:]][: reactions.shape[0] == 1])
+        return _shaped(self, value, reactions.shape)

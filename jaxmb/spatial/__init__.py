@@ -34,5 +34,5 @@ from ..parts.spatial.joints import (
     Universal as Universal,
 )
 from ..parts.spatial.point_joints import Distance as Distance, PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
-from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisk as RollingDisk, RollingSphere as RollingSphere
+from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisc as RollingDisc, RollingSphere as RollingSphere
 from ..parts.spatial.tyre import Tyre as Tyre

@@ -60,7 +60,7 @@ SCENES = [
     "n_four_bar",
     "parallelogram",
     "rod_chain",
-    "rolling_disk",
+    "rolling_disc",
     "slider_crank",
     "spatial_loop",
     "spatial_slider_crank",

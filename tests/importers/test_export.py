@@ -69,7 +69,7 @@ def test_a_scene_read_back_moves_alike():
     np.testing.assert_allclose(accelerations_at(again, one), expected, rtol=0, atol=1e-11)
 
 
-# Those of the library that MuJoCo can express. `rolling_disk`, `net`, `swash_plate`, `double_wishbone` and
+# Those of the library that MuJoCo can express. `rolling_disc`, `net`, `swash_plate`, `double_wishbone` and
 # `spherical_four_bar` have constraints or forces that it has not.
 MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "spatial_loop", "cable")
 

@@ -50,8 +50,8 @@ def bicycle():
         spatial.Revolute("rear_hub", "frame", "rear", point=(0.0, 0.0, REAR), axis=axle),
         spatial.Revolute("head", "steer", "stem", point_a=origin, point_b=origin, axis_a=z, axis_b=z),
         spatial.Revolute("front_hub", "fork", "front", point=(W, 0.0, FRONT), axis=axle),
-        spatial.RollingDisk("rear_tyre", "rear", radius=REAR, axis=axle),
-        spatial.RollingDisk("front_tyre", "front", radius=FRONT, axis=axle),
+        spatial.RollingDisc("rear_tyre", "rear", radius=REAR, axis=axle),
+        spatial.RollingDisc("front_tyre", "front", radius=FRONT, axis=axle),
     ]
     scene = mb.Scene(bodies, joints=joints, frames=frames, forces=[mb.Gravity((0.0, 0.0, -G))])
     ahead = lambda v, x, z: jnp.stack([W + v["trail"] - x, jnp.zeros(()), jnp.full((), -z)])

@@ -57,7 +57,7 @@ CASES = [
     ("chaplygin_sleigh", {}, 1e-8),
     ("free_body", {}, 1e-7),
     ("heavy_top", {}, 1e-7),
-    ("rolling_disk", {}, 1e-8),
+    ("rolling_disc", {}, 1e-8),
     pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.long),
     pytest.param("bricard", {}, 1e-6, marks=pytest.mark.long),
     *((name, {}, 1e-8) for name in LINKAGES),
@@ -103,7 +103,7 @@ CONSERVATIVE = [
     "chaplygin_sleigh",
     "free_body",
     "heavy_top",
-    "rolling_disk",
+    "rolling_disc",
     "roller_racer",
     "nonholonomic_cart",
     "three_platform_snake",
@@ -224,8 +224,8 @@ def test_planar_loop_in_space_has_27_independent_rows_of_30():
         assert {implied.name, *implied.by} <= {"A", "B", "C", "D"}
 
 
-def test_rolling_disk_has_five_coordinates_and_three_velocities():
-    system = library("rolling_disk").system
+def test_rolling_disc_has_five_coordinates_and_three_velocities():
+    system = library("rolling_disc").system
     assert (system.nq - system.coordinate_rank, system.nu - system.velocity_rank) == (5, 3)
 
 
@@ -328,13 +328,13 @@ def test_stiff_bushings_tend_to_hinges():
     np.testing.assert_allclose(errors[0] / errors[1], 10.0, rtol=0.2)
 
 
-# The rolling disk beyond steady motion
+# The rolling disc beyond steady motion
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("spin, frequency", [(3.0, 2.429815), (5.0, 6.656125), (8.0, 11.743253)])
-def test_an_upright_rolling_disk_wobbles_at_the_frequency_of_small_oscillations(spin, frequency):
-    mechanism = mechanisms.rolling_disk(radius=0.5, lean=1e-4, roll=spin, turn=0.0)
+def test_an_upright_rolling_disc_wobbles_at_the_frequency_of_small_oscillations(spin, frequency):
+    mechanism = mechanisms.rolling_disc(radius=0.5, lean=1e-4, roll=spin, turn=0.0)
     times = jnp.linspace(0.0, 4.0, 101)
     trajectory = mb.simulate(mechanism.system, mechanism.state, t1=4.0, rtol=1e-11, atol=1e-15, saveat=times)
     lean = 1e4 * np.asarray(mechanism.observe(trajectory)["theta"])
@@ -344,12 +344,12 @@ def test_an_upright_rolling_disk_wobbles_at_the_frequency_of_small_oscillations(
     assert omega == pytest.approx(frequency, rel=1e-5)
 
 
-def test_a_wobbling_disk_ends_where_an_independent_model_does():
+def test_a_wobbling_disc_ends_where_an_independent_model_does():
     lean, spin, yaw = 0.3, 5.0, 0.8
-    mechanism = mechanisms.rolling_disk(radius=0.5, lean=lean, roll=-spin + yaw * np.sin(lean), turn=yaw * np.cos(lean))
+    mechanism = mechanisms.rolling_disc(radius=0.5, lean=lean, roll=-spin + yaw * np.sin(lean), turn=yaw * np.cos(lean))
     trajectory = mb.simulate(mechanism.system, mechanism.state, t1=4.0, rtol=RTOL, saveat=jnp.array([1.0, 2.0, 4.0]))
     np.testing.assert_allclose(
-        trajectory["disk"].position[-1], [0.791621867, -5.441766623, 0.477285836], rtol=0, atol=1e-6
+        trajectory["disc"].position[-1], [0.791621867, -5.441766623, 0.477285836], rtol=0, atol=1e-6
     )
     assert trajectory.stats["charts"] - 1 >= 3
 

@@ -130,14 +130,14 @@ def governor(system, q, rate):
         "shaft": ([0.0, 0.0, 0.5, *shaft], [0.0, 0.0, 0.0, 0.0, 0.0, omega]),
         "slider": ([0.0, 0.0, s, *shaft], [0.0, 0.0, slide, 0.0, 0.0, omega]),
     }
-    center = (0.3 * 0.5 + 5.0) / 5.3
+    centre = (0.3 * 0.5 + 5.0) / 5.3
     for k, (alpha, turn, side) in enumerate(zip(alphas, turns, (1.0, -1.0), strict=True), start=1):
         # An arm's own axes: along it, the shaft's y, and across.
         angle = alpha if side > 0 else np.pi - alpha
         about_y = side * turn
         along = side * np.cos(alpha) * x - np.sin(alpha) * z
-        position = side * 0.05 * x + z + center * along
-        velocity = omega * np.cross(z, position) + about_y * center * np.cross(y, along)
+        position = side * 0.05 * x + z + centre * along
+        velocity = omega * np.cross(z, position) + about_y * centre * np.cross(y, along)
         p = rotations.multiply(shaft, rotations.from_axis_angle((0.0, 1.0, 0.0), angle))
         spin = [-omega * np.sin(angle), about_y, omega * np.cos(angle)]
         motions[f"arm{k}"] = ([*position, *p], [*velocity, *spin])

@@ -193,7 +193,7 @@ INSTANTS = {
         UdwadiaKalaba("inverses"),
     ),
     "spatial points": (named("spatial", "Distance", "PointOnPlane", "PointOnLine", "Driver"), NullSpace()),
-    "spatial rolling": (named("spatial", "KnifeEdge", "RollingDisk", "RollingSphere"), UdwadiaKalaba("singular_mass")),
+    "spatial rolling": (named("spatial", "KnifeEdge", "RollingDisc", "RollingSphere"), UdwadiaKalaba("singular_mass")),
     "spatial friction": ([rubbing_3d()], Partitioned()),
     "spatial forces": (SPATIAL_FORCES, Multipliers()),
     "ground": (on_the_ground(), Multipliers()),

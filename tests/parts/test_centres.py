@@ -58,7 +58,7 @@ def test_all_that_may_leave_out_a_point_are_here():
         "Contact",
         "Tyre",
         "RollingSphere",
-        "RollingDisk",
+        "RollingDisc",
         "Driver",
     }
     assert names >= {"Distance", "PlateContact", "DiscContact", "KnifeEdge", "DraftGear"}

@@ -9,7 +9,7 @@ import pytest
 import jaxmb as mb
 
 MACHINES = {"four_bar": 2.0, "heavy_top": 1.0, "roller_racer": 2.0, "slider_crank": 0.2}
-MORE = {"andrews": 0.03, "bricard": 2.0, "rolling_disk": 1.0, "spherical_four_bar": 1.0, "double_wishbone": 0.5}
+MORE = {"andrews": 0.03, "bricard": 2.0, "rolling_disc": 1.0, "spherical_four_bar": 1.0, "double_wishbone": 0.5}
 
 
 @pytest.mark.parametrize(

@@ -50,11 +50,11 @@ CASES = {
     # mechanism: (body of the spring, its point, more fixed coordinates, rate that is differentiated, other parameters)
     "four_bar": ("rocker", (0.3, 0.1), "crank.angle", ["crank.mass", "rocker.inertia", "spring.point_b"]),
     "bricard": ("bar3", (0.1, 0.0, 0.2), "bar1.wy", ["bar2.mass", "bar3.inertia", "spring.point_b"]),
-    "rolling_disk": (
-        "disk",
+    "rolling_disc": (
+        "disc",
         (0.05, 0.02, 0.1),
-        "disk.wy",
-        ["disk.mass", "disk.inertia", "spring.point_b", "plane.radius"],
+        "disc.wy",
+        ["disc.mass", "disc.inertia", "spring.point_b", "plane.radius"],
     ),
     "heavy_top": ("top", (0.02, 0.01, 0.05), "top.wz", ["top.mass", "top.inertia", "tip.point_b", "spring.point_b"]),
 }

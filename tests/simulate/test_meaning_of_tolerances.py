@@ -24,7 +24,7 @@ MOTIONS = {
     "chaplygin_sleigh": 3.0,
     "heavy_top": 1.0,
     "free_body": 5.0,
-    "rolling_disk": 1.0,
+    "rolling_disc": 1.0,
     "roller_racer": 2.0,
     "nonholonomic_cart": 2.0,
     "three_platform_snake": 2.0,

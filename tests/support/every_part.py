@@ -422,8 +422,8 @@ SPATIAL = [
         joints=(pin_3d,),
     ),
     on_body_3d(spatial.KnifeEdge, "point", point=(0.2, 0.0, 0.0)),
-    # A disk at rest falls over.
-    on_body_3d(spatial.RollingDisk, "radius", position=(0.5, 0.1, 0.3), radius=0.3, axis=(0.0, 1.0, 0.0), rests=False),
+    # A disc at rest falls over.
+    on_body_3d(spatial.RollingDisc, "radius", position=(0.5, 0.1, 0.3), radius=0.3, axis=(0.0, 1.0, 0.0), rests=False),
     on_body_3d(spatial.RollingSphere, "radius", radius=0.2),
     of_ground_3d(spatial.SpringDamper, "stiffness", stiffness=30.0, damping=0.5, free_length=0.1),
     of_ground_3d(spatial.Damper, "damping", damping=3.0, point_b=(0.1, 0.2, 0.0)),

@@ -41,21 +41,21 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
         return (0, sleeve(self.point, size, self.axis)), (None, Ground(orientation=along(self.normal)))
 
 
-class AbstractDisk(AbstractSpatialPart):
-    """Fields of `RollingDisk` and its components."""
+class AbstractDisc(AbstractSpatialPart):
+    """Fields of `RollingDisc` and its components."""
 
     name: str = fields.name()
     body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
     axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
-    center: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
     normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
 
 def _lowest_rim_point(space, part, pose):
-    """From the centre of a disk to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`, `m = n × (e × n)`.
+    """From the centre of a disc to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`, `m = n × (e × n)`.
 
-    The direction does not depend on the lengths of e and n. For a disk that lies flat, which has no lowest point, ρ =
+    The direction does not depend on the lengths of e and n. For a disc that lies flat, which has no lowest point, ρ =
     0.
     """
     n = space.direction(pose, part.axis)
@@ -68,42 +68,42 @@ def _tangential(normal, v):
     return jnp.sum(perpendiculars(normal) * v[None, :], axis=1)
 
 
-class RollingDisk(AbstractDisk, AbstractCompound):
-    """A thin disk that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
+class RollingDisc(AbstractDisc, AbstractCompound):
+    """A thin disc that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, n the
-    axle. The disk must never lie flat.
+    axle. The disc must never lie flat.
 
-    **Arguments:** `radius` [m] > 0; `axis`, unit, shape (3,), the axle fixed in the body; `center` [m], shape (3,), of
-    the disk, fixed in the body, default the origin of the frame; `point` [m] and `normal` (unit), shape (3,), of the
+    **Arguments:** `radius` [m] > 0; `axis`, unit, shape (3,), the axle fixed in the body; `centre` [m], shape (3,), of
+    the disc, fixed in the body, default the origin of the frame; `point` [m] and `normal` (unit), shape (3,), of the
     plane in the world.
     """
 
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
 
     def components(self):
-        disk = {"radius": self.radius, "axis": self.axis, "center": self.center, "normal": self.normal}
-        return (DiskContact(self.name, self.body, point=self.point, **disk), DiskRolling(self.name, self.body, **disk))
+        disc = {"radius": self.radius, "axis": self.axis, "centre": self.centre, "normal": self.normal}
+        return (DiscContact(self.name, self.body, point=self.point, **disc), DiscRolling(self.name, self.body, **disc))
 
 
-class DiskContact(AbstractDisk, AbstractConstraint):
-    """A disk that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisk`."""
+class DiscContact(AbstractDisc, AbstractConstraint):
+    """A disc that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisc`."""
 
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):
-        lowest = space.point(poses[0], self.center) + _lowest_rim_point(space, self, poses[0])
+        lowest = space.point(poses[0], self.centre) + _lowest_rim_point(space, self, poses[0])
         return jnp.dot(self.normal, lowest - self.point)[None]
 
     def shapes(self, space, size):
-        disc = ((0, shape) for shape in wheel(self.radius, size, self.center, self.axis))
+        disc = ((0, shape) for shape in wheel(self.radius, size, self.centre, self.axis))
         return (*disc, (None, Ground(position=self.point, orientation=along(self.normal))))
 
 
-class DiskRolling(AbstractDisk, AbstractVelocityConstraint):
-    """A disk whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisk`."""
+class DiscRolling(AbstractDisc, AbstractVelocityConstraint):
+    """A disc whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisc`."""
 
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
@@ -111,7 +111,7 @@ class DiskRolling(AbstractDisk, AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         rho = space.body_direction(poses[0], _lowest_rim_point(space, self, poses[0]))
-        return _tangential(self.normal, space.point_velocity(poses[0], velocities[0], self.center + rho))
+        return _tangential(self.normal, space.point_velocity(poses[0], velocities[0], self.centre + rho))
 
 
 class AbstractBall(AbstractSpatialPart):
@@ -120,7 +120,7 @@ class AbstractBall(AbstractSpatialPart):
     name: str = fields.name()
     body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
-    center: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
@@ -128,7 +128,7 @@ class AbstractBall(AbstractSpatialPart):
 class RollingSphere(AbstractBall, AbstractCompound):
     """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
-    **Arguments:** `radius` [m] > 0; `center` [m], shape (3,), of the sphere, fixed in the body, default the origin of
+    **Arguments:** `radius` [m] > 0; `centre` [m], shape (3,), of the sphere, fixed in the body, default the origin of
     the frame; `point` [m] and `normal` (unit), shape (3,), of the plane in the world; `spin` [rad/s], of a turntable:
     the rate at which the plane turns about its normal through `point`, default a plane at rest.
     """
@@ -136,7 +136,7 @@ class RollingSphere(AbstractBall, AbstractCompound):
     spin: fields.Number = fields.parameter(unit="rad/s", optional=True)
 
     def components(self):
-        ball = {"radius": self.radius, "center": self.center, "point": self.point, "normal": self.normal}
+        ball = {"radius": self.radius, "centre": self.centre, "point": self.point, "normal": self.normal}
         return (
             SphereContact(self.name, self.body, **ball),
             SphereRolling(self.name, self.body, spin=self.spin, **ball),
@@ -150,12 +150,12 @@ class SphereContact(AbstractBall, AbstractConstraint):
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):
-        height = jnp.dot(self.normal, space.point(poses[0], self.center) - self.point)
+        height = jnp.dot(self.normal, space.point(poses[0], self.centre) - self.point)
         return (height - self.radius * norm(self.normal))[None]
 
     def shapes(self, space, size):
         ground = Ground(position=self.point, orientation=along(self.normal))
-        return *((0, shape) for shape in marked_ball(self.radius, self.center)), (None, ground)
+        return *((0, shape) for shape in marked_ball(self.radius, self.centre)), (None, ground)
 
 
 class SphereRolling(AbstractBall, AbstractVelocityConstraint):
@@ -175,7 +175,7 @@ class SphereRolling(AbstractBall, AbstractVelocityConstraint):
     def residual(self, space, poses, velocities, t):
         e = self.normal / norm(self.normal)
         rho = space.body_direction(poses[0], -self.radius * e)
-        slip = space.point_velocity(poses[0], velocities[0], self.center + rho)
+        slip = space.point_velocity(poses[0], velocities[0], self.centre + rho)
         if self.spin is not None:
-            slip = slip - self.spin * cross(e, space.point(poses[0], self.center) - self.point)
+            slip = slip - self.spin * cross(e, space.point(poses[0], self.centre) - self.point)
         return _tangential(self.normal, slip)

@@ -37,9 +37,9 @@ def random_unit(rng):
     return jnp.asarray(v / np.linalg.norm(v))
 
 
-def move(pose, angle, center, shift):
+def move(pose, angle, centre, shift):
     """The body turned by `angle` about a world point, then shifted."""
-    return jnp.concatenate([center + rotate_2d(angle, pose[:2] - center) + shift, (pose[2] + angle)[None]])
+    return jnp.concatenate([centre + rotate_2d(angle, pose[:2] - centre) + shift, (pose[2] + angle)[None]])
 
 
 def net_wrench(poses, wrenches):

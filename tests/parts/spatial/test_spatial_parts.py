@@ -60,9 +60,9 @@ def turn_3(x):
     return turn(x / angle, angle)
 
 
-def move(pose, p, center, shift):
+def move(pose, p, centre, shift):
     """The body turned by `p` about a world point, then shifted."""
-    return jnp.concatenate([center + rot.rotate(p, pose[:3] - center) + shift, rot.multiply(p, pose[3:])])
+    return jnp.concatenate([centre + rot.rotate(p, pose[:3] - centre) + shift, rot.multiply(p, pose[3:])])
 
 
 def pose_rates(poses, velocities):
@@ -110,8 +110,8 @@ def composite(*sequence, apart=False):
         pose, k = q[1], hinges
         for word, own, value in reversed([*zip(sequence, jnp.asarray(axes), x, strict=False)]):
             k -= word == "hinge"
-            center = jnp.asarray(POINTS[k]) if apart else point
-            pose = move(pose, turn(own, value), center, STILL) if word == "hinge" else pose.at[:3].add(value * own)
+            centre = jnp.asarray(POINTS[k]) if apart else point
+            pose = move(pose, turn(own, value), centre, STILL) if word == "hinge" else pose.at[:3].add(value * own)
         return pose
 
     return Case(6 - len(sequence), build, of_b(motion))
@@ -355,7 +355,7 @@ def test_length_driver(quantity):
 
 ROLLING = {
     "KnifeEdge": spatial.KnifeEdge("blade", "a", point=(0.2, 0.0, 0.0)),
-    "RollingDisk": spatial.RollingDisk("wheel", "a", radius=0.5, center=(0.1, -0.2, 0.05)),
+    "RollingDisc": spatial.RollingDisc("wheel", "a", radius=0.5, centre=(0.1, -0.2, 0.05)),
     "RollingSphere": spatial.RollingSphere("ball", "a", radius=0.2, spin=2.5),
 }
 
@@ -398,23 +398,23 @@ def rolling_case(build, rng):
     return link, rolling, pose, rows
 
 
-def test_rolling_disk():
+def test_rolling_disc():
     rng = np.random.default_rng(4)
     axis = random_unit(rng)
-    build = lambda plane: spatial.RollingDisk("wheel", "a", radius=0.5, axis=axis, center=(0.1, -0.2, 0.05), **plane)
-    disk, rolling, pose, rows = rolling_case(build, rng)
+    build = lambda plane: spatial.RollingDisc("wheel", "a", radius=0.5, axis=axis, centre=(0.1, -0.2, 0.05), **plane)
+    disc, rolling, pose, rows = rolling_case(build, rng)
     assert rolling.linear and rolling.homogeneous
     jacobian = jax.jit(jax.jacfwd(rows))(jnp.zeros(6))
     assert rank(jacobian) == 3
     # The lowest point of the rim, found on the rim itself.
-    n, C = SPACE.direction(pose, axis), SPACE.point(pose, disk.center)
+    n, C = SPACE.direction(pose, axis), SPACE.point(pose, disc.centre)
     u, v = across(n)
-    phi = np.arctan2(-v @ disk.normal, -u @ disk.normal)
+    phi = np.arctan2(-v @ disc.normal, -u @ disc.normal)
     rho = 0.5 * (np.cos(phi) * u + np.sin(phi) * v)
-    np.testing.assert_allclose(disk.normal @ (C + rho - disk.point), 0.0, atol=1e-14)
+    np.testing.assert_allclose(disc.normal @ (C + rho - disc.point), 0.0, atol=1e-14)
     _, _, basis = np.linalg.svd(np.asarray(jacobian))
     for free in basis[3:]:
-        velocity = SPACE.point_velocity(pose, jnp.asarray(free), disk.center + SPACE.body_direction(pose, rho))
+        velocity = SPACE.point_velocity(pose, jnp.asarray(free), disc.centre + SPACE.body_direction(pose, rho))
         np.testing.assert_allclose(velocity, 0.0, atol=1e-14)
     check_parameter_derivatives(
         lambda part: jnp.concatenate(
@@ -423,14 +423,14 @@ def test_rolling_disk():
                 part.components()[1].residual(SPACE, pose[None], jnp.ones((1, 6)), 0.0),
             ]
         ),
-        disk,
+        disc,
         rng,
     )
 
 
-def test_flat_disk_is_finite():
+def test_flat_disc_is_finite():
     ground = jnp.array(SPACE.ground)[None]
-    contact, rolling = spatial.RollingDisk("wheel", "a", radius=0.5).resolve(SPACE, ground).components()
+    contact, rolling = spatial.RollingDisc("wheel", "a", radius=0.5).resolve(SPACE, ground).components()
     rows = lambda q: jnp.concatenate(
         [contact.residual(SPACE, q, 0.0), rolling.residual(SPACE, q, jnp.ones((1, 6)), 0.0)]
     )
@@ -785,8 +785,8 @@ TWO = ("J", "a", "b")
         (spatial.Distance(*TWO), "length must be positive"),
         (driver("angle", lambda t, p: t), "give axis_a"),
         (spatial.KnifeEdge("J", "a", axis=(2.0, 0.0, 0.0)), "axis must be a unit vector"),
-        (spatial.RollingDisk("J", "a", radius=0.0), "radius must be positive"),
-        (spatial.RollingDisk("J", "a", radius=1.0, axis=O), "axis must be a unit vector"),
+        (spatial.RollingDisc("J", "a", radius=0.0), "radius must be positive"),
+        (spatial.RollingDisc("J", "a", radius=1.0, axis=O), "axis must be a unit vector"),
         (spatial.RollingSphere("J", "a", radius=1.0, normal=O), "normal must be a unit vector"),
         (spatial.RollingSphere("J", "a", radius=1.0, spin=np.nan), "spin must be finite"),
         (spatial.SpringDamper(*TWO, stiffness=-1.0), "stiffness must be non-negative"),

@@ -81,38 +81,38 @@ def test_a_flyball_governor_balances_its_springs():
     assert np.max(linear.eigenvalues.real) < 1e-6 and len(linear.states) == 8
 
 
-def disk(speed):
-    """A disk of 1 kg and 0.3 m that rolls upright along x."""
-    body = spatial.Body("disk", mass=1.0, inertia=spatial.disc(1.0, 0.3, "y"), position=(0.0, 0.0, 0.3))
-    plane = spatial.RollingDisk("plane", "disk", radius=0.3, axis=(0.0, 1.0, 0.0))
+def disc(speed):
+    """A disc of 1 kg and 0.3 m that rolls upright along x."""
+    body = spatial.Body("disc", mass=1.0, inertia=spatial.disc(1.0, 0.3, "y"), position=(0.0, 0.0, 0.3))
+    plane = spatial.RollingDisc("plane", "disc", radius=0.3, axis=(0.0, 1.0, 0.0))
     system = mb.Scene([body], joints=[plane], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
-    return system, mb.assemble(system, rates={"disk.wy": speed / 0.3, "disk.wx": 0.0, "disk.wz": 0.0})
+    return system, mb.assemble(system, rates={"disc.wy": speed / 0.3, "disc.wx": 0.0, "disc.wz": 0.0})
 
 
 @pytest.mark.parametrize("speed", [0.8, 1.2])
-def test_a_rolling_disk_falls_below_its_critical_speed(speed):
+def test_a_rolling_disc_falls_below_its_critical_speed(speed):
     """λ² (A + m r²) = m g r − C (C + m r²) ω² / A, which changes its sign at v² = g r / 3 (Routh)."""
     r, A, C, mr2 = 0.3, 0.0225, 0.045, 0.09
-    linear = mb.linearise(*disk(speed))
+    linear = mb.linearise(*disc(speed))
     square = (G * r - C * (C + mr2) * (speed / r) ** 2 / A) / (A + mr2)
     found = np.asarray(linear.eigenvalues)[-2:]
     np.testing.assert_allclose(found**2, square, rtol=1e-9)
     assert (speed**2 < G * r / 3) == (np.max(found.real) > 1e-6)
 
 
-def test_a_disk_in_a_steady_circle():
-    given = mechanisms.get("rolling_disk", lean=0.4, turn=-2.0)
+def test_a_disc_in_a_steady_circle():
+    given = mechanisms.get("rolling_disc", lean=0.4, turn=-2.0)
     names = given.system.rate_names()
-    rates = {f"disk.{w}": float(given.state.u[names[f"disk.{w}"][0]]) for w in ("wx", "wy", "wz")}
+    rates = {f"disc.{w}": float(given.state.u[names[f"disc.{w}"][0]]) for w in ("wx", "wy", "wz")}
     moved = given.state.u + 0.05 * np.sin(np.arange(6.0))
     guess = mb.assemble(given.system, mb.State(given.state.q, moved))
     state = mb.steady_motion(
         given.system,
         guess,
-        fix={"disk.z": float(given.state.q[2])},
-        rates={"disk.wx": rates["disk.wx"], "disk.wz": rates["disk.wz"]},
+        fix={"disc.z": float(given.state.q[2])},
+        rates={"disc.wx": rates["disc.wx"], "disc.wz": rates["disc.wz"]},
     )
-    np.testing.assert_allclose(state.u[4], rates["disk.wy"], rtol=1e-8)
+    np.testing.assert_allclose(state.u[4], rates["disc.wy"], rtol=1e-8)
     np.testing.assert_allclose(state.q[2], given.state.q[2], rtol=1e-10)
     linear = mb.linearise(given.system, state)
     assert len(linear.states) == 8

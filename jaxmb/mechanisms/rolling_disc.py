@@ -1,4 +1,4 @@
-"""A disk that rolls without slipping."""
+"""A disc that rolls without slipping."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from .observe import body_axis
 
 
 @mechanism()
-def rolling_disk(
+def rolling_disc(
     *,
     mass: float = 1.0,
     radius: float = 0.3,
@@ -23,7 +23,7 @@ def rolling_disk(
     pitch: float = 0.0,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """A thin uniform disk that rolls on a horizontal plane without slipping; z up. By default it runs in a circle,
+    """A thin uniform disc that rolls on a horizontal plane without slipping; z up. By default it runs in a circle,
     leaning steadily.
 
     With the heading ψ and the lean θ from upright, `e₁ = (cos ψ, sin ψ, 0)` is the heading, `e₂ = (−sin ψ cos θ, cos ψ
@@ -41,39 +41,39 @@ def rolling_disk(
     A, C = mass * radius**2 / 4, mass * radius**2 / 2
     if roll is None:
         if turn * lean == 0:
-            raise ValueError("rolling_disk: straight rolling is steady at any roll; give roll [rad/s].")
+            raise ValueError("rolling_disc: straight rolling is steady at any roll; give roll [rad/s].")
         roll = (A * turn**2 * np.tan(lean) - mass * gravity * radius * np.sin(lean)) / ((C + mass * radius**2) * turn)
-    disk = spatial.Body(
-        "disk",
+    disc = spatial.Body(
+        "disc",
         mass=mass,
         inertia=spatial.disc(mass, radius, "y"),
         position=(0.0, 0.0, radius * np.cos(lean)),
         orientation=rotations.from_axis_angle((1.0, 0.0, 0.0), lean),
     )
-    plane = spatial.RollingDisk("plane", "disk", radius=radius, axis=(0.0, 1.0, 0.0))
+    plane = spatial.RollingDisc("plane", "disc", radius=radius, axis=(0.0, 1.0, 0.0))
     return build(
-        "rolling_disk",
-        Scene([disk], joints=[plane], forces=[Gravity((0.0, 0.0, -gravity))]),
+        "rolling_disc",
+        Scene([disc], joints=[plane], forces=[Gravity((0.0, 0.0, -gravity))]),
         t1=4.0,
         observe=_observe,
-        description="A thin disk that rolls on a plane without slipping, in a steady circle.",
-        references=References.load("rolling_disk"),
-        rates={"disk.angular_velocity": (pitch, roll, turn)},
+        description="A thin disc that rolls on a plane without slipping, in a steady circle.",
+        references=References.load("rolling_disc"),
+        rates={"disc.angular_velocity": (pitch, roll, turn)},
     )
 
 
 def _observe(trajectory):
-    disk = trajectory["disk"]
-    axle = body_axis(trajectory, "disk", (0.0, 1.0, 0.0))
-    omega_W = jax.vmap(rotations.rotate)(disk.orientation, disk.angular_velocity)
+    disc = trajectory["disc"]
+    axle = body_axis(trajectory, "disc", (0.0, 1.0, 0.0))
+    omega_W = jax.vmap(rotations.rotate)(disc.orientation, disc.angular_velocity)
     level = jnp.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
     cos, sin = axle[:, 1] / level, -axle[:, 0] / level
     e1 = jnp.stack([cos, sin, jnp.zeros_like(cos)], axis=1)
     e3 = jnp.cross(e1, axle)
     along = lambda e: jnp.sum(e * omega_W, axis=1)
     return {
-        "xc": disk.position[:, 0],
-        "yc": disk.position[:, 1],
+        "xc": disc.position[:, 0],
+        "yc": disc.position[:, 1],
         "theta": jnp.arctan2(axle[:, 2], level),
         "cos_psi": cos,
         "sin_psi": sin,
