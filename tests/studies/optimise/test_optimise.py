@@ -8,7 +8,7 @@ import optax
 import pytest
 
 import jaxmb as mb
-from jaxmb.studies.optimise.evaluation import Program, differentiable
+from jaxmb.studies.optimise.evaluation import Program, with_derivatives
 
 START = {"x": [-1.2, 1.0]}
 DISK = {"square": (None, 1.0)}
@@ -73,7 +73,7 @@ def test_equations_and_bounds_of_components():
 
 def test_both_modes_of_derivatives_agree():
     forward, reverse = (
-        differentiable(Program(valley, in_z, ("f", "x"), True, False), mode, 3).linearised(jnp.ones(2))
+        with_derivatives(Program(valley, in_z, ("f", "x"), True, False), mode, 3).linearised(jnp.ones(2))
         for in_z, mode in ((Plain(), "forward"), (Plain(), "reverse"))
     )
     for a, b in zip(forward, reverse, strict=True):
