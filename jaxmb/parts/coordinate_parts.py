@@ -28,7 +28,9 @@ class AbstractOfJoints(AbstractLink):
     """
 
     name: str = fields.name()
-    joints: Any = fields.parts()
+    joints: Any = eqx.field(
+        default_factory=dict, kw_only=True, metadata={"declaration": fields.Declaration("parts", of=dict)}
+    )
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
     stage: ClassVar[int] = 2
 

@@ -338,11 +338,6 @@ def part(of: Any) -> Any:
     return _field(Declaration("part", of=of | None), default=None, kw_only=True)
 
 
-def parts() -> Any:
-    """Other parts by some keys, in the same way."""
-    return _field(Declaration("parts", of=dict), default_factory=dict, kw_only=True)
-
-
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """A module whose numbers are parameters, `"part.field.number"`.
 
