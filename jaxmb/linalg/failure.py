@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 Tree = TypeVar("Tree")
 
 
-def not_a_number_where(failed: Bool[Array, ""], values: Tree, inputs: PyTree = None) -> Tree:
+def nan_where(failed: Bool[Array, ""], values: Tree, inputs: PyTree = None) -> Tree:
     """The values, and NaN where a computation failed, as are their derivatives with respect to all `inputs`, also those
     that the computation did not reach.
     """

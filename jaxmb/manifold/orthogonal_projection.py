@@ -129,7 +129,7 @@ def project_normalized(system: AbstractEquation, t: Scalar, y: State) -> State:
 
 def project(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order where the
-    Jacobian is one dense matrix. Where Newton's method fails the state and its derivatives are not a number.
+    Jacobian is one dense matrix. Where Newton's method fails the state and its derivatives are NaN.
     """
     found, failed = projected(system, t, y)
     factor = jnp.where(failed, jnp.nan, 1.0)

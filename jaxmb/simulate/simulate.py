@@ -16,7 +16,7 @@ from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
-from ..linalg.failure import not_a_number_where
+from ..linalg.failure import nan_where
 from ..manifold import AbstractManifold, default_manifold, with_internal_states
 from ..parts.names import names_arguments
 from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController, OneStepController
@@ -275,7 +275,7 @@ def simulate(
         # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.
         motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
-        spoiled = not_a_number_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
+        spoiled = nan_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
         trajectory = eqx.tree_at(motion_of, trajectory, spoiled, is_leaf=lambda leaf: leaf is None)
         if throw:
             trajectory = trajectory.result.error_if(trajectory, failed)

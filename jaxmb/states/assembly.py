@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
-from ..linalg.failure import not_a_number_where
+from ..linalg.failure import nan_where
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions, rates_of
@@ -90,7 +90,7 @@ def assemble(
             q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are violated."
         )
     state = State(q, u, z)
-    return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
+    return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
 
 
 def configuration(

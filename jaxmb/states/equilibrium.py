@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
-from ..linalg.failure import not_a_number_where
+from ..linalg.failure import nan_where
 from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
@@ -120,7 +120,7 @@ def equilibrium(
             "No static equilibrium was found; call equilibrium outside jit to see the coordinates at fault.",
         )
     state = State(q, u, z)
-    return state if throw else not_a_number_where(jnp.logical_not(ok), state, (system, guess, fix, time))
+    return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, time))
 
 
 @eqx.filter_jit

@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float
 from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
-from ...linalg.failure import not_a_number_where
+from ...linalg.failure import nan_where
 from ...parts.names import names_arguments, unknown
 from ...simulate import simulate
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
@@ -123,7 +123,7 @@ def floquet(
     bad = jnp.any(far) | ~jnp.all(own.regular) | ~jnp.all(jnp.isfinite(pushed))
     monodromy = own.reading @ pushed
     if is_traced((monodromy, bad)):
-        monodromy = not_a_number_where(bad, monodromy, (system, state, t, period))
+        monodromy = nan_where(bad, monodromy, (system, state, t, period))
     elif not bool(jnp.all(jnp.isfinite(pushed))):
         raise RuntimeError("The motion or its derivatives could not be integrated over the period; simulate it to see.")
     elif bad:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
-from ...linalg.failure import not_a_number_where
+from ...linalg.failure import nan_where
 from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
@@ -81,7 +81,7 @@ def linearise(
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
     matrices = found.A, found.B, found.C, found.D
     if is_traced((matrices, found.ok)):
-        matrices = not_a_number_where(~found.ok, matrices, (system, state, t))
+        matrices = nan_where(~found.ok, matrices, (system, state, t))
     elif not found.ok:
         raise ValueError(_refusal(system, t, state, names, found, labels))
     return Linearisation(

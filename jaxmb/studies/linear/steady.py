@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ..._arguments import real_array
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
-from ...linalg.failure import not_a_number_where
+from ...linalg.failure import nan_where
 from ...linalg.newton import newton, root
 from ...linalg.rotations import unrotate
 from ...parts.names import names_arguments, unknown
@@ -75,7 +75,7 @@ def steady_motion(
     advancing = _indices(system, ignorable)
     found = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
     if is_traced(found) or not throw:
-        return not_a_number_where(~found.ok, found.state, (system, guess, values, t))
+        return nan_where(~found.ok, found.state, (system, guess, values, t))
     if not found.ok:
         raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
     return found.state
