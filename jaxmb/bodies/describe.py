@@ -53,11 +53,7 @@ def describe_scene(system: Any) -> Description:
         "design variables": description_rows(system.design),
     }
     specialised = specialised_constraints(system)
-    if system.elimination is not None:
-        specialised.append(f"no dense Jacobian and no charts with Adams: {_elimination(system.elimination)}")
-    if system.implicit_in_blocks:
-        joined = f"{count} bodies" if system.elimination is None else f"{count} bodies with the joints"
-        specialised.append(f"no dense Newton matrix with Hermite: sparse elimination of {joined}")
+    specialised += system.eliminations()
     if not system.spatial:
         specialised.append("planar: no Euler parameters, no gyroscopic moment")
     if not system.forces and not system.nonideal:
@@ -65,12 +61,3 @@ def describe_scene(system: Any) -> Description:
     redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
     remarks = {"redundant rows": tuple(redundant), "specialised away": tuple(specialised)}
     return Description(tuple(facts), {title: tuple(rows) for title, rows in tables.items()}, remarks)
-
-
-def _elimination(order):
-    """The order of elimination, in words."""
-    nodes = order.nodes
-    text = f"sparse elimination of {len(order.kept)} joints"
-    if order.hubs.size:
-        text += f" and {order.hubs.size} bodies of many joints"
-    return f"{text} in {nodes.levels} levels" + (f" and a rest of {nodes.rest.size}" if nodes.rest.size else "")

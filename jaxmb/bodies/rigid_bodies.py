@@ -286,10 +286,6 @@ class RigidBodySystem(AbstractSystem):
         return state_fields(self.forces)
 
     @property
-    def nz(self) -> int:
-        return self.state_ends[-1] if self.state_ends else 0
-
-    @property
     def state_ends(self) -> tuple[int, ...]:
         return tuple(own.stop for own in self._state_fields)
 
@@ -374,6 +370,16 @@ class RigidBodySystem(AbstractSystem):
 
     def describe(self):
         return describe_scene(self)
+
+    def eliminations(self) -> list[str]:
+        """Sentences on the matrices that are eliminated in blocks."""
+        order, out = self.elimination, []
+        if order is not None:
+            out.append(f"no dense Jacobian and no charts with Adams: {order}")
+        if self.implicit_in_blocks:
+            joined = f"{self.layout.bodies} bodies" + " with the joints" * (order is not None)
+            out.append(f"no dense Newton matrix with Hermite: sparse elimination of {joined}")
+        return out
 
     # Views of a motion
 

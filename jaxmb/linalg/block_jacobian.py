@@ -76,6 +76,13 @@ class JointOrder:
     left_out: tuple[int, ...] = dataclasses.field(compare=False)
     absolute: frozenset[int] = dataclasses.field(compare=False)
 
+    def __str__(self) -> str:
+        text = f"sparse elimination of {len(self.kept)} joints"
+        if self.hubs.size:
+            text += f" and {self.hubs.size} bodies of many joints"
+        rest = self.nodes.rest.size
+        return f"{text} in {self.nodes.levels} levels" + f" and a rest of {rest}" * bool(rest)
+
     @property
     def uniform(self) -> bool:
         """Whether every body has all its velocities, so that those of the bodies are a plain reshape of all."""

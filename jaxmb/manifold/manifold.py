@@ -27,11 +27,12 @@ class AbstractManifold(eqx.Module):
     """A policy that turns a system into a term, and a solver into one that respects the constraints.
 
     `restores` says whether every step ends on the constraints, `takes_impulses` whether velocities follow a jump of
-    prescribed rates.
+    prescribed rates, `uses_charts` whether independent coordinates are chosen.
     """
 
     restores: AbstractVar[bool]
     takes_impulses: ClassVar[bool] = True
+    uses_charts: ClassVar[bool] = False
 
     @abc.abstractmethod
     def prepare(

@@ -73,6 +73,7 @@ class Partition(AbstractManifold):
     max_influence: float = eqx.field(static=True, default=_GROWTH)
     newton_tol: float | None = eqx.field(static=True, default=None)
     restores: ClassVar[bool] = True
+    uses_charts: ClassVar[bool] = True
 
     def __check_init__(self):
         if not self.max_influence > 1:

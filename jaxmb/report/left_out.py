@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from .._types import State
-from ..manifold import Partition
+from ..manifold import Partition, default_manifold
 from ..mechanisms import Mechanism
 from ..simulate import simulate
 from ..solvers import Adams
@@ -112,7 +112,7 @@ def left_out(
         ("a damper of zero", True, with_damper, {}),
         ("an event", True, None, events),
         ("dense output", True, None, {"saveat": diffrax.SaveAt(t1=True, dense=True)}),
-        ("charts, a dense Jacobian", own.elimination is not None, None, {"manifold": Partition()}),
+        ("charts, a dense Jacobian", not default_manifold(own, Adams(), None).uses_charts, None, {"manifold": Partition()}),
     ]
     remarks, compiled, programs = [], [], []
     for what, free, change, options in possible:
