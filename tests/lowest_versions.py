@@ -1,7 +1,8 @@
 """The lowest versions of `pyproject.toml` in an environment of their own, and the tests in it.
 
-`python tests/lowest_versions.py ENVIRONMENT [options of pytest]` makes the environment in a folder, or takes one that it
-made before, installs exactly the lower bounds of the dependencies and of the extras that tests need, and runs pytest.
+`python tests/lowest_versions.py ENVIRONMENT [options of pytest]` makes the environment in a folder, or takes one that
+it made before, installs exactly the lower bounds of the dependencies and of the extras that tests need, and runs
+pytest.
 """
 
 import argparse
