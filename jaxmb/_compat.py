@@ -4,6 +4,7 @@ Each stands here once, with what it does and the versions that it was found in; 
 each, which says what is missing when an update takes it away.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
@@ -86,6 +87,39 @@ def define_bilinear(
     ad.defbilinear(own, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
     batching.primitive_batchers[own] = batched
     return own.bind
+
+
+def only_in_reverse(tree: T, message: str) -> T:
+    """The same tree, whose derivatives may be taken in reverse mode only.
+
+    Where one is evaluated in forward mode, a `TypeError` with a message is raised: when the program is lowered, or at
+    once outside of `jit`. (A linear operation that has a transpose and no value, as jax.custom_vjp has one itself.)
+    """
+    # Each array on its own, so that those without a derivative have none after it.
+    return jax.tree.map(lambda x: _only_in_reverse(message, x) if eqx.is_inexact_array(x) else x, tree)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _only_in_reverse(message, x):
+    del message
+    return x
+
+
+@_only_in_reverse.defjvp
+def _only_in_reverse_jvp(message, primals, tangents):
+    return _only_in_reverse(message, *primals), _transposed_only.bind(*tangents, message=message)
+
+
+def _not_forward(*args, message, **kwargs):
+    raise TypeError(message)
+
+
+_transposed_only = Primitive("transposed_only")
+_transposed_only.def_impl(_not_forward)
+_transposed_only.def_abstract_eval(lambda x, *, message: x)
+mlir.register_lowering(_transposed_only, _not_forward)
+ad.deflinear2(_transposed_only, lambda cotangent, x, *, message: [cotangent])
+batching.primitive_batchers[_transposed_only] = _not_forward
 
 
 # equinox

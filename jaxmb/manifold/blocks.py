@@ -23,12 +23,7 @@ def state_blocks(system: AbstractSystem, rate: Any) -> tuple[Block, ...]:
     )
 
 
-def natural_units(system: AbstractSystem, rate: Any, dtype: Any) -> Float[Array, " n"]:
-    """The natural sizes of the components of a raveled state.
-
-    **Arguments:** `rate` by which units of velocities are multiplied, None for those of one unit of time.
-    """
-    velocities = system.velocity_scale()
-    velocities = velocities if rate is None else velocities * rate
+def natural_units(system: AbstractSystem, velocities: Float[Array, " nu"], dtype: Any) -> Float[Array, " n"]:
+    """The natural sizes of the components of a raveled state, with given ones of velocities."""
     units = [system.coordinate_scale(), velocities, *([system.state_scale()] if system.nz else [])]
     return jnp.concatenate(units).astype(dtype)

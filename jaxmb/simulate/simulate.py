@@ -217,15 +217,7 @@ def simulate(
             changed = lambda step: prepare(moved(step), solver, policy, method)[0]
             along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
         own = options | {"y0": start}
-        try:
-            return integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
-        except TypeError as error:
-            if "custom_vjp" not in str(error):
-                raise
-            raise TypeError(
-                "The default adjoint serves reverse mode only: for jvp, jacfwd and linearize call "
-                "simulate(..., adjoint=diffrax.ForwardMode())."
-            ) from None
+        return integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
 
     def probe(solver, steps):
         with warnings.catch_warnings():

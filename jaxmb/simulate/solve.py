@@ -9,12 +9,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._compat import only_in_reverse
 from .._results import RESULTS
 from ..manifold import after_jumps, natural_units, state_blocks
 from ..manifold.diagnosis import diagnose_friction
 from ..solvers import AbstractMultistep, RunningScales, TangentControl, intended_step, with_tangents
 from ..trajectory import Trajectory
 from .outcome import Outcome, has_failed
+
+_FORWARD = (
+    "The default adjoint serves reverse mode only: for jvp, jacfwd and linearize call "
+    "simulate(..., adjoint=diffrax.ForwardMode())."
+)
 
 
 @eqx.filter_jit
@@ -77,7 +83,8 @@ def _solve(term, solver, options, control):
     # A class of diffrax: its loop has a rule for reverse mode only, whose tangents cannot be batched. So that gradients
     # of batches exist, the rule around it is one for reverse mode, too.
     if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _solve_in_reverse((term, solver, options), control)
+        arguments, control = only_in_reverse(((term, solver, options), control), _FORWARD)
+        return _solve_in_reverse(arguments, control)
     return _solve_either_way((term, solver, options), control)
 
 
@@ -126,7 +133,7 @@ def _tangent_control(system, options, direction) -> TangentControl:
     state, span = options["y0"], jnp.abs(options["t1"] - options["t0"])
     velocities = system.velocity_scale()
     rate = jnp.maximum(jnp.max(jnp.abs(state.u) / velocities, initial=0.0), 1 / jnp.where(span > 0, span, 1.0))
-    units = natural_units(system, rate, state.q.dtype)
+    units = natural_units(system, velocities * rate, state.q.dtype)
     sizes = tuple(block.size for block in state_blocks(system, rate))
     return lax.stop_gradient(TangentControl(units, sizes, direction))
 
@@ -136,7 +143,8 @@ def running_scales(system, state, options) -> RunningScales:
     time.
     """
     span = jnp.abs(options["t1"] - options["t0"])
-    units, rate = lax.stop_gradient((natural_units(system, None, state.q.dtype), 1 / jnp.where(span > 0, span, 1.0)))
+    units = natural_units(system, system.velocity_scale(), state.q.dtype)
+    units, rate = lax.stop_gradient((units, 1 / jnp.where(span > 0, span, 1.0)))
     return RunningScales(units, state_blocks(system, rate))
 
 

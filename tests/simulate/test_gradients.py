@@ -5,6 +5,7 @@ kind are there: mass, inertia, body-fixed point, stiffness, a driver's parameter
 """
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,3 +134,15 @@ def test_gradients_in_a_batch():
     values = values_and_gradients(batch, 1e-12)[0]
     central = (8 * (values[1] - values[2]) - (values[3] - values[4])) / 12e-4
     np.testing.assert_allclose(slope[0], central, rtol=1e-6)
+
+
+def test_forward_mode_asks_for_its_adjoint():
+    mechanism = mb.mechanisms.four_bar()
+
+    def end(scale):
+        state = eqx.tree_at(lambda state: state.u, mechanism.state, scale * mechanism.state.u)
+        return mb.simulate(mechanism.system, state, t1=0.01).ys.q[-1]
+
+    for forward in (jax.jacfwd(end), lambda scale: jax.linearize(end, scale)[1](1.0)):
+        with pytest.raises(TypeError, match=r"^The default adjoint serves reverse mode only: for jvp, jacfwd and"):
+            forward(1.0)

@@ -103,9 +103,12 @@ def test_functions_can_have_rules_for_batches(compat):
 
 def test_types_of_numbers(compat):
     assert compat.default_float() == jnp.result_type(float), "jax.dtypes.canonicalize_dtype(float) is no float's type"
-    with jax.enable_x64(False):
+    jax.config.update("jax_enable_x64", False)
+    try:
         assert compat.default_float() == np.float32
         assert compat.canonical(np.float64) == np.float32
+    finally:
+        jax.config.update("jax_enable_x64", True)
 
 
 def test_weak_types(compat):
@@ -146,6 +149,21 @@ def test_bilinear_operations(compat):
         np.testing.assert_allclose(found, through(lambda a, b: value(jnp.outer, a, b))(a, b), rtol=1e-14)
     several = jnp.stack([b, 2 * b])
     np.testing.assert_array_equal(jax.vmap(outer, in_axes=(None, 0))(a, several)[1], jnp.outer(a, 2 * b))
+
+
+def test_derivatives_in_reverse_mode_only(compat):
+    def function(x):
+        return jnp.sum(compat.only_in_reverse({"x": x, "name": "x"}, "Not forward.")["x"] ** 3)
+
+    x = jnp.arange(3.0)
+    for through in (lambda f: f, jax.jit):
+        np.testing.assert_array_equal(through(function)(x), 9.0)
+        np.testing.assert_array_equal(through(jax.grad(function))(x), 3 * x**2)
+        np.testing.assert_array_equal(through(jax.vmap(jax.grad(function)))(jnp.stack([x, 2 * x]))[1], 12 * x**2)
+        np.testing.assert_array_equal(through(jax.jacrev(jax.grad(function)))(x), np.diag(6 * x))
+        for forward in (jax.jacfwd(function), lambda x: jax.jvp(function, (x,), (x,))):
+            with pytest.raises(TypeError, match=r"^Not forward\."):
+                through(forward)(x)
 
 
 # equinox
