@@ -102,7 +102,7 @@ def left_out(
     """
     mechanism = subject(system, state, t1)
     own, start, end = mechanism.system, mechanism.state, mechanism.t1
-    default = default_manifold(own, Adams(), None)
+    without_charts = own.acceleration_rows > 0 and not default_manifold(own, Adams(), None).uses_charts
     events: dict[str, Any] = {"event": diffrax.Event(lambda t, y, args, **kwargs: t - 2 * end)}
     # What is put in, whether the motion does without it, the system that has it, and options of `simulate`.
     possible: list[tuple[str, bool, Callable[..., Any] | None, dict[str, Any]]] = [
@@ -113,12 +113,7 @@ def left_out(
         ("a damper of zero", True, with_damper, {}),
         ("an event", True, None, events),
         ("dense output", True, None, {"saveat": diffrax.SaveAt(t1=True, dense=True)}),
-        (
-            "charts, a dense Jacobian",
-            own.acceleration_rows > 0 and not default.uses_charts,
-            None,
-            {"manifold": Partition()},
-        ),
+        ("charts, a dense Jacobian", without_charts, None, {"manifold": Partition()}),
     ]
     remarks, compiled, programs = [], [], []
     for what, free, change, options in possible:

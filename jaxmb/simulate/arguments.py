@@ -15,13 +15,17 @@ from ..formulations import AbstractFormulation
 from ..linalg.arrays import as_array, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
-from ..solvers import Adams
+from ..solvers import AbstractMultistep, Adams, MultistepController, OneStepController, RunningScales
 from ..system import AbstractSystem
 from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
 
-KINDS: dict[str, tuple[type, str]] = {
+# Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
+_CHECKPOINTS = 4096
+_CHECKPOINT_BYTES = 2**28
+
+_KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
     "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
     "manifold": (AbstractManifold, "jaxmb.manifold.Partition()"),
@@ -30,6 +34,34 @@ KINDS: dict[str, tuple[type, str]] = {
     "event": (diffrax.Event, "diffrax.Event(function)"),
     "progress_meter": (diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
 }
+
+
+def check_steps(max_steps: Any) -> None:
+    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
+
+
+def check_kinds(*given: Any) -> None:
+    """Raise a `ValueError` for an argument of the wrong kind, in the order of `_KINDS`; None is the default."""
+    for (name, (kind, example)), value in zip(_KINDS.items(), given, strict=True):
+        if value is not None:
+            check_kind(name, value, kind, f"an object such as {example}", "leave it out for the default")
+
+
+def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales | None) -> Any:
+    if isinstance(solver, AbstractMultistep):
+        return MultistepController(rtol, atol, scales=scales)
+    return OneStepController.around(diffrax.PIDController(rtol, atol), scales)
+
+
+def with_restarts(controller: Any, restarts: Any) -> Any:
+    return controller if restarts is None else diffrax.ClipStepSizeController(controller, jump_ts=restarts)
+
+
+def default_adjoint(system: AbstractSystem, state: State, max_steps: int) -> diffrax.AbstractAdjoint:
+    size = 16 * state.q.dtype.itemsize * (system.nq + system.nu + system.nz)
+    kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
 
 
 def check_error_estimate(saveat, stepsize_controller, event) -> None:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from .._results import RESULTS
 from ..formulations.friction import coupled_most
@@ -46,8 +47,23 @@ def has_failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
 
 
-def warn_of_jumps(system, q, t0, t1, restarts, announced) -> None:
-    """Warn of jumps of prescribed rates between restarts; `announced` are those that the user gave, or None."""
+def warn_of_stiffness(stats) -> None:
+    if isinstance(stats["stiff"], Tracer) or not stats["stiff"]:
+        return
+    warnings.warn(
+        f"The motion is stiff: in {stats['stiff_steps']} of {stats['num_steps']} steps of Adams' method stability was "
+        "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
+        stacklevel=3,
+    )
+
+
+def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
+    """Warn of jumps of prescribed rates between restarts, unless the motion is traced; `announced` are those that the
+    user gave, or None.
+    """
+    q, t0, t1 = outcome.y.q, times["t0"], times["t1"]
+    if is_traced((system, outcome.y, t0, t1, restarts)):
+        return
     found = find_jumps(system, q, t0, t1, np.zeros(0) if restarts is None else restarts)
     if not found:
         return
@@ -63,6 +79,15 @@ def warn_of_jumps(system, q, t0, t1, restarts, announced) -> None:
         f"simulate(..., jumps=[{every}]) restarts there.",
         stacklevel=3,
     )
+
+
+def message_of_failure(system, result, t1, outcome: Outcome, stats, solver, probe) -> str:
+    """Why a simulation with a solver failed; `probe` as in `is_stiff_at_end`."""
+    if np.any(outcome.coupling):
+        return about_friction(system, outcome.coupling)
+    if result == RESULTS.max_steps_reached and not is_traced((system, outcome, t1)):
+        return about_steps(outcome, t1, stats, is_stiff_at_end(probe, stats, solver))
+    return reason_of_failure(system, result, t1, outcome)
 
 
 def about_steps(outcome: Outcome, t1, stats, stiff) -> str:
@@ -99,7 +124,10 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
         return bool(stats["stiff"])
     if stats["num_steps"] < _ENOUGH:
         return None
-    return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
+    with warnings.catch_warnings():
+        # The motion's own are said already.
+        warnings.simplefilter("ignore")
+        return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
 
 
 def reason_of_failure(system, result, t1, outcome: Outcome) -> str:

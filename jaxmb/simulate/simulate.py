@@ -1,49 +1,45 @@
 """From a system and a state to a motion."""
 
-import warnings
+import functools
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax
 import equinox as eqx
-import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
 from .._arguments import check_kind
-from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
-from ..manifold import AbstractManifold, default_manifold, with_internal_states
+from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
-from ..solvers import AbstractMultistep, Adams, Hermite, MultistepController, OneStepController
-from ..states.consistency import consistent
+from ..solvers import Adams, Hermite
 from ..system import AbstractSystem
 from ..system.inputs import Signals, check_inputs, input_break_times, with_inputs
-from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
-    KINDS,
     check_error_estimate,
+    check_kinds,
+    check_steps,
     checked_jumps,
     checked_saveat,
     checked_state,
     checked_times,
     checked_tolerances,
+    default_adjoint,
+    default_controller,
     named_solver,
     parameter_changes,
     with_end,
+    with_restarts,
 )
-from .outcome import about_friction, about_steps, is_stiff_at_end, reason_of_failure, warn_of_jumps
-from .solve import integrate, running_scales
-
-# Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
-_CHECKPOINTS = 4096
-_CHECKPOINT_BYTES = 2**28
+from .outcome import message_of_failure, warn_of_jumps, warn_of_stiffness
+from .solve import Problem, running_scales
 
 
 @names_arguments
@@ -133,7 +129,7 @@ def simulate(
     states drift; under a trace such a run fails instead, with `RESULTS.assembly_failed`;
     `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
     trajectory up to there is kept, with times and states of infinity after it. Under `jit`, `vmap` or a derivative,
-    where nothing can be kept for some members of a batch only, a motion that fails is not a number as a whole, and so
+    where nothing can be kept for some members of a batch only, a motion that fails is NaN as a whole, and so
     are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
     members are as if it were not there.
 
@@ -149,144 +145,80 @@ def simulate(
     same steps with and without derivatives, and so does `diffrax.diffeqsolve` when it is called directly.
     """
     check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
-    if inputs is not None:
-        system = with_inputs(system, inputs)
+    system = system if inputs is None else with_inputs(system, inputs)
     state = checked_state(system, state)
     # Numbers become arrays, so that other tolerances and times do not compile anew.
     relative, absolute = checked_tolerances(rtol, atol, state)
-    options = checked_times(t0, t1, dt0, state.q.dtype)
-    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
-    choice = solver
-    solver = named_solver(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
-    given = (solver, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
-    for (name, (kind, example)), value in zip(KINDS.items(), given, strict=True):
-        if value is not None:
-            check_kind(name, value, kind, f"an object such as {example}", "leave it out for the default")
+    times = checked_times(t0, t1, dt0, state.q.dtype)
+    check_steps(max_steps)
+    method = named_solver(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
+    check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     if error:
         check_error_estimate(saveat, stepsize_controller, event)
-    if stepsize_controller is None:
-        scales = running_scales(system, state, options) if atol is None else None
-        if isinstance(solver, AbstractMultistep):
-            stepsize_controller = MultistepController(relative, absolute, scales=scales)
-        else:
-            stepsize_controller = OneStepController.around(diffrax.PIDController(relative, absolute), scales)
-    check_inputs(system, options["t0"], options["t1"])
+    check_inputs(system, times["t0"], times["t1"])
     restarts = checked_jumps(jumps, input_break_times(system))
-    if restarts is not None:
-        adaptive: Any = stepsize_controller
-        stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=restarts)
-    if adjoint is None:
-        size = 16 * state.q.dtype.itemsize * (system.nq + system.nu + system.nz)
-        kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-    saved = checked_saveat(saveat, options["t0"], options["t1"])
-    interpolated = event is not None or (saved.subs is not None and saved.subs.ts is not None)
-    options |= {
+    saved = checked_saveat(saveat, times["t0"], times["t1"])
+    if stepsize_controller is None:
+        scales = running_scales(system, state, times) if atol is None else None
+        stepsize_controller = default_controller(method, relative, absolute, scales)
+    options = times | {
         "y0": state,
         "saveat": with_end(saved),
-        "stepsize_controller": stepsize_controller,
-        "adjoint": adjoint,
+        "stepsize_controller": with_restarts(stepsize_controller, restarts),
+        "adjoint": default_adjoint(system, state, max_steps) if adjoint is None else adjoint,
         "event": event,
         "max_steps": max_steps,
         "progress_meter": diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
     }
+    problem = Problem(
+        system=system,
+        formulation=formulation,
+        manifold=manifold,
+        rtol=relative,
+        options=options,
+        restarts=restarts,
+        interpolated=event is not None or (saved.subs is not None and saved.subs.ts is not None),
+        changes={} if direction is None else parameter_changes(system, direction),
+    )
 
-    changes = {} if direction is None else parameter_changes(system, direction)
-    valid = system.parameters_in_range()
-
-    def prepare(system, solver, policy, method):
-        term, prepared = policy.prepare(system, method, solver, relative)
-        return with_internal_states(term), prepared
-
-    def motion(solver):
-        policy = default_manifold(system, solver, formulation) if manifold is None else manifold
-        jumping = restarts is not None and system.velocity_rows > 0
-        if jumping and not (policy.takes_impulses and system.positive_definite_mass):
-            raise ValueError(
-                "With jumps, or inputs that jump, a constrained system needs manifold=Partition() or Projection(), and "
-                f"a mass matrix that has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
-                f"{system.positive_definite_mass}."
-            )
-        method = policy.default_formulation(system) if formulation is None else formulation
-        term, prepared = prepare(system, solver, policy, method)
-        start = consistent(system, options["t0"], state) if policy.restores else state
-        along = None
-        if direction is not None:
-            moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in changes.items()})
-            changed = lambda step: prepare(moved(step), solver, policy, method)[0]
-            along = eqx.filter_jvp(changed, (0.0,), (1.0,))[1]
-        own = options | {"y0": start}
-        return integrate(system, method, policy, term, prepared, own, interpolated, along, valid)
-
-    def probe(solver, steps):
-        with warnings.catch_warnings():
-            # This motion's own are said already.
-            warnings.simplefilter("ignore")
-            return simulate(
-                *lax.stop_gradient((system, outcome.y)),
-                t0=outcome.t,
-                t1=t1,
-                solver=solver,
-                formulation=formulation,
-                manifold=manifold,
-                rtol=relative,
-                atol=None if atol is None else absolute,
-                jumps=jumps,
-                max_steps=steps,
-                throw=False,
-            )
-
-    used = solver
-    trajectory, outcome = motion(solver)
-    if choice == "switch" and trajectory.stats["stiff"]:
+    used = method
+    trajectory, outcome = problem.solved(used)
+    if solver == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
         used = Hermite()
-        trajectory, outcome = motion(used)
+        trajectory, outcome = problem.solved(used)
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
-    if choice == "auto" and not isinstance(trajectory.stats["stiff"], Tracer) and trajectory.stats["stiff"]:
-        warnings.warn(
-            f"The motion is stiff: in {trajectory.stats['stiff_steps']} of {trajectory.stats['num_steps']} steps of "
-            "Adams' method stability was the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
-            stacklevel=2,
-        )
-    prescribed = system.acceleration_rows > 0 and not system.drift_free
-    if prescribed and not is_traced((system, outcome.y, options["t0"], options["t1"], restarts)):
-        warn_of_jumps(system, outcome.y.q, options["t0"], options["t1"], restarts, jumps)
-    failed = outcome.failed
-    if throw and not isinstance(failed, Tracer) and failed:
+    if solver == "auto":
+        warn_of_stiffness(trajectory.stats)
+    if system.acceleration_rows > 0 and not system.drift_free:
+        warn_of_jumps(system, outcome, times, restarts, jumps)
+
+    # Other runs of the same motion.
+    again = functools.partial(simulate, t1=t1, formulation=formulation, manifold=manifold, jumps=jumps, throw=False)
+    if throw and not isinstance(outcome.failed, Tracer) and outcome.failed:
         outcome, stats = lax.stop_gradient((outcome, trajectory.stats))
-        if np.any(outcome.coupling):
-            reason = about_friction(system, outcome.coupling)
-        elif trajectory.result == RESULTS.max_steps_reached and not is_traced((system, outcome, options["t1"], rtol)):
-            reason = about_steps(outcome, options["t1"], stats, is_stiff_at_end(probe, stats, used))
-        else:
-            reason = reason_of_failure(system, trajectory.result, options["t1"], outcome)
-        raise RuntimeError(reason)
-    if is_traced((failed, trajectory.ys)):
+        on = functools.partial(again, lax.stop_gradient(system), outcome.y, t0=outcome.t, rtol=relative)
+        probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=None if atol is None else absolute)
+        raise RuntimeError(message_of_failure(system, trajectory.result, times["t1"], outcome, stats, used, probe))
+    if is_traced((outcome.failed, trajectory.ys)):
         # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.
         motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
-        spoiled = nan_where(failed, motion_of(trajectory), (system, state, options, formulation, manifold))
+        spoiled = nan_where(outcome.failed, motion_of(trajectory), (system, state, options, formulation, manifold))
         trajectory = eqx.tree_at(motion_of, trajectory, spoiled, is_leaf=lambda leaf: leaf is None)
         if throw:
-            trajectory = trajectory.result.error_if(trajectory, failed)
+            trajectory = trajectory.result.error_if(trajectory, outcome.failed)
     if error:
-        closer = simulate(
+        closer = again(
             *lax.stop_gradient((system, state)),
             t0=t0,
-            t1=t1,
             dt0=dt0,
             saveat=saveat,
             solver=used,
             rtol=relative / 10,
             atol=None if atol is None else absolute / 10,
-            formulation=formulation,
-            manifold=manifold,
             adjoint=adjoint,
-            jumps=jumps,
             max_steps=max_steps,
-            throw=False,
         )
         trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)
     return trajectory.trimmed()

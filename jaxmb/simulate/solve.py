@@ -1,7 +1,7 @@
 """The integration of a motion as one compiled program, whose mesh resolves derivatives where they are taken."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,9 +11,20 @@ from jax import lax
 
 from .._compat import only_in_reverse
 from .._results import RESULTS
-from ..manifold import after_jumps, natural_units, state_blocks
+from ..formulations import AbstractFormulation
+from ..manifold import (
+    AbstractManifold,
+    after_jumps,
+    default_manifold,
+    natural_units,
+    state_blocks,
+    with_internal_states,
+)
 from ..manifold.diagnosis import diagnose_friction
 from ..solvers import AbstractMultistep, RunningScales, TangentControl, intended_step, with_tangents
+from ..states.consistency import consistent
+from ..system import AbstractSystem
+from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .outcome import Outcome, has_failed
 
@@ -21,6 +32,51 @@ _FORWARD = (
     "The default adjoint serves reverse mode only: for jvp, jacfwd and linearize call "
     "simulate(..., adjoint=diffrax.ForwardMode())."
 )
+
+
+class Problem(NamedTuple):
+    """A motion to be computed, with checked arguments.
+
+    **Fields:** the `system`; `formulation` and `manifold`, None for those that suit the solver; `rtol`; `options` of
+    `diffrax.diffeqsolve`; times of `restarts`, or None; whether states are `interpolated`; `changes`: values of
+    parameters with changes whose tangent is watched, by name.
+    """
+
+    system: AbstractSystem
+    formulation: AbstractFormulation | None
+    manifold: AbstractManifold | None
+    rtol: Any
+    options: dict[str, Any]
+    restarts: Any
+    interpolated: bool
+    changes: dict[str, tuple[Any, Any]]
+
+    def solved(self, solver: diffrax.AbstractSolver) -> tuple[Trajectory, Outcome]:
+        """The motion by a solver, and how it ended."""
+        system, state = self.system, self.options["y0"]
+        valid = system.parameters_in_range()
+        policy = default_manifold(system, solver, self.formulation) if self.manifold is None else self.manifold
+        jumping = self.restarts is not None and system.velocity_rows > 0
+        if jumping and not (policy.takes_impulses and system.positive_definite_mass):
+            raise ValueError(
+                "With jumps, or inputs that jump, a constrained system needs manifold=Partition() or Projection(), and "
+                f"a mass matrix that has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
+                f"{system.positive_definite_mass}."
+            )
+        method = policy.default_formulation(system) if self.formulation is None else self.formulation
+
+        def assembled(system):
+            term, prepared = policy.prepare(system, method, solver, self.rtol)
+            return with_internal_states(term), prepared
+
+        term, prepared = assembled(system)
+        start = consistent(system, self.options["t0"], state) if policy.restores else state
+        along = None
+        if self.changes:
+            moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in self.changes.items()})
+            along = eqx.filter_jvp(lambda step: assembled(moved(step))[0], (0.0,), (1.0,))[1]
+        options = self.options | {"y0": start}
+        return integrate(system, method, policy, term, prepared, options, self.interpolated, along, valid)
 
 
 @eqx.filter_jit
