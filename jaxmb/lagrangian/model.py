@@ -145,10 +145,6 @@ class AbstractLagrangian(AbstractSystem):
         return self._join(c.value(t, q, q, q, self.parameters_at(t)) for c in self.constraints if c.level == 0)
 
     @eqx.filter_jit
-    def coordinate_jacobian(self, t, q):
-        return jax.jacfwd(self.position_residual, 1)(t, q)
-
-    @eqx.filter_jit
     def velocity_residual(self, t, q, u):
         t = jnp.asarray(t, q.dtype)
         v = self.rates(t, q, u)
@@ -165,16 +161,6 @@ class AbstractLagrangian(AbstractSystem):
         _, a = jax.jvp(self.rates, (t, q, u), (one, v, udot))
         others = [c.value(t, q, v, a, self.parameters_at(t)) for c in self.constraints if c.level == 2]
         return self._join([rate, *others])
-
-    @eqx.filter_jit
-    def jacobian(self, t, q, u):
-        # Linear in accelerations, so that its derivative is the same anywhere.
-        return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
-
-    @eqx.filter_jit
-    def constraint_force(self, t, q, u, multipliers):
-        _, pull = jax.vjp(lambda udot: self.acceleration_residual(t, q, u, udot), jnp.zeros_like(u))
-        return pull(multipliers)[0]
 
     @eqx.filter_jit
     def nonideal_force(self, t, q, u, multipliers):

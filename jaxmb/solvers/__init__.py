@@ -12,6 +12,7 @@ from .evaluation import (
     Evaluation as Evaluation,
     evaluate as evaluate,
     next_chart as next_chart,
+    project_near as project_near,
     ravel as ravel,
     unravel_like as unravel_like,
 )

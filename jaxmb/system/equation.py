@@ -14,6 +14,7 @@ import abc
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -43,8 +44,9 @@ class AbstractEquation(eqx.Module):
     """The equation of a constrained mechanical system, as formulations, manifolds and the search for states see it; a
     pytree with every number a leaf and every choice static.
 
-    A class gives `nq`, `nu`, `length`, `inertia`, `force` and the scales. Everything else has the values of a system
-    without constraints, without internal states, and with velocities that are the rates of its coordinates.
+    A class gives `nq`, `nu`, `length`, `inertia`, `force` and the scales, and with constraints the residuals of their
+    positions, velocities and accelerations, whose derivatives are found automatically. Everything else has the values
+    of a system without constraints, without internal states, and with velocities that are the rates of its coordinates.
 
     Ranks are found once, on concrete numbers, and are static, so that index sets have static shapes.
 
@@ -172,10 +174,10 @@ class AbstractEquation(eqx.Module):
         """`Φ(t, q)` and the coordinates' own invariants."""
         return self.position_residual(t, q)
 
+    @eqx.filter_jit
     def coordinate_jacobian(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "coordinate_rows nq"]:
         """Derivative of `coordinate_residual` with respect to q."""
-        del t
-        return jnp.zeros((0, self.nq), q.dtype)
+        return jax.jacfwd(self.coordinate_residual, 1)(t, q)
 
     def velocity_residual(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
@@ -191,10 +193,11 @@ class AbstractEquation(eqx.Module):
         del t, u, udot
         return jnp.zeros(0, q.dtype)
 
+    @eqx.filter_jit
     def jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "acceleration_rows nu"]:
         """`A`."""
-        del t, u
-        return jnp.zeros((0, self.nu), q.dtype)
+        # Residuals are linear in accelerations, so that their derivative is the same anywhere.
+        return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
 
     def velocity_jacobian(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
@@ -206,12 +209,13 @@ class AbstractEquation(eqx.Module):
         """`A` in blocks where the system has an order of `elimination`, else as a dense matrix without a factor."""
         return DenseJacobian(self.jacobian(t, q, u))
 
+    @eqx.filter_jit
     def constraint_force(
         self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
         """`Aᵀ λ`, without the matrix."""
-        del t, q, multipliers
-        return jnp.zeros_like(u)
+        _, pull = jax.vjp(lambda udot: self.acceleration_residual(t, q, u, udot), jnp.zeros_like(u))
+        return pull(multipliers)[0]
 
     def held_velocities(self, held: Bool[np.ndarray, "nq"]) -> Bool[np.ndarray, "nu"] | None:
         """The velocities along which held coordinates do not move; None where some of a rotation is held but not all

@@ -3,7 +3,7 @@ bodies, each in a few lines against the public classes, simulated and compared w
 """
 
 import inspect
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import jax
@@ -14,7 +14,7 @@ import scipy.linalg
 from jax.scipy.linalg import solve_triangular
 
 import jaxmb as mb
-from jaxmb import mechanisms, parts, planar
+from jaxmb import mechanisms, parts, planar, solvers
 from jaxmb.formulations import AbstractFormulation, Multipliers, accelerations
 from jaxmb.system import AbstractSystem, DiagonalInertia, Ranks
 
@@ -83,6 +83,90 @@ class Kutta(diffrax.AbstractSolver):
         return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
+class TwoStepState(solvers.AbstractMultistepState):
+    """The last two times and derivatives."""
+
+    ts: jax.Array
+    rates: jax.Array
+    chart: Any
+    sizes: Any
+    tangents: Any
+
+    @property
+    def memory(self):
+        return self.rates
+
+
+class TwoStepAttempt(solvers.AbstractAttempt):
+    predicted: jax.Array
+    after: jax.Array
+    rates: jax.Array
+    failed: jax.Array
+    chart: Any
+
+    @property
+    def memory(self):
+        return self.rates
+
+
+class TwoStep(solvers.AbstractMultistep):
+    """The Adams–Bashforth method of two steps with the trapezoidal rule as corrector, of order two, on any term."""
+
+    tolerances: solvers.Tolerances = solvers.tolerances_of("TwoStep")
+    tangent_control: Any = None
+    solves_implicitly: ClassVar[bool] = False
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 2
+
+    def statistics(self, solver_state, controller_state, stats):
+        return {"num_evaluations": 1 + 2 * stats["num_steps"]}
+
+    def initial_state(self, terms, t0, t1, y0, args, chart, before):
+        first = solvers.evaluate(terms, t0, solvers.ravel(y0), y0, chart, args)
+        numbers = lambda terms, flat: (flat, jnp.stack([solvers.evaluate(terms, t0, flat, y0, chart, args).f] * 2))
+        sizes = self.first_sizes(solvers.ravel(y0), first.f, before)
+        tangents = self.first_tangents(numbers, terms, solvers.ravel(y0), before)
+        # As if the derivative had been the same one step ago.
+        ts, rates = jnp.stack([t0, 2 * t0 - t1]), jnp.stack([first.f, first.f])
+        return TwoStepState(ts, rates, first.chart, sizes, tangents)
+
+    def attempt(self, terms, t1, before, like, args, state):
+        h, ratio = t1 - state.ts[0], (t1 - state.ts[0]) / (2 * (state.ts[0] - state.ts[1]))
+        predicted = before + h * ((1 + ratio) * state.rates[0] - ratio * state.rates[1])
+        first = solvers.evaluate(terms, t1, predicted, like, state.chart, args)
+        corrected = before + h / 2 * (state.rates[0] + first.f)
+        second = solvers.project_near(terms, t1, corrected, like, first, args)
+        rates = jnp.stack([second.f, state.rates[0]])
+        return TwoStepAttempt(predicted, second.y, rates, first.failed | second.failed, second.chart)
+
+    def advance(self, terms, t1, y0, args, state):
+        before = solvers.ravel(y0)
+        step, along = self.attempted(terms, t1, before, y0, args, state)
+        tangents, scales = self.tangents_after(state.tangents, along)
+        errors = [((step.after - step.predicted) / 6, self.tolerances.of_step(before, step.after, state.sizes))]
+        errors += [((end.after - end.predicted) / 6, own) for end, own in zip(along, scales, strict=True)]
+        size = jnp.max(jnp.stack([self.weighted_norm(error, scale, y0) for error, scale in errors]))
+        size = jnp.where(step.failed, jnp.inf, size)
+        never, powers = jnp.array(False), jnp.full(3, 3.0)
+        _, estimate = solvers.choose_order(
+            jnp.stack([jnp.inf, size, jnp.inf]),
+            powers,
+            jnp.ones(()),
+            may_fall=never,
+            may_rise=never,
+            known=~never,
+            target=0.5,
+            work=jnp.array([2, 0]),
+        )
+        y1 = solvers.unravel_like(y0, step.after)
+        chart, sizes = solvers.next_chart(terms, t1, y1, step.chart, args), self.grown_sizes(state.sizes, step.after)
+        new = TwoStepState(jnp.stack([t1, state.ts[0]]), step.rates, chart, sizes, tangents)
+        return y1, estimate, {"y0": y0, "y1": y1}, new, step.failed
+
+
 class LeastConstraint(AbstractFormulation):
     """Gauss's principle in the norm of the mass matrix, M = L Lᵀ: the constraint force along the columns of L⁻¹ Aᵀ."""
 
@@ -141,20 +225,11 @@ class SphericalPendulum(AbstractSystem):
     def position_residual(self, t, q):
         return (jnp.dot(q, q) - self.length**2)[None] / (2 * self.length)
 
-    def coordinate_jacobian(self, t, q):
-        return q[None] / self.length
-
     def velocity_residual(self, t, q, u):
         return jnp.dot(q, u)[None] / self.length
 
     def acceleration_residual(self, t, q, u, udot):
         return (jnp.dot(q, udot) + jnp.dot(u, u))[None] / self.length
-
-    def jacobian(self, t, q, u):
-        return q[None] / self.length
-
-    def constraint_force(self, t, q, u, multipliers):
-        return q * multipliers[0] / self.length
 
 
 @pytest.mark.parametrize("cls, most", [(Rolling, 30), (SphericalPendulum, 40)])
@@ -211,6 +286,28 @@ def test_a_one_step_solver():
     assert 1e-7 < coarse < 1e-3
     assert 7.0 < coarse / fine < 9.0
     np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
+
+
+def test_a_multistep_solver():
+    """Errors in proportion to the tolerance, on a pendulum that is constrained and on a plain field; a derivative."""
+    pendulum = mechanisms.get("pendulum")
+    run = lambda **options: mb.simulate(pendulum.system, pendulum.state, t1=0.5, max_steps=2**16, **options)
+    exact = run(rtol=1e-12).ys.q[-1]
+    errors = []
+    for rtol in (1e-4, 1e-6):
+        motion = run(solver=TwoStep(), rtol=rtol)
+        assert motion.stats["num_evaluations"] == 1 + 2 * motion.stats["num_steps"]
+        assert np.max(motion.constraint_violation.position) <= 1e-9
+        errors.append(np.max(np.abs(motion.ys.q[-1] - exact)))
+    assert 1e-8 < errors[1] < 1e-4 and 20 < errors[0] / errors[1] < 500
+    controller = solvers.MultistepController(rtol=1e-6, atol=1e-8)
+    term = diffrax.ODETerm(lambda t, y, args: args * y)
+    end = lambda rate: diffrax.diffeqsolve(
+        term, TwoStep(), 0.0, 1.0, None, jnp.ones(2), rate, stepsize_controller=controller, max_steps=2**14
+    ).ys[-1]
+    value, slope = jax.jit(lambda rate: (end(rate), jax.jacrev(end)(rate)))(-2.0)
+    np.testing.assert_allclose(value, np.exp(-2.0), rtol=1e-4)
+    np.testing.assert_allclose(slope, np.exp(-2.0), rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["four_bar", "parallelogram"])
