@@ -113,7 +113,7 @@ def meet_constraints(
         shift = _SHIFT * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
         step = -scale * (scaled.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), before))
         longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
-        best, size = _shortened(residual, lambda step: q + step, q, step, longest)
+        best, size, _ = _shortened(residual, lambda step: q + step, q, step, longest)
         return (best, jacobian), size
 
     def far(at, size):
@@ -142,7 +142,8 @@ def meet_in_blocks(
         multipliers = factor.refined(jacobian.gather_rows(position_rows(system, t, q)))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         longest = jnp.max(jnp.abs(step) / scale)
-        return _shortened(residual, lambda step: displaced(system, t, q, step), q, step, longest)
+        best, size, better = _shortened(residual, lambda step: displaced(system, t, q, step), q, step, longest)
+        return jnp.where(better, best, q), size
 
     small = float(jnp.finfo(start.dtype).eps) ** 0.75
     far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
@@ -150,7 +151,9 @@ def meet_in_blocks(
 
 
 def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], q, step, longest):
-    """The best configuration along a Gauss–Newton step, and the size of the step, zero where nothing is gained."""
+    """The best configuration along a Gauss–Newton step, the size of the step, zero where next to nothing is gained, and
+    whether anything is.
+    """
     before = jnp.sum(residual(q) ** 2)
     # Rotations by more than about a radian leave the region where the linearisation is valid.
     step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
@@ -160,7 +163,7 @@ def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Arra
     best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
     # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
     size = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
-    return jnp.where(sizes[best] < before, reached[best], q), size
+    return reached[best], size, sizes[best] < before
 
 
 # Closest states
