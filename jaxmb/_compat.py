@@ -1,7 +1,7 @@
 """Names and habits of JAX, equinox, diffrax and the standard library that their documentation does not promise.
 
-Each stands here once, with what it does and the versions that it was found in; `tests/test_compat.py` has a test of
-each, which says what is missing when an update takes it away.
+Each stands here once, with what it does and the versions that it was found in; `tests/package/test_compat.py` has a
+test of each, which says what is missing when an update takes it away.
 """
 
 import functools

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from precision import single_precision
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -236,7 +237,7 @@ def test_nothing_to_solve_implicitly():
 def test_single_precision_warns(pendulum):
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, pendulum)
     for whose, options in (("^rtol=1e-10", {"rtol": 1e-10}), ("^The default rtol=1e-08", {})):
-        with jax.enable_x64(False), pytest.warns(UserWarning, match=rf"{whose} .*single precision.*jax_enable_x64"):
+        with single_precision(), pytest.warns(UserWarning, match=rf"{whose} .*single precision.*jax_enable_x64"):
             state = mb.State(jnp.array([0.5, 0.0, 0.0]), jnp.zeros(3))
             sol = mb.simulate(single, state, t1=0.1, **options)
         assert sol.ys.q.dtype == jnp.float32 and np.all(np.isfinite(sol.ys.q))

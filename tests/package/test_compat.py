@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from precision import single_precision
 
-ROOT = Path(__file__).parent.parent / "jaxmb"
+ROOT = Path(__file__).parents[2] / "jaxmb"
 COMPAT = ROOT / "_compat.py"
 # Modules and attributes that only `_compat` may use.
 PRIVATE_MODULES = ("equinox.internal", "jax.extend", "jax.interpreters", "jax._src", "jax.custom_batching")
@@ -103,12 +104,9 @@ def test_functions_can_have_rules_for_batches(compat):
 
 def test_types_of_numbers(compat):
     assert compat.default_float() == jnp.result_type(float), "jax.dtypes.canonicalize_dtype(float) is no float's type"
-    jax.config.update("jax_enable_x64", False)
-    try:
+    with single_precision():
         assert compat.default_float() == np.float32
         assert compat.canonical(np.float64) == np.float32
-    finally:
-        jax.config.update("jax_enable_x64", True)
 
 
 def test_weak_types(compat):
