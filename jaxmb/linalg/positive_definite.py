@@ -37,7 +37,7 @@ class AbstractPositiveFactor(eqx.Module):
     """
 
     matrix: AbstractVar[Any]
-    shift: AbstractVar[Any]
+    shift: AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
     def substitute(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -73,8 +73,9 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
 
     def eliminate(self, share=None):
         matrix = lax.stop_gradient(self.matrix)
-        shift = 0.0 if share is None else share * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
+        shift = jnp.zeros((), matrix.dtype)
         if share is not None:
+            shift = share * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
             matrix = matrix + shift * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
         inverse = 1 / matrix if matrix.shape[0] == 1 else gauss_jordan(matrix, matrix.shape[0])
         return DensePositiveFactor(self, shift, inverse)
@@ -84,7 +85,7 @@ class DensePositiveFactor(AbstractPositiveFactor):
     """The inverse of a full matrix, shape (n, n)."""
 
     matrix: DensePositiveDefinite
-    shift: Any
+    shift: Float[Array, ""]
     inverse: Float[Array, "n n"]
 
     def substitute(self, b):
