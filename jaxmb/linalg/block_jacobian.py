@@ -200,7 +200,7 @@ class BlockGram(AbstractPositiveDefinite):
             across = jnp.where(hub_is_row[:, None, None], across.swapaxes(1, 2), across)
             stored = stored.at[order.hub_places].set(across, unique_indices=True, mode="promise_in_bounds")
         stored = stored + jnp.asarray(_identities(order, size), blocks.dtype)
-        shift = jnp.zeros((), blocks.dtype)
+        shift = None
         if share is not None:
             own = stored[:joints]
             largest = jnp.max(jnp.diagonal(own, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
@@ -215,7 +215,7 @@ class BlockGramFactor(AbstractPositiveFactor):
     """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
 
     matrix: BlockGram
-    shift: Float[Array, ""]
+    shift: Any
     factor: BlockFactor
     diagonal: Float[Array, "nodes b"]
 

@@ -33,11 +33,11 @@ class AbstractPositiveDefinite(eqx.Module):
 class AbstractPositiveFactor(eqx.Module):
     """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination carry none.
 
-    **Fields:** `matrix`; `shift`: what was added to its diagonal before it was eliminated.
+    **Fields:** `matrix`; `shift`: what was added to its diagonal before it was eliminated, None for nothing.
     """
 
     matrix: AbstractVar[Any]
-    shift: AbstractVar[Float[Array, ""]]
+    shift: AbstractVar[Any]
 
     @abc.abstractmethod
     def substitute(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -52,7 +52,8 @@ class AbstractPositiveFactor(eqx.Module):
     def refined(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`(T + shift)⁻¹ b`, substituted and refined once: pivots of implied rows are small, and amplify roundings."""
         x = self.substitute(b)
-        return x + self.substitute(b - self.matrix.product(x) - self.shift * x)
+        rest = b - self.matrix.product(x)
+        return x + self.substitute(rest if self.shift is None else rest - self.shift * x)
 
     def solve(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`T⁻¹ b`, differentiated implicitly, by the equation `T x = b`."""
@@ -73,7 +74,7 @@ class DensePositiveDefinite(AbstractPositiveDefinite):
 
     def eliminate(self, share=None):
         matrix = lax.stop_gradient(self.matrix)
-        shift = jnp.zeros((), matrix.dtype)
+        shift = None
         if share is not None:
             shift = share * jnp.max(jnp.diag(matrix)) + jnp.finfo(matrix.dtype).tiny
             matrix = matrix + shift * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
@@ -85,7 +86,7 @@ class DensePositiveFactor(AbstractPositiveFactor):
     """The inverse of a full matrix, shape (n, n)."""
 
     matrix: DensePositiveDefinite
-    shift: Float[Array, ""]
+    shift: Any
     inverse: Float[Array, "n n"]
 
     def substitute(self, b):
