@@ -215,7 +215,7 @@ class BlockGramFactor(AbstractPositiveFactor):
     """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
 
     matrix: BlockGram
-    shift: Float[Array, ""]
+    shift: Any
     factor: BlockFactor
     diagonal: Float[Array, "nodes b"]
 

@@ -37,7 +37,7 @@ class AbstractPositiveFactor(eqx.Module):
     """
 
     matrix: AbstractVar[Any]
-    shift: AbstractVar[Float[Array, ""]]
+    shift: AbstractVar[Any]
 
     @abc.abstractmethod
     def substitute(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -85,7 +85,7 @@ class DensePositiveFactor(AbstractPositiveFactor):
     """The inverse of a full matrix, shape (n, n)."""
 
     matrix: DensePositiveDefinite
-    shift: Float[Array, ""]
+    shift: Any
     inverse: Float[Array, "n n"]
 
     def substitute(self, b):
