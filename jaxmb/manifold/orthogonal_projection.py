@@ -104,8 +104,10 @@ class ProjectorConstraints(AbstractConstraints):
     def push_positions(self, at, along):
         system, t, q = at
         still = jnp.zeros(system.nu, q.dtype)
-        step = self.cancel_velocities(push(position_rows, at, along))
-        return push(lambda q, step: displaced(system, t, q, step), (q, still), (along[2], step))
+        # Constraints hold for normalised coordinates.
+        dq = push(lambda system, q: system.normalize(q), (system, q), (along[0], along[2]))
+        step = self.cancel_velocities(push(position_rows, at, (*along[:2], dq)))
+        return push(lambda q, step: displaced(system, t, q, step), (q, still), (dq, step))
 
     def cancel_velocities(self, residual):
         return self.projector.displacement(-residual)
@@ -256,8 +258,9 @@ def project_in_metric(
         found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
         own = projector_at(found)
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
-    # matrices.
-    q = y.q + (found - before.q)
+    # matrices. What coordinates are normalised by has no part in it: constraints hold for normalised ones.
+    start = system.normalize(y.q)
+    q = found + (start - lax.stop_gradient(start))
     q = displaced(system, t, q, own.displacement(-position_rows(system, t, q)))
     here = binding_velocities(system, t, q, y.u).projector(metric_of(system, t, State(q, y.u)), own.factor)
     u = y.u + here.displacement(-velocity_rows(system, t, q, y.u))

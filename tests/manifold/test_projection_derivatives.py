@@ -1,0 +1,46 @@
+"""Derivatives of projections in the metric of the mass matrix, with respect to every coordinate."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxmb as mb
+from jaxmb import spatial
+from jaxmb.formulations import Multipliers
+from jaxmb.manifold.projection import ProjectionTerm
+
+J = np.diag([0.01, 0.018, 0.014])
+
+
+def links(inertial):
+    """Two links on hinges that are not parallel, and drives with inertia on each, or none."""
+    axes = (0.0, 0.96, 0.28), (0.0, 0.96, -0.28)
+    bodies = [spatial.Body(f"link{k}", mass=1.0, inertia=J, position=(0.4 * k + 0.2, 0.0, 0.0)) for k in range(2)]
+    joints = [
+        spatial.Revolute("hinge0", "ground", "link0", point=(0.0, 0.0, 0.0), axis=axes[0]),
+        spatial.Revolute("hinge1", "link0", "link1", point=(0.4, 0.0, 0.0), axis=axes[1]),
+    ]
+    if inertial:
+        joints += [mb.JointInertia(f"drive{k}", f"hinge{k}.angle", inertia=0.1 * (k + 1)) for k in range(2)]
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_the_field_changes_as_its_differences_say_in_every_direction(inertial):
+    """Also with the norm of a quaternion, which the constraints say nothing of."""
+    system = links(inertial)
+    start = mb.assemble(system, rates={"hinge0.angle": 0.5, "hinge1.angle": -0.8})
+    term = ProjectionTerm(system, Multipliers(), jnp.array(1e-10))
+    y, state_of = ravel_pytree(start)
+
+    @jax.jit
+    def at(y):
+        out = term.project_cold(jnp.zeros(()), state_of(y), jnp.array(0), None)
+        return jnp.stack([ravel_pytree(own)[0] for own in (out.y, out.f)])
+
+    exact, step = jax.jit(jax.jacfwd(at))(y), 1e-5
+    for k, unit in enumerate(np.eye(y.size)):
+        change = (at(y + step * unit) - at(y - step * unit)) / (2 * step)
+        np.testing.assert_allclose(exact[:, :, k], change, rtol=0, atol=1e-6 * np.max(np.abs(exact)))
