@@ -18,6 +18,7 @@ import numpy as np
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax.core import ShapedArray
+from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -95,19 +96,24 @@ def only_in_reverse(tree: T, message: str) -> T:
     Where one is evaluated in forward mode, a `TypeError` with a message is raised: when the program is lowered, or at
     once outside of `jit`. (A linear operation that has a transpose and no value, as jax.custom_vjp has one itself.)
     """
-    # Each array on its own, so that those without a derivative have none after it.
-    return jax.tree.map(lambda x: _only_in_reverse(message, x) if eqx.is_inexact_array(x) else x, tree)
+    moved, still = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(moved)
+    return eqx.combine(jax.tree.unflatten(structure, _only_in_reverse(message, *leaves)), still)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _only_in_reverse(message, x):
+def _only_in_reverse(message, *leaves):
     del message
-    return x
+    return leaves
 
 
-@_only_in_reverse.defjvp
 def _only_in_reverse_jvp(message, primals, tangents):
-    return _only_in_reverse(message, *primals), _transposed_only.bind(*tangents, message=message)
+    # Arrays without a derivative have none after it.
+    push = lambda x: x if isinstance(x, SymbolicZero) else _transposed_only.bind(x, message=message)
+    return _only_in_reverse(message, *primals), tuple(map(push, tangents))
+
+
+_only_in_reverse.defjvp(_only_in_reverse_jvp, symbolic_zeros=True)
 
 
 def _not_forward(*args, message, **kwargs):
