@@ -34,9 +34,6 @@ class Unanalysed(AbstractLagrangian):
     drift_free: ClassVar[bool] = False
     ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
 
-    def with_signals(self, signals):
-        raise NotImplementedError
-
 
 def constraint_sizes(
     lagrangian: Callable[..., Array],
