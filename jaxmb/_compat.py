@@ -15,6 +15,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
+from diffrax._integrate import SaveState, loop
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax.core import ShapedArray
@@ -22,7 +23,11 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.interpreters.ad import Zero
 from jaxtyping import Array
+
+# The makers of new operations of JAX. (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.)
+__all__ = ["Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir"]
 
 T = TypeVar("T")
 
@@ -143,6 +148,15 @@ def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: 
     """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, and used only by those that do."""
     new = lax.cond(any_of_batch(pred), true_fn, false_fn, operand)
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))
+
+
+# A loop whose buffers are written in place, also in batches. (equinox.internal.while_loop and buffer_at_set, 0.13.)
+while_loop = eqxi.while_loop
+
+
+def buffer_set(buffer: Any, index: Any, x: Array, pred: Any = True) -> Any:
+    """The same with an entry, which is written once; where `pred` is false, the same."""
+    return eqxi.buffer_at_set(buffer, index, x, pred=pred)
 
 
 def is_enumerated(x: Any) -> bool:
@@ -267,6 +281,20 @@ def with_loops(solver: Any, kind: Any) -> Any:
     if kind is None or not hasattr(solver, "scan_kind"):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+# The loop of `diffeqsolve`, with everything before and after its steps. (diffrax._integrate.loop, 0.7.)
+loop_of_diffrax = loop
+
+
+def save_states(state: Any) -> list[Any]:
+    """What a state of diffrax's loop holds of each series of saved states: `ts`, `ys` and counts.
+
+    (diffrax._integrate.SaveState, 0.7; the loop's state has the fields `y`, `tprev`, `tnext`, `made_jump`,
+    `solver_state`, `num_accepted_steps`, `dense_infos` and `event_dense_info`.)
+    """
+    is_one = lambda x: isinstance(x, SaveState)
+    return [x for x in jax.tree.leaves(state.save_state, is_leaf=is_one) if is_one(x)]
 
 
 def steps_of(interpolation: diffrax.DenseInterpolation) -> tuple[Array, Array]:

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._compat import only_in_reverse
 from .._results import RESULTS
 from ..formulations import AbstractFormulation
 from ..manifold import (
@@ -21,18 +20,12 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
-from ..solvers import AbstractMultistep, RunningScales, TangentControl, intended_step, with_tangents
+from ..solvers import AbstractMultistep, MeshAdjoint, RunningScales, TangentControl, intended_step, with_tangents
 from ..states.consistency import consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .outcome import Outcome, has_failed
-
-_FORWARD = (
-    "The default adjoint serves reverse mode only: for jvp, jacfwd and linearize call "
-    "simulate(..., adjoint=diffrax.ForwardMode())."
-)
-
 
 class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
@@ -136,50 +129,30 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
 
 def _solve(term, solver, options, control):
     """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
-    # A class of diffrax: its loop has a rule for reverse mode only, whose tangents cannot be batched. So that gradients
-    # of batches exist, the rule around it is one for reverse mode, too.
-    if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        arguments, control = only_in_reverse(((term, solver, options), control), _FORWARD)
-        return _solve_in_reverse(arguments, control)
-    return _solve_either_way((term, solver, options), control)
+    return _solve_on_mesh((term, solver, options), control)
 
 
-def _solve_plain(arguments, control):
+@eqx.filter_custom_jvp
+def _solve_on_mesh(arguments, control):
     del control
     term, solver, options = arguments
-    return diffrax.diffeqsolve(term, solver, throw=False, **options)
+    adjoint = diffrax.ForwardMode() if options["adjoint"] is None else options["adjoint"]
+    return diffrax.diffeqsolve(term, solver, throw=False, **options | {"adjoint": adjoint})
 
 
-def _solve_with_tangents(arguments, control):
-    term, solver, options = arguments
-    solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
-    solution = diffrax.diffeqsolve(term, solver, throw=False, **options | {"stepsize_controller": controller})
-    return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
-
-
-_solve_either_way = eqx.filter_custom_jvp(_solve_plain)
-_solve_in_reverse = eqx.filter_custom_vjp(_solve_plain)
-
-
-@_solve_either_way.def_jvp
+@_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
     arguments, control = primals
     return eqx.filter_jvp(lambda arguments: _solve_with_tangents(arguments, control), (arguments,), (tangents[0],))
 
 
-@_solve_in_reverse.def_fwd
-def _solve_forward(perturbed, arguments, control):
-    moved, still = eqx.partition(arguments, perturbed)
-    solution, pull = eqx.filter_vjp(lambda moved: _solve_with_tangents(eqx.combine(moved, still), control), moved)
-    return solution, (pull, eqx.filter(solution, eqx.is_inexact_array))
-
-
-@_solve_in_reverse.def_bwd
-def _solve_backward(residuals, cotangents, perturbed, arguments, control):
-    del perturbed, arguments, control
-    pull, values = residuals
-    zeros = jax.tree.map(jnp.zeros_like, values)
-    return pull(eqx.combine(cotangents, zeros))[0]
+def _solve_with_tangents(arguments, control):
+    term, solver, options = arguments
+    solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
+    adjoint = MeshAdjoint(4096) if options["adjoint"] is None else options["adjoint"]
+    own = {"stepsize_controller": controller, "adjoint": adjoint}
+    solution = diffrax.diffeqsolve(term, solver, throw=False, **options | own)
+    return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 
 def _tangent_control(system, options, direction) -> TangentControl:

@@ -23,6 +23,7 @@ from .manifold_term import (
     AbstractResolvent as AbstractResolvent,
     ManifoldEvaluation as ManifoldEvaluation,
 )
+from .mesh import MeshAdjoint as MeshAdjoint
 from .multistep import (
     AbstractAttempt as AbstractAttempt,
     AbstractMultistep as AbstractMultistep,

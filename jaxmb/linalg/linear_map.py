@@ -1,0 +1,158 @@
+"""Linear maps whose values and transposes are computed by programs of one's own, such as loops.
+
+JAX transposes a linear function by transposing each of its operations, which a loop of unknown length does not allow.
+A `linear_map` is one operation that comes with its transpose: forward mode evaluates the map, reverse mode the
+transpose, and batches of either are the batched programs.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir
+
+_SECOND_REVERSE = (
+    "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
+    "instead of jax.jacrev of a derivative."
+)
+
+
+class _Programs:
+    """A map and its transpose on lists of arrays: `there(residuals, x)` and `back(residuals, cotangents)`, where a
+    cotangent may be None for zeros; `again`, the map in a form whose derivatives by residuals are right; and the shapes
+    of x and of the value.
+    """
+
+    def __init__(self, there: Callable, back: Callable, again: Callable, inputs: Sequence, outputs: Sequence):
+        self.there, self.back, self.again = there, back, again
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+
+    def transposed(self, known: tuple[bool, ...]) -> "_Programs":
+        """The transpose, of the `known` ones of the cotangents."""
+
+        def filled(cotangents):
+            left = iter(cotangents)
+            return [next(left) if here else None for here in known]
+
+        def back(residuals, cotangents):
+            cotangents = [jnp.zeros(a.shape, a.dtype) if c is None else c for c, a in zip(cotangents, self.inputs, strict=True)]
+            return [x for x, here in zip(self.there(residuals, cotangents), known, strict=True) if here]
+
+        there = lambda residuals, cotangents: self.back(residuals, filled(cotangents))
+        outputs = [a for a, here in zip(self.outputs, known, strict=True) if here]
+        return _Programs(there, back, there, outputs, self.inputs)
+
+    def batched(self, size: int, axes: Sequence[int | None]) -> "_Programs":
+        """The maps of a batch, whose residuals have these `axes`."""
+        of = lambda function: jax.vmap(function, in_axes=(list(axes), 0))
+        shapes = lambda avals: [ShapedArray((size, *a.shape), a.dtype) for a in avals]
+        return _Programs(of(self.there), of(self.back), of(self.again), shapes(self.inputs), shapes(self.outputs))
+
+
+def linear_map(there: Callable, back: Callable, again: Callable, residuals: PyTree, x: PyTree, like: PyTree) -> PyTree:
+    """`there(residuals, x)`, linear in x.
+
+    **Arguments:**
+
+    - `there(residuals, x)`: the map.
+    - `back(residuals, cotangents)`: its transpose; a cotangent that is None stands for zeros.
+    - `again`: the same as `there`, in a form that may be differentiated by the residuals.
+    - `residuals`: what the map depends on otherwise, a pytree.
+    - `x`: a pytree of floating-point arrays.
+    - `like`: a pytree of arrays or shapes, those of the value.
+
+    Derivatives of derivatives by the residuals exist in forward mode only: they are those of `again`, a `TypeError`
+    says it otherwise.
+    """
+    arrays, static = eqx.partition(residuals, eqx.is_array)
+    known, structure = jax.tree.flatten(arrays)
+    inputs, of_inputs = jax.tree.flatten(x)
+    outputs, of_outputs = jax.tree.flatten(like)
+    held = lambda leaves: eqx.combine(jax.tree.unflatten(structure, leaves), static)
+    run = lambda function: lambda r, x: jax.tree.leaves(function(held(r), jax.tree.unflatten(of_inputs, x)))
+
+    def transpose(r, cotangents):
+        out = back(held(r), jax.tree.unflatten(of_outputs, cotangents))
+        return jax.tree.leaves(filled(x, out))
+
+    shapes = lambda leaves: [ShapedArray(a.shape, a.dtype) for a in leaves]
+    programs = _Programs(run(there), transpose, run(again), shapes(inputs), shapes(outputs))
+    values = _linear_map.bind(*known, *inputs, programs=programs, known=len(known))
+    return jax.tree.unflatten(of_outputs, values)
+
+
+def filled(x: PyTree, tangent: PyTree) -> PyTree:
+    """A tangent of x, with zeros where it has None and x has an array."""
+    fill = lambda x, t: jnp.zeros(x.shape, x.dtype) if t is None and x is not None else t
+    return jax.tree.map(fill, x, tangent, is_leaf=lambda x: x is None)
+
+
+def _evaluate(*operands: Array, programs: _Programs, known: int) -> list[Array]:
+    return programs.there(list(operands[:known]), list(operands[known:]))
+
+
+def _push(primals, tangents, *, programs: _Programs, known: int):
+    out = _linear_map.bind(*primals, programs=programs, known=known)
+    pushed = [jnp.zeros(a.shape, a.dtype) for a in programs.outputs]
+    if any(type(t) is not Zero for t in tangents[known:]):
+        x = [ad.instantiate_zeros(t) for t in tangents[known:]]
+        pushed = _linear_map.bind(*primals[:known], *x, programs=programs, known=known)
+    moving = [k for k in range(known) if type(tangents[k]) is not Zero]
+    if moving:
+
+        def moved(*values):
+            residuals = list(primals[:known])
+            for k, value in zip(moving, values, strict=True):
+                residuals[k] = value
+            return programs.again(residuals, list(primals[known:]))
+
+        along = tuple(tangents[k] for k in moving)
+        _, more = jax.jvp(moved, tuple(primals[k] for k in moving), along)
+        pushed = [_forward_only.bind(a + b) for a, b in zip(pushed, more, strict=True)]
+    return out, pushed
+
+
+def _transpose(cotangents, *operands, programs: _Programs, known: int):
+    there = tuple(type(c) is not Zero for c in cotangents)
+    given = [c for c, here in zip(cotangents, there, strict=True) if here]
+    pulled = _linear_map.bind(*operands[:known], *given, programs=programs.transposed(there), known=known)
+    return [None] * known + list(pulled)
+
+
+def _batch(operands, axes, *, programs: _Programs, known: int):
+    size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+    front = [
+        jnp.broadcast_to(x[None], (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands[known:], axes[known:], strict=True)
+    ]
+    batched = programs.batched(size, axes[:known])
+    out = _linear_map.bind(*operands[:known], *front, programs=batched, known=known)
+    return out, [0] * len(out)
+
+
+def _not_in_reverse(cotangent, x):
+    raise TypeError(_SECOND_REVERSE)
+
+
+# An identity that is differentiated in forward mode only.
+_forward_only = Primitive("forward_only")
+_forward_only.def_impl(lambda x: x)
+_forward_only.def_abstract_eval(lambda x: x)
+mlir.register_lowering(_forward_only, lambda ctx, x: [x])
+ad.deflinear2(_forward_only, _not_in_reverse)
+batching.defvectorized(_forward_only)
+
+_linear_map = Primitive("linear_map")
+_linear_map.multiple_results = True
+_linear_map.def_impl(lambda *operands, **static: jax.jit(lambda *x: _evaluate(*x, **static))(*operands))
+_linear_map.def_abstract_eval(lambda *operands, programs, known: list(programs.outputs))
+mlir.register_lowering(_linear_map, mlir.lower_fun(_evaluate, multiple_results=True))
+ad.primitive_jvps[_linear_map] = _push
+ad.primitive_transposes[_linear_map] = _transpose
+batching.primitive_batchers[_linear_map] = _batch
+
+

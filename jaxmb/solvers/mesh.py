@@ -1,0 +1,529 @@
+"""Derivatives of a solve on its mesh.
+
+A solve that is differentiated is integrated once, without derivatives, and leaves a row of numbers for each accepted
+step. Its derivatives go over these rows: forward mode pushes a tangent through them from the first to the last, reverse
+mode pulls a cotangent back from the last to the first, one linear step at a time. There is no step size control, no
+rejected step and no second solution of the equations in them, all modes share one mesh, and since the linear map over
+the rows comes with its transpose, modes can be combined and batched.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
+from ..linalg.linear_map import filled, linear_map
+from .controller import MultistepController
+from .evaluation import freeze, ravel, unravel_like
+from .multistep import AbstractMultistep
+from .one_step import OneStepController, WithTangents
+
+
+class LinearStep(NamedTuple):
+    """A step as linear maps of tangents.
+
+    **Fields:** `push(dmoved, w, memory)`: the tangent of the raveled state at the end, that of the solver's memory, and
+    that of the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time in the step, from the
+    latter.
+    """
+
+    push: Callable[..., tuple[Array, PyTree, PyTree]]
+    at: Callable[[PyTree, Any], Array]
+
+
+class AbstractSteps(eqx.Module):
+    """How a solver's steps are stored, and linearised from what is stored."""
+
+    @abc.abstractmethod
+    def row(self, before: Any, after: Any) -> PyTree[Array]:
+        """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
+
+    @abc.abstractmethod
+    def end(self, row: PyTree[Array]) -> Any:
+        """The time at the end of a step."""
+
+    @abc.abstractmethod
+    def memory(self, solver_state: Any) -> PyTree[Array]:
+        """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
+
+    @abc.abstractmethod
+    def linearised(self, of: Callable, moved: PyTree[Array], like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
+        """A step at its row.
+
+        **Arguments:** `of(moved)`: the solver's terms and their arguments; `like`: a state before raveling.
+        """
+
+    @abc.abstractmethod
+    def row_tangent(
+        self, row: PyTree[Array], like: PyTree[Array], before: tuple[Array, PyTree], after: tuple[Array, PyTree]
+    ) -> PyTree[Array]:
+        """The tangent of a row, from those of the state and the memory before and after its step; None for numbers that
+        have none.
+        """
+
+
+class WholeSteps(AbstractSteps):
+    """The steps of any solver, differentiated as they are.
+
+    **Fields:** the `solver`, whose states are those of the run or, if they are `watched`, the first parts of them;
+    `jumps`: whether steps may begin after a jump.
+    """
+
+    solver: Any
+    watched: bool = eqx.field(static=True)
+    jumps: bool = eqx.field(static=True)
+
+    def row(self, before, after):
+        del after
+        jump = jnp.asarray(before.made_jump) if self.jumps else None
+        return before.tprev, before.tnext, before.y, self._own(before.solver_state), jump
+
+    def end(self, row):
+        return row[1]
+
+    def memory(self, solver_state):
+        return self._smooth(self._own(solver_state))
+
+    def _own(self, solver_state):
+        """A solver state without tangents."""
+        if isinstance(self.solver, AbstractMultistep):
+            return eqx.tree_at(lambda state: state.tangents, solver_state, None, is_leaf=_is_none)
+        return solver_state[0] if self.watched else solver_state
+
+    def _smooth(self, state):
+        """The numbers that a step depends on smoothly, with None for all others."""
+        if isinstance(self.solver, AbstractMultistep):
+            none = jax.tree.map(lambda _: None, state)
+            return eqx.tree_at(lambda state: state.memory, none, state.memory, is_leaf=_is_none)
+        return eqx.filter(state, eqx.is_inexact_array)
+
+    def linearised(self, of, moved, like, row):
+        t0, t1, y0, state, jump = row
+
+        def step(moved, flat, memory):
+            terms, args = of(moved)
+            before = eqx.combine(memory, state)
+            out = self.solver.step(
+                terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump
+            )
+            dense, still = eqx.partition(out[2], eqx.is_inexact_array)
+            return (ravel(out[0]), self._smooth(out[3]), dense), still
+
+        (_, _, dense), push, still = jax.linearize(step, moved, ravel(y0), self._smooth(state), has_aux=True)
+
+        def at(ddense, t):
+            value = lambda dense: ravel(
+                self.solver.interpolation_cls(t0=t0, t1=t1, **eqx.combine(dense, still)).evaluate(t)
+            )
+            return jax.jvp(value, (dense,), (ddense,))[1]
+
+        return LinearStep(push, at)
+
+    def row_tangent(self, row, like, before, after):
+        del row, after
+        w, memory = before
+        return None, None, unravel_like(like, w), memory, None
+
+
+def steps_of(solver: Any, controller: Any) -> AbstractSteps:
+    """The steps of a solver, without the tangents that it carries along."""
+    still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
+    jumps = not isinstance(controller, still)
+    if isinstance(solver, AbstractMultistep):
+        solver = eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none)
+        return WholeSteps(solver, False, jumps)
+    if isinstance(solver, WithTangents):
+        return WholeSteps(solver.inner, True, jumps)
+    return WholeSteps(solver, False, jumps)
+
+
+class Saved(eqx.Module):
+    """A series of saved states.
+
+    **Fields:** whether it begins with the `start`; its `times`, or None; after how many `steps` each a state is saved,
+    or 0; its `length`; how many states, and how many of the times, were `passed`.
+    """
+
+    start: bool = eqx.field(static=True)
+    times: Any
+    steps: int = eqx.field(static=True)
+    length: int = eqx.field(static=True)
+    passed: Any
+
+
+class Tangents(NamedTuple):
+    """Tangents, or cotangents, of a run.
+
+    **Fields:** those of the raveled state and of the memory at its `end`; of `saved` states; of the `rows`; of the
+    `dense` output of all steps, or None; of that of the `last` step, or None.
+    """
+
+    end: tuple[Array, PyTree]
+    saved: tuple[Array, ...]
+    rows: PyTree
+    dense: PyTree
+    last: PyTree
+
+
+class Mesh(eqx.Module):
+    """The steps of a run.
+
+    **Fields:** `moved`, `still`: the numbers of the terms and their arguments that have tangents, and the rest;
+    `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
+    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an `event`.
+    """
+
+    moved: PyTree
+    still: PyTree
+    steps: AbstractSteps
+    rows: list[Array]
+    layout: "Layout" = eqx.field(static=True)
+    count: Any
+    saved: tuple[Saved, ...]
+    like: PyTree
+    memory: PyTree
+    dense: bool = eqx.field(static=True)
+    event: bool = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return self.rows[0].shape[0]
+
+    def row(self, k: Any) -> PyTree[Array]:
+        return self.layout.unpacked([buffer[k] for buffer in self.rows])
+
+    def linearised(self, row: PyTree[Array]) -> LinearStep:
+        return self.steps.linearised(lambda moved: eqx.combine(moved, self.still), self.moved, self.like, row)
+
+    def blank(self) -> Tangents:
+        """Zeros."""
+        n, memory, step = ravel(self.like), self.memory, self._shapes()
+        table = lambda x: jnp.zeros((self.size, *x.shape), x.dtype)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step)
+        return Tangents(
+            (jnp.zeros_like(n), jax.tree.map(jnp.zeros_like, memory)),
+            tuple(jnp.zeros((series.length, n.size), n.dtype) for series in self.saved),
+            [jnp.zeros_like(rows) for rows in self.rows if jnp.issubdtype(rows.dtype, jnp.floating)],
+            jax.tree.map(table, step) if self.dense else None,
+            zeros if self.event else None,
+        )
+
+    def _shapes(self) -> PyTree:
+        """The shapes of the tangent of a step's dense output."""
+        run = lambda moved, memory: self.linearised(self.row(0)).push(moved, ravel(self.like), memory)[2]
+        return eqx.filter_eval_shape(run, self.moved, self.memory)
+
+    def push(self, x: PyTree) -> Tangents:
+        """The tangents that one of the terms, one of the first state and one of its memory cause."""
+        dmoved, w, memory = x
+        out = self.blank()
+        saved = tuple(
+            table.at[0].set(w) if series.start else table for series, table in zip(self.saved, out.saved, strict=True)
+        )
+        places = tuple(jnp.array([int(series.start), 0]) for series in self.saved)
+        first = 0, (w, memory), saved, places, out.rows, out.dense, out.last
+
+        def body(carry):
+            k, before, saved, places, rows, dense, _ = carry
+            row = self.row(k)
+            step = self.linearised(row)
+            *after, ddense = step.push(dmoved, *before)
+            after = tuple(after)
+            along = self.layout.packed_tangent(row, self.steps.row_tangent(row, self.like, before, after))
+            rows = [buffer_set(buffer, k, x) for buffer, x in zip(rows, along, strict=True)]
+            if self.dense:
+                dense = jax.tree.map(lambda buffer, x: buffer_set(buffer, k, x), dense, ddense)
+            end = self.steps.end(row)
+            each = zip(self.saved, saved, places, strict=True)
+            new = [_saved(series, table, place, k, end, after[0], ddense, step.at) for series, table, place in each]
+            saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
+            return k + 1, after, saved, places, rows, dense, ddense if self.event else None
+
+        carry = while_loop(
+            lambda carry: carry[0] < self.count,
+            body,
+            first,
+            max_steps=None,
+            buffers=lambda carry: (carry[2], carry[4], carry[5]),
+            kind="lax",
+        )
+        _, end, saved, _, rows, dense, last = carry
+        return self._known(Tangents(end, saved, rows, dense, last))
+
+    def pull(self, cotangents: Tangents) -> PyTree:
+        """The transpose of `push`; cotangents that are None are zero."""
+        lw, lmemory = filled((ravel(self.like), self.memory), cotangents.end)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes())
+        given = cotangents.saved
+        places = tuple(series.passed for series in self.saved)
+        nothing = jax.tree.map(jnp.zeros_like, self.moved)
+
+        def body(carry):
+            k, lw, lmemory, places, total = carry
+            k = k - 1
+            row = self.row(k)
+            step = self.linearised(row)
+            ldense = zeros
+            if cotangents.dense is not None:
+                ldense = jax.tree.map(lambda z, c: z if c is None else z + c[k], zeros, cotangents.dense)
+            if cotangents.last is not None:
+                is_last = k + 1 == self.count
+                ldense = jax.tree.map(
+                    lambda z, c: z if c is None else z + jnp.where(is_last, c, 0), ldense, cotangents.last
+                )
+            before = jnp.where(k > 0, self.steps.end(self.row(jnp.maximum(k - 1, 0))), -jnp.inf)
+            left = []
+            for series, table, place in zip(self.saved, given, places, strict=True):
+                lw, ldense, place = _unsaved(series, table, place, k, before, lw, ldense, step.at)
+                left.append(place)
+            pulled = jax.linear_transpose(step.push, nothing, lw, lmemory)((lw, lmemory, ldense))
+            dmoved, lw, lmemory = pulled
+            return k, lw, lmemory, tuple(left), jax.tree.map(jnp.add, total, dmoved)
+
+        carry = self.count, lw, lmemory, places, nothing
+        _, lw, lmemory, places, total = while_loop(
+            lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax"
+        )
+        for series, table in zip(self.saved, given, strict=True):
+            if series.start and table is not None:
+                lw = lw + table[0]
+        return self._known((total, lw, lmemory))
+
+    def _known(self, tree: PyTree) -> PyTree:
+        """The same numbers, NaN where not all rows were kept."""
+        lost = self.count > self.size
+        return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), tree)
+
+
+def _saved(series: Saved, table, place, k, end, w, dense, at):
+    """The table of a series of saved states with those of a step, and where the series is after it."""
+    if series.times is not None:
+        times = series.times
+
+        def more(carry):
+            _, place = carry
+            return (place[1] < times.size) & (times[jnp.minimum(place[1], times.size - 1)] <= end)
+
+        def save(carry):
+            table, place = carry
+            return buffer_set(table, place[0], at(dense, times[place[1]])), place + 1
+
+        carry = table, place
+        table, place = while_loop(more, save, carry, max_steps=None, buffers=lambda carry: carry[0], kind="lax")
+    if series.steps:
+        here = (k + 1) % series.steps == 0
+        table = buffer_set(table, place[0], w, here)
+        place = place + jnp.array([1, 0]) * here
+    return table, place
+
+
+def _unsaved(series: Saved, table, place, k, before, lw, ldense, at):
+    """The transpose: cotangents of the end of a step and of its dense output with those of the states that were saved
+    in it, after the time `before`, and where the series is before it.
+    """
+    if series.steps:
+        here = (k + 1) % series.steps == 0
+        place = place - jnp.array([1, 0]) * here
+        if table is not None:
+            lw = lw + jnp.where(here, table[place[0]], 0.0)
+    if series.times is not None:
+        times = series.times
+
+        def more(carry):
+            _, place = carry
+            return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > before)
+
+        def unsave(carry):
+            ldense, place = carry
+            place = place - 1
+            if table is not None:
+                (more,) = jax.linear_transpose(lambda x: at(x, times[place[1]]), ldense)(table[place[0]])
+                ldense = jax.tree.map(jnp.add, ldense, more)
+            return ldense, place
+
+        carry = ldense, place
+        ldense, place = while_loop(more, unsave, carry, max_steps=None, buffers=None, kind="lax")
+    return lw, ldense, place
+
+
+class Layout:
+    """Rows as vectors, one for each type of numbers."""
+
+    def __init__(self, example: PyTree):
+        arrays, self.static = eqx.partition(example, lambda x: isinstance(x, jax.ShapeDtypeStruct | jax.Array))
+        leaves, self.structure = jax.tree.flatten(arrays)
+        self.leaves = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+        self.types = sorted({x.dtype for x in self.leaves}, key=str)
+
+    @property
+    def vectors(self) -> list[jax.ShapeDtypeStruct]:
+        size = lambda dtype: sum(x.size for x in self.leaves if x.dtype == dtype)
+        return [jax.ShapeDtypeStruct((size(dtype),), dtype) for dtype in self.types]
+
+    def packed(self, row: PyTree[Array]) -> list[Array]:
+        """A row as vectors."""
+        leaves = jax.tree.leaves(eqx.filter(row, eqx.is_array))
+        return [self._joined(leaves, dtype) for dtype in self.types]
+
+    def packed_tangent(self, row: PyTree[Array], tangent: PyTree[Array]) -> list[Array]:
+        """The tangent of a row, or parts of it, as those of its vectors that are floating-point numbers."""
+        arrays = eqx.filter(row, eqx.is_array)
+        leaves = jax.tree.leaves(filled(arrays, tangent))
+        return [self._joined(leaves, dtype) for dtype in self.types if jnp.issubdtype(dtype, jnp.floating)]
+
+    def _joined(self, leaves, dtype):
+        return jnp.concatenate([jnp.ravel(x) for x, of in zip(leaves, self.leaves, strict=True) if of.dtype == dtype])
+
+    def unpacked(self, vectors: list[Array]) -> PyTree[Array]:
+        """The inverse of `packed`."""
+        given, starts, leaves = dict(zip(self.types, vectors, strict=True)), dict.fromkeys(self.types, 0), []
+        for of in self.leaves:
+            start = starts[of.dtype]
+            leaves.append(given[of.dtype][start : start + of.size].reshape(of.shape))
+            starts[of.dtype] = start + of.size
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
+
+
+class MeshAdjoint(diffrax.AbstractAdjoint):
+    """Derivatives of a solve on its mesh, in every mode.
+
+    **Arguments:** `most`: the number of steps that are kept.
+    """
+
+    most: int = eqx.field(static=True)
+
+    def loop(
+        self,
+        *,
+        terms,
+        args,
+        solver,
+        saveat,
+        init_state,
+        max_steps,
+        throw,
+        passed_solver_state,
+        passed_controller_state,
+        **options,
+    ):
+        del throw, passed_solver_state, passed_controller_state
+        steps = steps_of(solver, options["stepsize_controller"])
+        fixed = freeze((solver, saveat, options, steps))
+        final, _ = _recorded(terms, args, init_state, fixed, max_steps, self.most)
+        given = lambda *_, **__: final
+        return _run(given, terms, args, init_state, fixed, max_steps)
+
+
+def _run(outer, terms, args, init_state, fixed, max_steps):
+    solver, saveat, options, _ = fixed
+    return loop_of_diffrax(
+        args=args,
+        terms=terms,
+        solver=solver,
+        saveat=saveat,
+        init_state=init_state,
+        max_steps=max_steps,
+        inner_while_loop=functools.partial(while_loop, kind="lax"),
+        outer_while_loop=outer,
+        **options,
+    )
+
+
+@eqx.filter_custom_jvp
+def _recorded(terms, args, init_state, fixed, max_steps, most):
+    """The last state of diffrax's loop, and the packed rows of its steps."""
+    steps, found = fixed[3], []
+    size = min(most, max_steps)
+
+    def outer(cond_fun, body_fun, init, *, max_steps, buffers):
+        layout = Layout(eqx.filter_eval_shape(lambda init: steps.row(init, body_fun(init)), init))
+
+        def body(carry):
+            old, rows = carry
+            new = body_fun(old)
+            kept = new.num_accepted_steps > old.num_accepted_steps
+            index = old.num_accepted_steps % size
+            packed = layout.packed(steps.row(old, new))
+            return new, [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
+
+        rows = [jnp.zeros((size, *x.shape), x.dtype) for x in layout.vectors]
+        final, rows = while_loop(
+            lambda carry: cond_fun(carry[0]),
+            body,
+            (init, rows),
+            max_steps=max_steps,
+            buffers=lambda carry: (buffers(carry[0]), carry[1]),
+            kind="lax",
+        )
+        found.append((final, rows))
+        return final
+
+    _run(outer, terms, args, init_state, fixed, max_steps)
+    return found[0]
+
+
+@_recorded.def_jvp
+def _recorded_jvp(primals, tangents):
+    terms, args, init_state, fixed, _, _ = primals
+    dterms, dargs, dinit, *_ = tangents
+    out = _recorded(*primals)
+    final, rows = out
+    _, saveat, options, steps = fixed
+    moved, still = eqx.partition((terms, args), jax.tree.map(_is_known, (dterms, dargs), is_leaf=_is_none))
+    y0, memory = init_state.y, steps.memory(init_state.solver_state)
+    x = (dterms, dargs), ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
+    saved = tuple(
+        Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
+        for sub, state in zip(series, save_states(final), strict=True)
+    )
+    mesh = Mesh(
+        moved=moved,
+        still=still,
+        steps=steps,
+        rows=rows,
+        layout=Layout(eqx.filter_eval_shape(steps.row, init_state, final)),
+        count=final.num_accepted_steps,
+        saved=saved,
+        like=y0,
+        memory=memory,
+        dense=bool(saveat.dense),
+        event=options["event"] is not None,
+    )
+    like = eqx.filter_eval_shape(Mesh.blank, mesh)
+    along = linear_map(Mesh.push, Mesh.pull, Mesh.push, mesh, x, like)
+    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows))
+
+
+def _of_loop(final, along: Tangents, like):
+    """The tangent of the last state of diffrax's loop."""
+    state = lambda flat: unravel_like(like, flat)
+    none = jax.tree.map(lambda _: None, final)
+    parts = lambda final: (
+        final.y,
+        final.dense_infos,
+        final.event_dense_info,
+        *(saved.ys for saved in save_states(final)),
+    )
+    new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in along.saved)
+    return eqx.tree_at(parts, none, new, is_leaf=_is_none)
+
+
+def _of_rows(rows, along):
+    left = iter(along)
+    return [next(left) if jnp.issubdtype(x.dtype, jnp.floating) else None for x in rows]
+
+
+def _is_none(x):
+    return x is None
+
+
+def _is_known(x):
+    return x is not None
