@@ -77,6 +77,14 @@ class StatefulTerm(AbstractManifoldTerm):
         term = _at(self.term, y)
         return _with_states(term.system, t, y.z, term.project_cold(t, _mechanical(y), chart, args))
 
+    def kept(self, chart):
+        return self.term.kept(chart)
+
+    def at_solution(self, t, y, f, kept, args):
+        term = _at(self.term, y)
+        own, rates = term.at_solution(t, _mechanical(y), _mechanical(f), kept, args)
+        return State(own.q, own.u, y.z), State(rates.q, rates.u, term.system.state_rates(t, own.q, own.u))
+
     def after_jump(self, t, y, args):
         after = self.term.after_jump(t, _mechanical(y), args)
         return State(after.q, after.u, y.z)

@@ -97,9 +97,11 @@ class ProjectorConstraints(AbstractConstraints):
         return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
 
     def multipliers(self, system, t, restored):
-        del system, t
-        assert restored.multipliers is not None, "a projector finds multipliers with the accelerations"
-        return restored.multipliers
+        if restored.multipliers is not None:
+            return restored.multipliers
+        q, u = restored.q, restored.u
+        free = system.inertia(t, q, u).solve(system.force(t, q, u))
+        return -self.projector.multipliers(system.acceleration_residual(t, q, u, free))
 
     def push_positions(self, at, along):
         system, t, q = at

@@ -31,7 +31,7 @@ from .chart import (
     restore_positions,
     shares_split,
 )
-from .constraints import SolvedState, restore
+from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import diagnose
 from .impulse import after_impulse
 from .manifold import AbstractManifold, newton_tolerance
@@ -225,6 +225,22 @@ class PartitionTerm(AbstractManifoldTerm):
         q, iterations, failed = restore_positions(self.system, t, y.q, split, self.newton_tol)
         out = self._evaluate(t, q, y.u, _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
+
+    def kept(self, chart):
+        return eqx.tree_at(lambda split: split.right_inverse, chart.split, None)
+
+    def at_solution(self, t, y, f, kept, args):
+        system = self.system
+        if system.acceleration_rows > 0 and system.ideal_on_velocities:
+            out = solved(ChartConstraints(None, kept), system, t, RestoredState(y.q, y.u, f.u))
+            return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
+        split = kept
+        if system.coordinate_rank:
+            own = coordinate_factor(*lax.stop_gradient((system, t, y.q)), kept)
+            split = ChartIndices(kept.velocity, kept.acceleration, kept.coordinate, own.right_inverse)
+        none = jnp.zeros(1 + drops_rows(system), y.q.dtype)
+        out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
+        return out.y, out.f
 
     def after_jump(self, t, y, args):
         return after_impulse(self.system, t, y)

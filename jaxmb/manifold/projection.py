@@ -20,7 +20,7 @@ from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
-from .constraints import SolvedState, restore
+from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
@@ -209,8 +209,15 @@ class ProjectionTerm(AbstractManifoldTerm):
         gamma = -system.acceleration_residual(t, y.q, y.u, jnp.zeros_like(y.u))
         udot, multipliers = projector.solve(system.force(t, y.q, y.u), gamma)
         f = State(system.rates(t, y.q, y.u), udot)
-        solved = SolvedState(ProjectorConstraints(y.q, projector), udot, multipliers)
-        return ManifoldEvaluation(y, f, chart, jnp.array(False), solved)
+        near = SolvedState(ProjectorConstraints(y.q, projector), udot, multipliers)
+        return ManifoldEvaluation(y, f, chart, jnp.array(False), near)
+
+    def at_solution(self, t, y, f, kept, args):
+        system = self.system
+        if system.velocity_rows == 0 or not system.ideal_on_velocities:
+            return super().at_solution(t, y, f, kept, args)
+        out = solved(ProjectorConstraints(y.q, None), system, t, RestoredState(y.q, y.u, f.u))
+        return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)

@@ -80,24 +80,30 @@ def before_each(length: int) -> np.ndarray:
     return np.tril(np.ones((length, length)), -1)
 
 
-def step_end(history: History, t: Any) -> Any:
+def step_end(mesh: Float[Array, " length"], t: Any) -> Any:
     """`t`, or a later time if the step has zero length.
 
     Members of a batch that finish early make and discard such steps. With zero length they would divide by zero and
     spoil reverse-mode derivatives.
     """
-    latest = history.mesh[0]
-    return jnp.where(t > latest, t, latest + spans(history.mesh)[0])
+    latest = mesh[0]
+    return jnp.where(t > latest, t, latest + spans(mesh)[0])
 
 
 def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float[Array, "length n"]) -> History:
     """The history with one more mesh point; `partial_sums` are the polynomials of all orders, evaluated there."""
-    # Rows that involve placeholders are kept at zero: they are never used but would grow without bound.
     length = history.mesh.shape[0]
-    known = history.known >= np.arange(length, dtype=np.int32)
-    zero = jnp.zeros((), z.dtype)
     return History(
-        differences=jnp.where(known[:, None], z[None] - partial_sums, zero),
+        differences=known_differences(history.known, z, partial_sums),
         mesh=jnp.concatenate([t[None], history.mesh[:-1]]),
         known=jnp.minimum(history.known + 1, length).astype(np.int32),
     )
+
+
+def known_differences(
+    known: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
+) -> Float[Array, "length n"]:
+    """The divided differences after a step with `z` at its end, from a number of points `known` before."""
+    # Rows that involve placeholders are kept at zero: they are never used but would grow without bound.
+    rows = known >= np.arange(partial_sums.shape[0], dtype=np.int32)
+    return jnp.where(rows[:, None], z[None] - partial_sums, jnp.zeros((), z.dtype))

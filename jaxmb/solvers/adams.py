@@ -11,9 +11,10 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, basis_means, before_each, start, step_end
+from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, start
 from ._interpolation import RateInterpolation
 from ._stiffness import Stiffness, none_found, observed
+from .adams_steps import AdamsSteps, coefficients
 from .evaluation import (
     Evaluation,
     controlled_components,
@@ -173,6 +174,9 @@ class Adams(AbstractMultistep):
         del terms
         return self.max_order + 1
 
+    def linear_steps(self, jumps):
+        return AdamsSteps(jumps)
+
     def statistics(self, solver_state: AdamsState, controller_state, stats):
         out = {
             "num_evaluations": solver_state.step_counts[0] + 2 * stats["num_steps"],
@@ -205,35 +209,18 @@ class Adams(AbstractMultistep):
 
     def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
-        dtype = before.dtype
-        h = (t1 - history.mesh[0]).astype(dtype)
-
-        end = step_end(history, t1)
-        means, values = basis_means(history.mesh, history.mesh[0], end)
-        means, values = means.astype(dtype), values.astype(dtype)
-        # In one product, at the end of the step: the polynomials through the last 0, 1, 2, ... derivatives, and those
-        # through the last k - 1, k and k + 1; and the mean over the step of that through the last k.
-        lengths = order + np.array([-1, 0, 1, 0], np.int32)
-        near = jnp.stack([values, values, values, means])
-        near = jnp.where(lengths[:, None] > INDEX[None], near, jnp.zeros((), dtype))
-        every = jnp.asarray(before_each(LENGTH), dtype) * values[None]
-        sums = jnp.concatenate([every, near]) @ history.differences
-        partial_sums, neighbours, mean = sums[:LENGTH], sums[LENGTH:-1], sums[-1]
-        predicted = before + h * mean
+        of = coefficients(history.mesh, order, t1, before.dtype)
+        partial_sums, neighbours, mean = of.sums(history.differences)
+        predicted = before + of.h * mean
         first = evaluate(terms, t1, predicted, like, chart, args)
 
-        # The contribution of the new derivative to these polynomials, and its integral.
         defects = first.f[None] - neighbours
-        integrals = means / values
-        last = integrals[order]
-        padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
-        differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
-        errors = h * differences[:, None] * defects
-        corrected = predicted + h * last * defects[1]
+        errors = of.h * of.differences[:, None] * defects
+        corrected = predicted + of.h * of.last * defects[1]
         second = project_near(terms, t1, corrected, like, first, args)
-        mismatch = predicted + h * last * (second.f - neighbours[1]) - second.y
+        mismatch = predicted + of.h * of.last * (second.f - neighbours[1]) - second.y
         return _Step(
-            second.y, advance(history, end, second.f, partial_sums), errors, mismatch, predicted, first, second
+            second.y, advance(history, of.end, second.f, partial_sums), errors, mismatch, predicted, first, second
         )
 
     def advance(self, terms, t1, y0, args, state: AdamsState):

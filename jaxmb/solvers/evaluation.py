@@ -141,6 +141,24 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
     return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)
 
 
+def kept_of_chart(term: Any, chart: Chart | None) -> PyTree[Array]:
+    """What `at_solution` needs of a chart."""
+    manifold = _manifold(term)
+    return None if manifold is None else manifold.kept(chart)
+
+
+def at_solution(
+    term: Any, t: Any, flat: Array, f: Array, like: PyTree[Array], kept: PyTree[Array], args: Args
+) -> tuple[Array, Array]:
+    """The state and the vector field at the end of a step, which are known, with their derivatives."""
+    manifold, direction = _manifold(term), direction_of(term)
+    if manifold is None:
+        return flat, ravel(derivative(term, t, unravel_like(like, flat), args), flat.dtype)
+    sign = jnp.asarray(direction).astype(flat.dtype)
+    y, f = manifold.at_solution(t * direction, unravel_like(like, flat), unravel_like(like, f * sign), kept, args)
+    return ravel(y, flat.dtype), ravel(f, flat.dtype) * sign
+
+
 def free_components(term: Any, flat: Array, chart: Chart | None) -> Array:
     """Indices of the components that are integrated."""
     manifold = _manifold(term)

@@ -246,7 +246,7 @@ class Hermite(AbstractMultistep):
         # The prediction extrapolates y, not f: the remaining error of stiff components is large in f. It has the order
         # of the formula, if there are enough points, since Newton's method converges only from nearby. Its slope
         # follows from the logarithmic derivatives of the basis.
-        end = step_end(history, t1)
+        end = step_end(history.mesh, t1)
         h = (end - history.mesh[0]).astype(dtype)
         values = basis(history.mesh, end[None])[:, 0].astype(dtype)
         before_own = jnp.asarray(before_each(family.length), dtype)
@@ -289,7 +289,7 @@ class Hermite(AbstractMultistep):
         n, dtype = before.size, before.dtype
         nodes = family.multiplicity * k
         index = np.arange(family.length, dtype=np.int32)
-        h = (step_end(history, t1) - history.mesh[0]).astype(dtype)
+        h = (step_end(history.mesh, t1) - history.mesh[0]).astype(dtype)
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
         step, along = self.attempted(terms, t1, before, y0, args, state)

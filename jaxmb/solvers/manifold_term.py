@@ -112,6 +112,20 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         out = self.project_near(t, y, linearized_at, args)
         return out._replace(failed=out.failed | linearized_at.failed)
 
+    def kept(self, chart: Chart) -> PyTree[Array]:
+        """What `at_solution` needs of a chart, stored for each step; by default all of it."""
+        return chart
+
+    def at_solution(self, t: Any, y: Y, f: Y, kept: PyTree[Array], args: Args) -> tuple[Y, Y]:
+        """A state on the manifold and the vector field there, both known, with the derivatives that the equations give
+        them; `kept` is of a chart that is good there.
+
+        A manifold that need not solve its equations for this overrides this method.
+        """
+        del f
+        out = self.project_cold(t, y, kept, args)
+        return out.y, out.f
+
     def after_jump(self, t: Any, y: Y, args: Args) -> Y:
         """The state just after a time at which the field or the manifold jumps; by default it has not changed.
 

@@ -7,9 +7,7 @@ rejected step and no second solution of the equations in them, all modes share o
 the rows comes with its transpose, modes can be combined and batched.
 """
 
-import abc
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -20,128 +18,9 @@ from jaxtyping import Array, PyTree
 
 from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
 from ..linalg.linear_map import filled, linear_map
-from .controller import MultistepController
 from .evaluation import freeze, ravel, unravel_like
-from .multistep import AbstractMultistep
-from .one_step import OneStepController, WithTangents
-
-
-class LinearStep(NamedTuple):
-    """A step as linear maps of tangents.
-
-    **Fields:** `push(dmoved, w, memory)`: the tangent of the raveled state at the end, that of the solver's memory, and
-    that of the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time in the step, from the
-    latter.
-    """
-
-    push: Callable[..., tuple[Array, PyTree, PyTree]]
-    at: Callable[[PyTree, Any], Array]
-
-
-class AbstractSteps(eqx.Module):
-    """How a solver's steps are stored, and linearised from what is stored."""
-
-    @abc.abstractmethod
-    def row(self, before: Any, after: Any) -> PyTree[Array]:
-        """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
-
-    @abc.abstractmethod
-    def end(self, row: PyTree[Array]) -> Any:
-        """The time at the end of a step."""
-
-    @abc.abstractmethod
-    def memory(self, solver_state: Any) -> PyTree[Array]:
-        """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
-
-    @abc.abstractmethod
-    def linearised(self, of: Callable, moved: PyTree[Array], like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
-        """A step at its row.
-
-        **Arguments:** `of(moved)`: the solver's terms and their arguments; `like`: a state before raveling.
-        """
-
-    @abc.abstractmethod
-    def row_tangent(
-        self, row: PyTree[Array], like: PyTree[Array], before: tuple[Array, PyTree], after: tuple[Array, PyTree]
-    ) -> PyTree[Array]:
-        """The tangent of a row, from those of the state and the memory before and after its step; None for numbers that
-        have none.
-        """
-
-
-class WholeSteps(AbstractSteps):
-    """The steps of any solver, differentiated as they are.
-
-    **Fields:** the `solver`, whose states are those of the run or, if they are `watched`, the first parts of them;
-    `jumps`: whether steps may begin after a jump.
-    """
-
-    solver: Any
-    watched: bool = eqx.field(static=True)
-    jumps: bool = eqx.field(static=True)
-
-    def row(self, before, after):
-        del after
-        jump = jnp.asarray(before.made_jump) if self.jumps else None
-        return before.tprev, before.tnext, before.y, self._own(before.solver_state), jump
-
-    def end(self, row):
-        return row[1]
-
-    def memory(self, solver_state):
-        return self._smooth(self._own(solver_state))
-
-    def _own(self, solver_state):
-        """A solver state without tangents."""
-        if isinstance(self.solver, AbstractMultistep):
-            return eqx.tree_at(lambda state: state.tangents, solver_state, None, is_leaf=_is_none)
-        return solver_state[0] if self.watched else solver_state
-
-    def _smooth(self, state):
-        """The numbers that a step depends on smoothly, with None for all others."""
-        if isinstance(self.solver, AbstractMultistep):
-            none = jax.tree.map(lambda _: None, state)
-            return eqx.tree_at(lambda state: state.memory, none, state.memory, is_leaf=_is_none)
-        return eqx.filter(state, eqx.is_inexact_array)
-
-    def linearised(self, of, moved, like, row):
-        t0, t1, y0, state, jump = row
-
-        def step(moved, flat, memory):
-            terms, args = of(moved)
-            before = eqx.combine(memory, state)
-            out = self.solver.step(
-                terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump
-            )
-            dense, still = eqx.partition(out[2], eqx.is_inexact_array)
-            return (ravel(out[0]), self._smooth(out[3]), dense), still
-
-        (_, _, dense), push, still = jax.linearize(step, moved, ravel(y0), self._smooth(state), has_aux=True)
-
-        def at(ddense, t):
-            value = lambda dense: ravel(
-                self.solver.interpolation_cls(t0=t0, t1=t1, **eqx.combine(dense, still)).evaluate(t)
-            )
-            return jax.jvp(value, (dense,), (ddense,))[1]
-
-        return LinearStep(push, at)
-
-    def row_tangent(self, row, like, before, after):
-        del row, after
-        w, memory = before
-        return None, None, unravel_like(like, w), memory, None
-
-
-def steps_of(solver: Any, controller: Any) -> AbstractSteps:
-    """The steps of a solver, without the tangents that it carries along."""
-    still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
-    jumps = not isinstance(controller, still)
-    if isinstance(solver, AbstractMultistep):
-        solver = eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none)
-        return WholeSteps(solver, False, jumps)
-    if isinstance(solver, WithTangents):
-        return WholeSteps(solver.inner, True, jumps)
-    return WholeSteps(solver, False, jumps)
+from .steps import AbstractSteps, LinearStep
+from .whole_steps import steps_of
 
 
 class Saved(eqx.Module):
@@ -443,14 +322,14 @@ def _recorded(terms, args, init_state, fixed, max_steps, most):
     size = min(most, max_steps)
 
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
-        layout = Layout(eqx.filter_eval_shape(lambda init: steps.row(init, body_fun(init)), init))
+        layout = Layout(eqx.filter_eval_shape(lambda init: steps.row(terms, init, body_fun(init)), init))
 
         def body(carry):
             old, rows = carry
             new = body_fun(old)
             kept = new.num_accepted_steps > old.num_accepted_steps
             index = old.num_accepted_steps % size
-            packed = layout.packed(steps.row(old, new))
+            packed = layout.packed(steps.row(terms, old, new))
             return new, [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
 
         rows = [jnp.zeros((size, *x.shape), x.dtype) for x in layout.vectors]
@@ -489,7 +368,7 @@ def _recorded_jvp(primals, tangents):
         still=still,
         steps=steps,
         rows=rows,
-        layout=Layout(eqx.filter_eval_shape(steps.row, init_state, final)),
+        layout=Layout(eqx.filter_eval_shape(steps.row, terms, init_state, final)),
         count=final.num_accepted_steps,
         saved=saved,
         like=y0,

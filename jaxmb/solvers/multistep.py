@@ -16,6 +16,7 @@ from .._compat import any_of_batch, from_controller
 from .evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
+from .steps import AbstractSteps
 from .tangent import Tangent, TangentControl, pushed, pushed_only
 from .tolerances import MultistepNorm, Tolerances, norm_of
 
@@ -127,6 +128,14 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
         return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
+
+    def linear_steps(self, jumps: bool) -> AbstractSteps | None:
+        """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.
+
+        **Arguments:** `jumps`: whether steps may begin after a jump.
+        """
+        del jumps
+        return None
 
     @abc.abstractmethod
     def statistics(self, solver_state: Any, controller_state: Any, stats: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,166 @@
+"""The formulas of a step of Adams' method, and the step as a linear map.
+
+A step evaluates its field twice, at a prediction and at the corrected state, which differ by the local error. The
+tangent of a step uses one linearisation for both, at the corrected state, which is on its manifold and whose field is
+known: nothing is solved, and little of a step is stored. This is the same method, applied to the tangent equation on
+the mesh of the motion; it differs from the derivative of the step by less than the local error of the tangent.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .._compat import any_of_batch
+from ._history import INDEX, LENGTH, basis_means, before_each, known_differences, start, step_end
+from ._interpolation import RateInterpolation
+from .evaluation import after_jump, at_solution, field_of, kept_of_chart, next_chart, ravel, unravel_like
+from .steps import AbstractSteps, LinearStep
+
+
+class Coefficients(eqx.Module):
+    """The coefficients of a step.
+
+    **Fields:** its length `h` and its `end`; `products` with the divided differences, see `sums`; `last`: the integral
+    of what a new derivative contributes to the corrector; `differences` of such integrals for three orders.
+    """
+
+    h: Float[Array, ""]
+    end: Any
+    products: Float[Array, "rows length"]
+    last: Float[Array, ""]
+    differences: Float[Array, "3"]
+
+    def sums(self, differences: Float[Array, "length n"]) -> tuple[Array, Array, Array]:
+        """At the end of the step, the polynomials through the last 0, 1, 2, ... derivatives, and those through the last
+        k - 1, k and k + 1; and the mean over the step of that through the last k.
+        """
+        sums = self.products @ differences
+        return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
+
+
+def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, dtype: Any) -> Coefficients:
+    """Those of a step of an order from the latest point of a mesh to `t1`."""
+    h = (t1 - mesh[0]).astype(dtype)
+    end = step_end(mesh, t1)
+    means, values = basis_means(mesh, mesh[0], end)
+    means, values = means.astype(dtype), values.astype(dtype)
+    lengths = order + np.array([-1, 0, 1, 0], np.int32)
+    near = jnp.stack([values, values, values, means])
+    near = jnp.where(lengths[:, None] > INDEX[None], near, jnp.zeros((), dtype))
+    every = jnp.asarray(before_each(LENGTH), dtype) * values[None]
+    integrals = means / values
+    padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
+    differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
+    return Coefficients(h, end, jnp.concatenate([every, near]), integrals[order], differences)
+
+
+class Jump(eqx.Module):
+    """What is stored of a start: whether there was a `jump`, its time, and the state and the chart before it."""
+
+    jump: Any
+    time: Any
+    y: Float[Array, " n"]
+    chart: Any
+
+
+class AdamsRow(eqx.Module):
+    """What is stored of a step.
+
+    **Fields:** its `end`; the `mesh`, the `order` and the number of `known` points at its start; state `y` and field
+    `f` at its end; what is `kept` of the chart there; `jump` at its start, None where steps have none.
+    """
+
+    end: Any
+    mesh: Float[Array, " length"]
+    order: Int[Array, ""]
+    known: Int[Array, ""]
+    y: Float[Array, " n"]
+    f: Float[Array, " n"]
+    kept: Any
+    jump: Jump | None
+
+
+class AdamsSteps(AbstractSteps):
+    """The steps of `Adams`; `jumps`: whether they may begin after a jump."""
+
+    jumps: bool = eqx.field(static=True)
+
+    def row(self, terms, before, after):
+        old, new = before.solver_state, after.solver_state
+        mesh, order, known, jump = old.history.mesh, old.order, old.history.known, None
+        if self.jumps:
+            made = jnp.asarray(before.made_jump)
+            first = start(before.tprev, new.history.differences[0], before.tnext - before.tprev)
+            of_start = first.mesh, jnp.ones_like(order), first.known
+            mesh, order, known = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, known))
+            jump = Jump(made, before.tprev, ravel(before.y), old.chart)
+        kept = kept_of_chart(terms, new.chart)
+        return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
+
+    def end(self, row):
+        return row.end
+
+    def memory(self, solver_state):
+        return solver_state.memory
+
+    def linearised(self, of, moved, like, row):
+        def at(moved, flat):
+            terms, args = of(moved)
+            return at_solution(terms, row.end, flat, row.f, like, row.kept, args)
+
+        _, field = jax.linearize(at, moved, row.y)
+        formulas = coefficients(row.mesh, row.order, row.end, row.y.dtype)
+        used = (row.order >= INDEX)[:, None]
+
+        def push(dmoved, w, memory):
+            if row.jump is not None:
+                w, memory = _restarted(of, moved, like, row.jump, dmoved, w, memory)
+            partial_sums, neighbours, mean = formulas.sums(memory)
+            predicted = w + formulas.h * mean
+            _, f = field(dmoved, predicted)
+            corrected = predicted + formulas.h * formulas.last * (f - neighbours[1])
+            w, f = field(dmoved, corrected)
+            memory = known_differences(row.known, f, partial_sums)
+            mismatch = predicted + formulas.h * formulas.last * (f - neighbours[1]) - w
+            zero = jnp.zeros((), w.dtype)
+            dense = {"y1": unravel_like(like, w), "differences": jnp.where(used, memory, zero), "mesh": None}
+            return w, memory, dense | {"mismatch": mismatch}
+
+        mesh = jnp.concatenate([formulas.end[None], row.mesh[:-1]])
+
+        def within(dense, t):
+            # Dense output is linear in everything but the mesh.
+            return ravel(RateInterpolation(row.mesh[0], row.end, **dense | {"mesh": mesh}).evaluate(t))
+
+        return LinearStep(push, within)
+
+    def row_tangent(self, row, like, before, after):
+        w, memory = after
+        none = jax.tree.map(lambda _: None, row)
+        parts = lambda row: (row.y, row.f)
+        out = eqx.tree_at(parts, none, (w, memory[0]), is_leaf=lambda x: x is None)
+        if row.jump is None:
+            return out
+        return eqx.tree_at(lambda row: row.jump.y, out, before[0], is_leaf=lambda x: x is None)
+
+
+def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
+    """The tangents after a jump, where there was one."""
+
+    def restart(moved, flat):
+        terms, args = of(moved)
+        y = after_jump(terms, jump.time, unravel_like(like, flat), args)
+        chart = next_chart(terms, jump.time, y, jump.chart, args)
+        (flat, f), _ = field_of(terms, jump.time, y, chart, args)(jump.time, ravel(y))
+        return flat, jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
+
+    def restarted():
+        _, new = jax.jvp(restart, (moved, jump.y), (dmoved, w))
+        return jax.tree.map(lambda new, old: jnp.where(jump.jump, new, old), new, (w, memory))
+
+    return lax.cond(any_of_batch(jump.jump), restarted, lambda: (w, memory))

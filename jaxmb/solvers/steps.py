@@ -1,0 +1,51 @@
+"""The steps of a solver as linear maps of tangents."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, PyTree
+
+
+class LinearStep(NamedTuple):
+    """A step as linear maps of tangents.
+
+    **Fields:** `push(dmoved, w, memory)`: the tangent of the raveled state at the end, that of the solver's memory, and
+    that of the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time in the step, from the
+    latter.
+    """
+
+    push: Callable[..., tuple[Array, PyTree, PyTree]]
+    at: Callable[[PyTree, Any], Array]
+
+
+class AbstractSteps(eqx.Module):
+    """How a solver's steps are stored, and linearised from what is stored."""
+
+    @abc.abstractmethod
+    def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
+        """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
+
+    @abc.abstractmethod
+    def end(self, row: PyTree[Array]) -> Any:
+        """The time at the end of a step."""
+
+    @abc.abstractmethod
+    def memory(self, solver_state: Any) -> PyTree[Array]:
+        """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
+
+    @abc.abstractmethod
+    def linearised(self, of: Callable, moved: PyTree[Array], like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
+        """A step at its row.
+
+        **Arguments:** `of(moved)`: the solver's terms and their arguments; `like`: a state before raveling.
+        """
+
+    @abc.abstractmethod
+    def row_tangent(
+        self, row: PyTree[Array], like: PyTree[Array], before: tuple[Array, PyTree], after: tuple[Array, PyTree]
+    ) -> PyTree[Array]:
+        """The tangent of a row, from those of the state and the memory before and after its step; None for numbers that
+        have none.
+        """
