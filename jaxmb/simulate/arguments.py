@@ -22,10 +22,6 @@ from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
 
-# Reverse mode keeps this many steps, fewer where they do not fit in this many bytes, and recomputes beyond.
-_CHECKPOINTS = 4096
-_CHECKPOINT_BYTES = 2**28
-
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
     "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
@@ -57,12 +53,6 @@ def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales 
 
 def with_restarts(controller: Any, restarts: Any) -> Any:
     return controller if restarts is None else diffrax.ClipStepSizeController(controller, jump_ts=restarts)
-
-
-def default_adjoint(system: AbstractSystem, state: State, max_steps: int) -> diffrax.AbstractAdjoint:
-    size = 16 * state.q.dtype.itemsize * (system.nq + system.nu + system.nz)
-    kept = min(max_steps, _CHECKPOINTS, max(_CHECKPOINT_BYTES // size, 64))
-    return diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
 
 
 def check_error_estimate(saveat, stepsize_controller, event) -> None:

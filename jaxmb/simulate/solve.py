@@ -25,7 +25,12 @@ from ..states.consistency import consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
+from .moving_times import at_frozen_start, at_moving_times, is_moving, saved_times
 from .outcome import Outcome, has_failed
+
+# Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
+_MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 4096, 64, 2**27
+
 
 class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
@@ -69,17 +74,23 @@ class Problem(NamedTuple):
             moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in self.changes.items()})
             along = eqx.filter_jvp(lambda step: assembled(moved(step))[0], (0.0,), (1.0,))[1]
         options = self.options | {"y0": start}
-        return integrate(system, method, policy, term, prepared, options, self.interpolated, along, valid)
+        moving = is_moving(options, options["saveat"])
+        return integrate(system, method, policy, term, prepared, options, self.interpolated, along, valid, moving)
 
 
 @eqx.filter_jit
-def integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid):
+def integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid, moving):
     start, first = options["y0"], options["saveat"].subs[0]
     finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
     if start.z is not None:
         finite = finite & jnp.all(jnp.isfinite(start.z))
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
-    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), first.ts
+    ends = options["t0"], options["t1"]
+    options = options | lax.stop_gradient({name: options[name] for name in ("t0", "t1", "dt0")})
+    if moving[0]:
+        start = at_frozen_start(term, ends[0], start)
+        options["y0"] = start
+    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
     options = options | {"t1": at_once(options["t1"])}
     controller, after = options["stepsize_controller"], times
     jumps = controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
@@ -99,6 +110,10 @@ def integrate(system, formulation, manifold, term, solver, options, interpolated
         saved, lost = _corrected(system, options, ts, saved, correction)
     if after is not times:
         ts = _replaced(ts, after, times)
+    if any(moving):
+        ts = saved_times(first, ts, *ends)
+        if are_states and moving[1]:
+            saved = at_moving_times(term, ts, saved)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
@@ -149,10 +164,36 @@ def _solve_jvp(primals, tangents):
 def _solve_with_tangents(arguments, control):
     term, solver, options = arguments
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
-    adjoint = MeshAdjoint(4096) if options["adjoint"] is None else options["adjoint"]
-    own = {"stepsize_controller": controller, "adjoint": adjoint}
-    solution = diffrax.diffeqsolve(term, solver, throw=False, **options | own)
+    options = options | {"stepsize_controller": controller}
+    if options["adjoint"] is None:
+        solution = _solve_states(term, solver, options | {"adjoint": MeshAdjoint(_rows(options))})
+    else:
+        solution = diffrax.diffeqsolve(term, solver, throw=False, **options)
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
+
+
+def _solve_states(term, solver, options):
+    """The solution with states saved first, and then what the user's function makes of them."""
+    function, states = options["saveat"].subs[0].fn, diffrax.SubSaveAt(t1=True).fn
+    if function is states:
+        return diffrax.diffeqsolve(term, solver, throw=False, **options)
+    saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], states)
+    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options | {"saveat": saveat})
+    ts, finite = solution.ts[0], jnp.isfinite(solution.ts[0])
+
+    def saved(t, y, finite):
+        # Entries after the end of a run are infinite, and their derivatives zero.
+        t, y = jax.tree.map(lambda x, x0: jnp.where(finite, x, x0), (t, y), (options["t0"], options["y0"]))
+        return jax.tree.map(lambda x: jnp.where(finite, x, jnp.asarray(jnp.inf, x.dtype)), function(t, y, None))
+
+    ys = jax.vmap(saved)(ts, solution.ys[0], finite)
+    return eqx.tree_at(lambda solution: solution.ys[0], solution, ys)
+
+
+def _rows(options) -> int:
+    """The number of steps that are kept for derivatives."""
+    size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(options["y0"]))
+    return max(min(_MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
 
 
 def _tangent_control(system, options, direction) -> TangentControl:

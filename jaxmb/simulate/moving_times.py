@@ -1,0 +1,76 @@
+"""Derivatives by the times of a run: its start, its end, and those that states are saved at.
+
+The mesh of a run has no derivatives. Where a time moves, the states that belong to it follow by Taylor's series of the
+solution, with coefficients from the field there: its first two terms, so that second derivatives are right as well.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ..linalg.arrays import is_traced
+
+
+def is_moving(times: Any, saveat: diffrax.SaveAt) -> tuple[bool, bool]:
+    """Whether the start, and the end or a saved time, may have derivatives."""
+    saved = [sub.ts for sub in jax.tree.leaves(saveat.subs, is_leaf=_is_series)]
+    return is_traced(times["t0"]), is_traced((times["t1"], saved))
+
+
+def _is_series(x):
+    return isinstance(x, diffrax.SubSaveAt)
+
+
+@eqx.filter_custom_jvp
+def at_frozen_start(term: Any, t0: Any, y0: Any) -> Any:
+    """The state that a run from a moving `t0` has at the time where it is now."""
+    return y0
+
+
+@at_frozen_start.def_jvp
+def _at_frozen_start_jvp(primals, tangents):
+    return eqx.filter_jvp(lambda term, t, y: _series(term, t, y, lax.stop_gradient(t) - t), primals, tangents)
+
+
+@eqx.filter_custom_jvp
+def at_moving_times(term: Any, ts: Any, ys: Any) -> Any:
+    """Saved states at moving times, from those at the times where they are now."""
+    return ys
+
+
+@at_moving_times.def_jvp
+def _at_moving_times_jvp(primals, tangents):
+    def moved(term, ts, ys):
+        at = lambda t, y: _series(term, lax.stop_gradient(t), y, t - lax.stop_gradient(t))
+        finite = jnp.isfinite(ts)
+        first = jnp.argmax(finite)
+        # Entries after the end of a run have no field.
+        inside = jax.tree.map(lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, x[first]), (ts, ys))
+        new = jax.vmap(at)(*inside)
+        return jax.tree.map(lambda x, y: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, ys)
+
+    return eqx.filter_jvp(moved, primals, tangents)
+
+
+def _series(term, t, y, step):
+    field = lambda t, y: term.vf(t, y, None)
+    first, second = jax.jvp(field, (t, y), (jnp.ones_like(t), field(t, y)))
+    return jax.tree.map(lambda y, f, g: y + step.astype(y.dtype) * (f + step.astype(y.dtype) / 2 * g), y, first, second)
+
+
+def saved_times(series: diffrax.SubSaveAt, found: Any, start: Any, end: Any) -> Any:
+    """The times of a series of saved states with the derivatives of those that were asked for.
+
+    **Arguments:** `found`: the times without derivatives.
+    """
+    if series.steps:
+        # Only the ends of a run move among its steps.
+        moved = jnp.where(found == lax.stop_gradient(end), end, found)
+        return moved.at[0].set(jnp.where(found[0] == lax.stop_gradient(start), start, moved[0])) if series.t0 else moved
+    asked = ([start[None]] if series.t0 else []) + ([] if series.ts is None else [series.ts])
+    asked = jnp.concatenate(asked + ([end[None]] if series.t1 else []))
+    return jnp.where(found == lax.stop_gradient(asked), asked, found)
