@@ -102,9 +102,6 @@ class AdamsSteps(AbstractSteps):
         kept = kept_of_chart(terms, new.chart)
         return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
 
-    def end(self, row):
-        return row.end
-
     def memory(self, solver_state):
         return solver_state.memory
 

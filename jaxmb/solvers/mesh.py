@@ -14,13 +14,26 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, PyTree
 
-from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
+from .._compat import any_of_batch, buffer_set, loop_of_diffrax, save_states, while_loop
 from ..linalg.linear_map import filled, linear_map
 from .evaluation import freeze, ravel, unravel_like
 from .steps import AbstractSteps, LinearStep
 from .whole_steps import steps_of
+
+
+class Row(NamedTuple):
+    """What is stored of a step.
+
+    **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
+    before the first; the `end` of this one; what its linearisation needs, its `own`.
+    """
+
+    since: Any
+    end: Any
+    own: Any
 
 
 class Saved(eqx.Module):
@@ -56,7 +69,7 @@ class Mesh(eqx.Module):
 
     **Fields:** `moved`, `still`: the numbers of the terms and their arguments that have tangents, and the rest;
     `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
-    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an `event`.
+    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an `event`; its `segments`, None where there is one only.
     """
 
     moved: PyTree
@@ -70,16 +83,18 @@ class Mesh(eqx.Module):
     memory: PyTree
     dense: bool = eqx.field(static=True)
     event: bool = eqx.field(static=True)
+    segments: "Segments | None"
 
     @property
     def size(self) -> int:
         return self.rows[0].shape[0]
 
-    def row(self, k: Any) -> PyTree[Array]:
-        return self.layout.unpacked([buffer[k] for buffer in self.rows])
+    def row(self, rows: list[Array], k: Any) -> Row:
+        """The row of a step, from those of its segment."""
+        return self.layout.unpacked([buffer[k % self.size] for buffer in rows])
 
-    def linearised(self, row: PyTree[Array]) -> LinearStep:
-        return self.steps.linearised(lambda moved: eqx.combine(moved, self.still), self.moved, self.like, row)
+    def linearised(self, row: Row) -> LinearStep:
+        return self.steps.linearised(lambda moved: eqx.combine(moved, self.still), self.moved, self.like, row.own)
 
     def blank(self) -> Tangents:
         """Zeros."""
@@ -96,58 +111,114 @@ class Mesh(eqx.Module):
 
     def _shapes(self) -> PyTree:
         """The shapes of the tangent of a step's dense output."""
-        run = lambda moved, memory: self.linearised(self.row(0)).push(moved, ravel(self.like), memory)[2]
+        run = lambda moved, memory: self.linearised(self.row(self.rows, 0)).push(moved, ravel(self.like), memory)[2]
         return eqx.filter_eval_shape(run, self.moved, self.memory)
 
     def push(self, x: PyTree) -> Tangents:
         """The tangents that one of the terms, one of the first state and one of its memory cause."""
-        dmoved, w, memory = x
+        if self.segments is None:
+            return self._out(self._pushed(x[0], self._first(x), self.rows, self.count))
+
+        def body(carry):
+            segment, inner = carry
+            last = jnp.minimum((segment + 1) * self.size, self.count)
+            return segment + 1, self._pushed(x[0], inner, self._rows_of(segment), last)
+
+        carry = while_loop(
+            lambda carry: carry[0] * self.size < self.count,
+            body,
+            (0, self._first(x)),
+            max_steps=None,
+            buffers=lambda carry: _tables(carry[1]),
+            kind="lax",
+        )
+        return self._out(carry[1])
+
+    def push_once(self, x: PyTree) -> Tangents:
+        """`push` in a form that can be differentiated by the rows: NaN where they are more than those kept."""
+        out = self._out(self._pushed(x[0], self._first(x), self.rows, self.count))
+        lost = self.count > self.size
+        return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), out)
+
+    def _rows_of(self, segment: Any) -> list[Array]:
+        """The rows of a segment of the run."""
+        assert self.segments is not None
+        terms, args = freeze(eqx.combine(self.moved, self.still))
+        is_last = (segment + 1) * self.size >= self.count
+        again = lambda: self.segments.rows(terms, args, segment, self.size)
+        rows = lax.cond(any_of_batch(~is_last), again, lambda: self.rows)
+        return jax.tree.map(lambda new, last: jnp.where(is_last, last, new), rows, self.rows)
+
+    def _first(self, x):
+        """The carry of the loop over steps at its start."""
+        _, w, memory = x
         out = self.blank()
         saved = tuple(
             table.at[0].set(w) if series.start else table for series, table in zip(self.saved, out.saved, strict=True)
         )
         places = tuple(jnp.array([int(series.start), 0]) for series in self.saved)
-        first = 0, (w, memory), saved, places, out.rows, out.dense, out.last
+        return jnp.zeros_like(self.count), (w, memory), saved, places, out.rows, out.dense, out.last
+
+    def _out(self, carry) -> Tangents:
+        _, end, saved, _, rows, dense, last = carry
+        return Tangents(end, saved, rows, dense, last)
+
+    def _pushed(self, dmoved, carry, rows_of_segment, count):
+        """The carry after the steps before `count`."""
 
         def body(carry):
             k, before, saved, places, rows, dense, _ = carry
-            row = self.row(k)
+            row = self.row(rows_of_segment, k)
             step = self.linearised(row)
             *after, ddense = step.push(dmoved, *before)
             after = tuple(after)
-            along = self.layout.packed_tangent(row, self.steps.row_tangent(row, self.like, before, after))
-            rows = [buffer_set(buffer, k, x) for buffer, x in zip(rows, along, strict=True)]
+            own = self.steps.row_tangent(row.own, self.like, before, after)
+            along = self.layout.packed_tangent(row, Row(None, None, own))
+            rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda buffer, x: buffer_set(buffer, k, x), dense, ddense)
-            end = self.steps.end(row)
             each = zip(self.saved, saved, places, strict=True)
-            new = [_saved(series, table, place, k, end, after[0], ddense, step.at) for series, table, place in each]
+            new = [_saved(series, table, place, k, row.end, after[0], ddense, step.at) for series, table, place in each]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
             return k + 1, after, saved, places, rows, dense, ddense if self.event else None
 
-        carry = while_loop(
-            lambda carry: carry[0] < self.count,
-            body,
-            first,
-            max_steps=None,
-            buffers=lambda carry: (carry[2], carry[4], carry[5]),
-            kind="lax",
+        return while_loop(
+            lambda carry: carry[0] < count, body, carry, max_steps=None, buffers=_tables, kind="lax"
         )
-        _, end, saved, _, rows, dense, last = carry
-        return self._known(Tangents(end, saved, rows, dense, last))
 
     def pull(self, cotangents: Tangents) -> PyTree:
         """The transpose of `push`; cotangents that are None are zero."""
-        lw, lmemory = filled((ravel(self.like), self.memory), cotangents.end)
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes())
-        given = cotangents.saved
+        end = filled((ravel(self.like), self.memory), cotangents.end)
         places = tuple(series.passed for series in self.saved)
+        carry = self.count, *end, places, jax.tree.map(jnp.zeros_like, self.moved)
+        if self.segments is None:
+            carry = self._pulled(cotangents, carry, self.rows, 0)
+        else:
+
+            def body(carry):
+                segment, inner = carry
+                segment = segment - 1
+                return segment, self._pulled(cotangents, inner, self._rows_of(segment), segment * self.size)
+
+            carry = -(-self.count // self.size), carry
+            _, carry = while_loop(
+                lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax"
+            )
+        _, lw, lmemory, places, total = carry
+        for series, table in zip(self.saved, cotangents.saved, strict=True):
+            if series.start and table is not None:
+                lw = lw + table[0]
+        return total, lw, lmemory
+
+    def _pulled(self, cotangents: Tangents, carry, rows, first):
+        """The carry of the loop over steps before the step `first`."""
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes())
         nothing = jax.tree.map(jnp.zeros_like, self.moved)
 
         def body(carry):
             k, lw, lmemory, places, total = carry
             k = k - 1
-            row = self.row(k)
+            row = self.row(rows, k)
             step = self.linearised(row)
             ldense = zeros
             if cotangents.dense is not None:
@@ -157,28 +228,20 @@ class Mesh(eqx.Module):
                 ldense = jax.tree.map(
                     lambda z, c: z if c is None else z + jnp.where(is_last, c, 0), ldense, cotangents.last
                 )
-            before = jnp.where(k > 0, self.steps.end(self.row(jnp.maximum(k - 1, 0))), -jnp.inf)
             left = []
-            for series, table, place in zip(self.saved, given, places, strict=True):
-                lw, ldense, place = _unsaved(series, table, place, k, before, lw, ldense, step.at)
+            for series, table, place in zip(self.saved, cotangents.saved, places, strict=True):
+                lw, ldense, place = _unsaved(series, table, place, k, row.since, lw, ldense, step.at)
                 left.append(place)
-            pulled = jax.linear_transpose(step.push, nothing, lw, lmemory)((lw, lmemory, ldense))
-            dmoved, lw, lmemory = pulled
+            dmoved, lw, lmemory = jax.linear_transpose(step.push, nothing, lw, lmemory)((lw, lmemory, ldense))
             return k, lw, lmemory, tuple(left), jax.tree.map(jnp.add, total, dmoved)
 
-        carry = self.count, lw, lmemory, places, nothing
-        _, lw, lmemory, places, total = while_loop(
-            lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax"
-        )
-        for series, table in zip(self.saved, given, strict=True):
-            if series.start and table is not None:
-                lw = lw + table[0]
-        return self._known((total, lw, lmemory))
+        return while_loop(lambda carry: carry[0] > first, body, carry, max_steps=None, buffers=None, kind="lax")
 
-    def _known(self, tree: PyTree) -> PyTree:
-        """The same numbers, NaN where not all rows were kept."""
-        lost = self.count > self.size
-        return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), tree)
+
+def _tables(carry):
+    """The buffers in the carry of the loop over steps."""
+    _, _, saved, _, rows, dense, _ = carry
+    return saved, rows, dense
 
 
 def _saved(series: Saved, table, place, k, end, w, dense, at):
@@ -203,9 +266,9 @@ def _saved(series: Saved, table, place, k, end, w, dense, at):
     return table, place
 
 
-def _unsaved(series: Saved, table, place, k, before, lw, ldense, at):
+def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
     """The transpose: cotangents of the end of a step and of its dense output with those of the states that were saved
-    in it, after the time `before`, and where the series is before it.
+    in it, `since` a time, and where the series is before it.
     """
     if series.steps:
         here = (k + 1) % series.steps == 0
@@ -217,7 +280,7 @@ def _unsaved(series: Saved, table, place, k, before, lw, ldense, at):
 
         def more(carry):
             _, place = carry
-            return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > before)
+            return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > since)
 
         def unsave(carry):
             ldense, place = carry
@@ -295,7 +358,7 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         del throw, passed_solver_state, passed_controller_state
         steps = steps_of(solver, options["stepsize_controller"])
         fixed = freeze((solver, saveat, options, steps))
-        final, _ = _recorded(terms, args, init_state, fixed, max_steps, self.most)
+        final, *_ = _recorded(terms, args, init_state, fixed, max_steps, self.most)
         given = lambda *_, **__: final
         return _run(given, terms, args, init_state, fixed, max_steps)
 
@@ -317,43 +380,112 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
 
 @eqx.filter_custom_jvp
 def _recorded(terms, args, init_state, fixed, max_steps, most):
-    """The last state of diffrax's loop, and the packed rows of its steps."""
+    """The last state of diffrax's loop, the packed rows of the last segment of its steps, and the packed starts of all
+    segments, of `most` steps each; None where there is one segment only.
+    """
+    steps, size = fixed[3], min(most, max_steps)
+    segments = -(-max_steps // size)
+    return _run_recorded(terms, args, init_state, fixed, max_steps, size, segments if segments > 1 else None, None, -jnp.inf)
+
+
+def _run_recorded(terms, args, init_state, fixed, max_steps, size, segments, last, since):
+    """The same, of the steps until `last` of them are accepted; `since`: the end of the last step before them."""
+    since = jnp.asarray(since, init_state.tprev.dtype)
     steps, found = fixed[3], []
-    size = min(most, max_steps)
+    row = lambda since, old, new: Row(since, old.tnext, steps.row(terms, old, new))
 
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
-        layout = Layout(eqx.filter_eval_shape(lambda init: steps.row(terms, init, body_fun(init)), init))
+        layout = Layout(eqx.filter_eval_shape(lambda init: row(since, init, body_fun(init)), init))
+        of_starts = Layout(eqx.filter_eval_shape(lambda init: _start_of(since, body_fun(init), steps.jumps), init))
+
+        def proceed(carry):
+            running = cond_fun(carry[0])
+            return running if last is None else running & (carry[0].num_accepted_steps < last)
 
         def body(carry):
-            old, rows = carry
+            old, since, rows, starts = carry
             new = body_fun(old)
             kept = new.num_accepted_steps > old.num_accepted_steps
             index = old.num_accepted_steps % size
-            packed = layout.packed(steps.row(terms, old, new))
-            return new, [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
+            packed = layout.packed(row(since, old, new))
+            rows = [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
+            if segments is not None:
+                first, segment = kept & (index == 0), old.num_accepted_steps // size
+                packed = of_starts.packed(_start_of(since, old, steps.jumps))
+                starts = [buffer_set(buffer, segment, x, first) for buffer, x in zip(starts, packed, strict=True)]
+            return new, jnp.where(kept, old.tnext, since), rows, starts
 
-        rows = [jnp.zeros((size, *x.shape), x.dtype) for x in layout.vectors]
-        final, rows = while_loop(
-            lambda carry: cond_fun(carry[0]),
+        table = lambda length, layout: [jnp.zeros((length, *x.shape), x.dtype) for x in layout.vectors]
+        starts = None if segments is None else table(segments, of_starts)
+        carry = while_loop(
+            proceed,
             body,
-            (init, rows),
+            (init, since, table(size, layout), starts),
             max_steps=max_steps,
-            buffers=lambda carry: (buffers(carry[0]), carry[1]),
+            buffers=lambda carry: (buffers(carry[0]), carry[2], carry[3]),
             kind="lax",
         )
-        found.append((final, rows))
+        final, _, rows, starts = carry
+        found.append((final, rows, starts))
         return final
 
     _run(outer, terms, args, init_state, fixed, max_steps)
     return found[0]
 
 
+def _start_of(since, state, jumps):
+    """What a state of diffrax's loop is made of where a segment of a run starts: without what is saved."""
+    made_jump = jnp.asarray(state.made_jump) if jumps else None
+    return since, (
+        state.tprev,
+        state.tnext,
+        state.y,
+        made_jump,
+        state.solver_state,
+        state.controller_state,
+        state.num_accepted_steps,
+    )
+
+
+class Segments(eqx.Module):
+    """The segments of a run that has more steps than rows are kept of, whose rows are found again from their starts.
+
+    **Fields:** the packed `starts`; the `layout` of a start; `first`: the state of diffrax's loop at the start of the
+    run; what is `fixed` in it.
+    """
+
+    starts: list[Array]
+    layout: "Layout" = eqx.field(static=True)
+    first: Any
+    fixed: Any
+    max_steps: int = eqx.field(static=True)
+
+    def rows(self, terms: PyTree, args: PyTree, segment: Any, size: int) -> list[Array]:
+        """The rows of a segment."""
+        solver, saveat, options, steps = self.fixed
+        saveat = eqx.tree_at(lambda saveat: (saveat.subs, saveat.dense), saveat, (None, False), is_leaf=_is_none)
+        options = options | {"event": None, "progress_meter": diffrax.NoProgressMeter()}
+        start = self.layout.unpacked([buffer[segment] for buffer in self.starts])
+        since, (*given, made_jump, solver_state, controller_state, count) = start
+        places = lambda s: (
+            (s.tprev, s.tnext, s.y, s.made_jump, s.solver_state, s.controller_state, s.num_accepted_steps)
+            + (s.save_state, s.dense_ts, s.dense_infos, s.dense_save_index, s.progress_meter_state)
+            + (s.event_tprev, s.event_tnext, s.event_dense_info, s.event_values, s.event_mask)
+        )
+        made_jump = False if made_jump is None else made_jump
+        new = (*given, made_jump, solver_state, controller_state, count, *[None] * 10)
+        init_state = eqx.tree_at(places, self.first, new, is_leaf=_is_none)
+        fixed = solver, saveat, options, steps
+        last = (segment + 1) * size
+        return _run_recorded(terms, args, init_state, fixed, self.max_steps, size, None, last, since)[1]
+
+
 @_recorded.def_jvp
 def _recorded_jvp(primals, tangents):
-    terms, args, init_state, fixed, _, _ = primals
+    terms, args, init_state, fixed, max_steps, _ = primals
     dterms, dargs, dinit, *_ = tangents
     out = _recorded(*primals)
-    final, rows = out
+    final, rows, starts = out
     _, saveat, options, steps = fixed
     moved, still = eqx.partition((terms, args), jax.tree.map(_is_known, (dterms, dargs), is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
@@ -368,17 +500,25 @@ def _recorded_jvp(primals, tangents):
         still=still,
         steps=steps,
         rows=rows,
-        layout=Layout(eqx.filter_eval_shape(steps.row, terms, init_state, final)),
+        layout=Layout(eqx.filter_eval_shape(lambda a, b: Row(b.tprev, b.tprev, steps.row(terms, a, b)), init_state, final)),
         count=final.num_accepted_steps,
         saved=saved,
         like=y0,
         memory=memory,
         dense=bool(saveat.dense),
         event=options["event"] is not None,
+        segments=_segments(starts, final, init_state, fixed, max_steps),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
-    along = linear_map(Mesh.push, Mesh.pull, Mesh.push, mesh, x, like)
-    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows))
+    along = linear_map(Mesh.push, Mesh.pull, Mesh.push_once, mesh, x, like)
+    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, starts))
+
+
+def _segments(starts, final, init_state, fixed, max_steps):
+    if starts is None:
+        return None
+    layout = Layout(eqx.filter_eval_shape(lambda state: _start_of(state.tprev, state, fixed[3].jumps), final))
+    return Segments(starts, layout, *freeze((init_state, fixed)), max_steps)
 
 
 def _of_loop(final, along: Tangents, like):

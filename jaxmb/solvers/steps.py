@@ -2,10 +2,15 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, PyTree
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class LinearStep(NamedTuple):
@@ -21,15 +26,16 @@ class LinearStep(NamedTuple):
 
 
 class AbstractSteps(eqx.Module):
-    """How a solver's steps are stored, and linearised from what is stored."""
+    """How a solver's steps are stored, and linearised from what is stored.
+
+    **Fields:** `jumps`: whether steps may begin after a jump.
+    """
+
+    jumps: AbstractVar[bool]
 
     @abc.abstractmethod
     def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
         """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
-
-    @abc.abstractmethod
-    def end(self, row: PyTree[Array]) -> Any:
-        """The time at the end of a step."""
 
     @abc.abstractmethod
     def memory(self, solver_state: Any) -> PyTree[Array]:

@@ -30,9 +30,6 @@ class WholeSteps(AbstractSteps):
         jump = jnp.asarray(before.made_jump) if self.jumps else None
         return before.tprev, before.tnext, before.y, self._own(before.solver_state), jump
 
-    def end(self, row):
-        return row[1]
-
     def memory(self, solver_state):
         return self._smooth(self._own(solver_state))
 
