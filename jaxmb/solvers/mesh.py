@@ -398,36 +398,49 @@ def _run_recorded(terms, args, init_state, fixed, max_steps, size, segments, las
         layout = Layout(eqx.filter_eval_shape(lambda init: row(since, init, body_fun(init)), init))
         of_starts = Layout(eqx.filter_eval_shape(lambda init: _start_of(since, body_fun(init), steps.jumps), init))
 
-        def proceed(carry):
-            running = cond_fun(carry[0])
-            return running if last is None else running & (carry[0].num_accepted_steps < last)
+        table = lambda length, layout: [jnp.zeros((length, *x.shape), x.dtype) for x in layout.vectors]
 
         def body(carry):
-            old, since, rows, starts = carry
+            old, since, rows = carry
             new = body_fun(old)
             kept = new.num_accepted_steps > old.num_accepted_steps
-            index = old.num_accepted_steps % size
             packed = layout.packed(row(since, old, new))
+            index = old.num_accepted_steps % size
             rows = [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
-            if segments is not None:
-                first, segment = kept & (index == 0), old.num_accepted_steps // size
-                packed = of_starts.packed(_start_of(since, old, steps.jumps))
-                starts = [buffer_set(buffer, segment, x, first) for buffer, x in zip(starts, packed, strict=True)]
-            return new, jnp.where(kept, old.tnext, since), rows, starts
+            return new, jnp.where(kept, old.tnext, since), rows
 
-        table = lambda length, layout: [jnp.zeros((length, *x.shape), x.dtype) for x in layout.vectors]
-        starts = None if segments is None else table(segments, of_starts)
-        carry = while_loop(
-            proceed,
-            body,
-            (init, since, table(size, layout), starts),
-            max_steps=max_steps,
-            buffers=lambda carry: (buffers(carry[0]), carry[2], carry[3]),
-            kind="lax",
-        )
-        final, _, rows, starts = carry
-        found.append((final, rows, starts))
-        return final
+        def until(last, carry):
+            """The carry after the steps until `last` of them are accepted."""
+
+            def proceed(carry):
+                state, running = carry[0], cond_fun(carry[0])
+                running = running & (state.num_steps < max_steps)
+                return running if last is None else running & (state.num_accepted_steps < last)
+
+            own = lambda carry: (buffers(carry[0]), carry[2])
+            return while_loop(proceed, body, carry, max_steps=None, buffers=own, kind="lax")
+
+        carry, starts = (init, since, table(size, layout)), None
+        if segments is None:
+            carry = until(last, carry)
+        else:
+
+            def segment(carry):
+                k, inner, starts = carry
+                packed = of_starts.packed(_start_of(inner[1], inner[0], steps.jumps))
+                starts = [buffer_set(buffer, k, x) for buffer, x in zip(starts, packed, strict=True)]
+                return k + 1, until((k + 1) * size, inner), starts
+
+            _, carry, starts = while_loop(
+                lambda carry: cond_fun(carry[1][0]) & (carry[1][0].num_steps < max_steps),
+                segment,
+                (0, carry, table(segments, of_starts)),
+                max_steps=None,
+                buffers=lambda carry: (buffers(carry[1][0]), carry[1][2], carry[2]),
+                kind="lax",
+            )
+        found.append((carry[0], carry[2], starts))
+        return carry[0]
 
     _run(outer, terms, args, init_state, fixed, max_steps)
     return found[0]
