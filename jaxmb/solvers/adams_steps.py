@@ -60,11 +60,15 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
 
 
 class Jump(eqx.Module):
-    """What is stored of a start: whether there was a `jump`, its time, and the state and the chart before it."""
+    """What is stored of a start: whether there was a jump, the times `before` and after it, and the state, the field
+    and the chart before it.
+    """
 
-    jump: Any
+    made: Any
+    before: Any
     time: Any
     y: Float[Array, " n"]
+    f: Float[Array, " n"]
     chart: Any
 
 
@@ -98,7 +102,7 @@ class AdamsSteps(AbstractSteps):
             first = start(before.tprev, new.history.differences[0], before.tnext - before.tprev)
             of_start = first.mesh, jnp.ones_like(order), first.known
             mesh, order, known = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, known))
-            jump = Jump(made, before.tprev, ravel(before.y), old.chart)
+            jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), old.history.differences[0], old.chart)
         kept = kept_of_chart(terms, new.chart)
         return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
 
@@ -106,11 +110,11 @@ class AdamsSteps(AbstractSteps):
         return solver_state.memory
 
     def linearised(self, of, moved, like, row):
-        def at(moved, flat):
-            terms, args = of(moved)
+        def at(of_terms, flat):
+            terms, args = of(of_terms)
             return at_solution(terms, row.end, flat, row.f, like, row.kept, args)
 
-        _, field = jax.linearize(at, moved, row.y)
+        _, field = jax.linearize(at, moved.terms, row.y)
         formulas = coefficients(row.mesh, row.order, row.end, row.y.dtype)
         used = (row.order >= INDEX)[:, None]
 
@@ -119,9 +123,9 @@ class AdamsSteps(AbstractSteps):
                 w, memory = _restarted(of, moved, like, row.jump, dmoved, w, memory)
             partial_sums, neighbours, mean = formulas.sums(memory)
             predicted = w + formulas.h * mean
-            _, f = field(dmoved, predicted)
+            _, f = field(dmoved.terms, predicted)
             corrected = predicted + formulas.h * formulas.last * (f - neighbours[1])
-            w, f = field(dmoved, corrected)
+            w, f = field(dmoved.terms, corrected)
             memory = known_differences(row.known, f, partial_sums)
             mismatch = predicted + formulas.h * formulas.last * (f - neighbours[1]) - w
             zero = jnp.zeros((), w.dtype)
@@ -143,21 +147,43 @@ class AdamsSteps(AbstractSteps):
         out = eqx.tree_at(parts, none, (w, memory[0]), is_leaf=lambda x: x is None)
         if row.jump is None:
             return out
-        return eqx.tree_at(lambda row: row.jump.y, out, before[0], is_leaf=lambda x: x is None)
+        parts = lambda row: (row.jump.y, row.jump.f)
+        return eqx.tree_at(parts, out, (before[0], before[1][0]), is_leaf=lambda x: x is None)
 
 
 def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
     """The tangents after a jump, where there was one."""
 
-    def restart(moved, flat):
-        terms, args = of(moved)
-        y = after_jump(terms, jump.time, unravel_like(like, flat), args)
+    def restart(moved, flat, f):
+        terms, args = of(moved.terms)
+        if moved.jumps is None:
+            late = at = None
+        else:
+            # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
+            time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
+            late = time - lax.stop_gradient(time)
+            field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
+            flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
+            at = jump.time + late
+        y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
         chart = next_chart(terms, jump.time, y, jump.chart, args)
-        (flat, f), _ = field_of(terms, jump.time, y, chart, args)(jump.time, ravel(y))
+        field = field_of(terms, jump.time, y, chart, args)
+        if late is None:
+            (flat, f), _ = field(jump.time, ravel(y))
+        else:
+            (flat, f), _ = field(at, ravel(y))
+            flat = _moved_on(lambda t, y: field(t, y)[0][1], at, flat, f, -late)
+            (flat, f), _ = field(jump.time, flat)
         return flat, jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
 
     def restarted():
-        _, new = jax.jvp(restart, (moved, jump.y), (dmoved, w))
-        return jax.tree.map(lambda new, old: jnp.where(jump.jump, new, old), new, (w, memory))
+        _, new = jax.jvp(restart, (moved, jump.y, jump.f), (dmoved, w, memory[0]))
+        return jax.tree.map(lambda new, old: jnp.where(jump.made, new, old), new, (w, memory))
 
-    return lax.cond(any_of_batch(jump.jump), restarted, lambda: (w, memory))
+    return lax.cond(any_of_batch(jump.made), restarted, lambda: (w, memory))
+
+
+def _moved_on(field, t, flat, f, time):
+    """A state after a time of zero, right to the second derivative by it; `f`: the field at the state."""
+    step = time.astype(flat.dtype)
+    return flat + step / 2 * (f + field(t + time, flat + step * f))

@@ -20,8 +20,8 @@ from jaxtyping import Array, PyTree
 from .._compat import any_of_batch, buffer_set, loop_of_diffrax, save_states, while_loop
 from ..linalg.linear_map import filled, linear_map
 from .evaluation import freeze, ravel, unravel_like
-from .steps import AbstractSteps, LinearStep
-from .whole_steps import steps_of
+from .steps import AbstractSteps, LinearStep, Moving
+from .whole_steps import jump_times, steps_of
 
 
 class Row(NamedTuple):
@@ -67,12 +67,12 @@ class Tangents(NamedTuple):
 class Mesh(eqx.Module):
     """The steps of a run.
 
-    **Fields:** `moved`, `still`: the numbers of the terms and their arguments that have tangents, and the rest;
+    **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms and their arguments;
     `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
     `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an `event`; its `segments`, None where there is one only.
     """
 
-    moved: PyTree
+    moved: Moving
     still: PyTree
     steps: AbstractSteps
     rows: list[Array]
@@ -94,7 +94,7 @@ class Mesh(eqx.Module):
         return self.layout.unpacked([buffer[k % self.size] for buffer in rows])
 
     def linearised(self, row: Row) -> LinearStep:
-        return self.steps.linearised(lambda moved: eqx.combine(moved, self.still), self.moved, self.like, row.own)
+        return self.steps.linearised(lambda terms: eqx.combine(terms, self.still), self.moved, self.like, row.own)
 
     def blank(self) -> Tangents:
         """Zeros."""
@@ -117,7 +117,7 @@ class Mesh(eqx.Module):
     def push(self, x: PyTree) -> Tangents:
         """The tangents that one of the terms, one of the first state and one of its memory cause."""
         if self.segments is None:
-            return self._out(self._pushed(x[0], self._first(x), self.rows, self.count))
+            return self._out(self._pushed(x[0], self._first(*x[1]), self.rows, self.count))
 
         def body(carry):
             segment, inner = carry
@@ -127,7 +127,7 @@ class Mesh(eqx.Module):
         carry = while_loop(
             lambda carry: carry[0] * self.size < self.count,
             body,
-            (0, self._first(x)),
+            (0, self._first(*x[1])),
             max_steps=None,
             buffers=lambda carry: _tables(carry[1]),
             kind="lax",
@@ -136,22 +136,21 @@ class Mesh(eqx.Module):
 
     def push_once(self, x: PyTree) -> Tangents:
         """`push` in a form that can be differentiated by the rows: NaN where they are more than those kept."""
-        out = self._out(self._pushed(x[0], self._first(x), self.rows, self.count))
+        out = self._out(self._pushed(x[0], self._first(*x[1]), self.rows, self.count))
         lost = self.count > self.size
         return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), out)
 
     def _rows_of(self, segment: Any) -> list[Array]:
         """The rows of a segment of the run."""
         assert self.segments is not None
-        terms, args = freeze(eqx.combine(self.moved, self.still))
+        terms, args = freeze(eqx.combine(self.moved.terms, self.still))
         is_last = (segment + 1) * self.size >= self.count
         again = lambda: self.segments.rows(terms, args, segment, self.size)
         rows = lax.cond(any_of_batch(~is_last), again, lambda: self.rows)
         return jax.tree.map(lambda new, last: jnp.where(is_last, last, new), rows, self.rows)
 
-    def _first(self, x):
+    def _first(self, w, memory):
         """The carry of the loop over steps at its start."""
-        _, w, memory = x
         out = self.blank()
         saved = tuple(
             table.at[0].set(w) if series.start else table for series, table in zip(self.saved, out.saved, strict=True)
@@ -176,7 +175,7 @@ class Mesh(eqx.Module):
             along = self.layout.packed_tangent(row, Row(None, None, own))
             rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
-                dense = jax.tree.map(lambda buffer, x: buffer_set(buffer, k, x), dense, ddense)
+                dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
             new = [_saved(series, table, place, k, row.end, after[0], ddense, step.at) for series, table, place in each]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
@@ -208,7 +207,7 @@ class Mesh(eqx.Module):
         for series, table in zip(self.saved, cotangents.saved, strict=True):
             if series.start and table is not None:
                 lw = lw + table[0]
-        return total, lw, lmemory
+        return total, (lw, lmemory)
 
     def _pulled(self, cotangents: Tangents, carry, rows, first):
         """The carry of the loop over steps before the step `first`."""
@@ -358,7 +357,8 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         del throw, passed_solver_state, passed_controller_state
         steps = steps_of(solver, options["stepsize_controller"])
         fixed = freeze((solver, saveat, options, steps))
-        final, *_ = _recorded(terms, args, init_state, fixed, max_steps, self.most)
+        jumps = jump_times(options["stepsize_controller"])
+        final, *_ = _recorded(terms, args, jumps, init_state, fixed, max_steps, self.most)
         given = lambda *_, **__: final
         return _run(given, terms, args, init_state, fixed, max_steps)
 
@@ -379,10 +379,12 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
 
 
 @eqx.filter_custom_jvp
-def _recorded(terms, args, init_state, fixed, max_steps, most):
+def _recorded(terms, args, jumps, init_state, fixed, max_steps, most):
     """The last state of diffrax's loop, the packed rows of the last segment of its steps, and the packed starts of all
-    segments, of `most` steps each; None where there is one segment only.
+    segments, of `most` steps each; None where there is one segment only. The times of `jumps` are known to the step
+    size controller as well, and stand here for their tangents.
     """
+    del jumps
     steps, size = fixed[3], min(most, max_steps)
     segments = -(-max_steps // size)
     return _run_recorded(terms, args, init_state, fixed, max_steps, size, segments if segments > 1 else None, None, -jnp.inf)
@@ -495,21 +497,22 @@ class Segments(eqx.Module):
 
 @_recorded.def_jvp
 def _recorded_jvp(primals, tangents):
-    terms, args, init_state, fixed, max_steps, _ = primals
-    dterms, dargs, dinit, *_ = tangents
+    terms, args, jumps, init_state, fixed, max_steps, _ = primals
+    dterms, dargs, djumps, dinit, *_ = tangents
     out = _recorded(*primals)
     final, rows, starts = out
     _, saveat, options, steps = fixed
     moved, still = eqx.partition((terms, args), jax.tree.map(_is_known, (dterms, dargs), is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
-    x = (dterms, dargs), ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    of_start = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    x = Moving((dterms, dargs), djumps), of_start
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     saved = tuple(
         Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)
     )
     mesh = Mesh(
-        moved=moved,
+        moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
         rows=rows,

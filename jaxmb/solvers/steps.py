@@ -13,6 +13,15 @@ else:
     from equinox import AbstractVar
 
 
+class Moving(NamedTuple):
+    """The numbers of a run that have tangents, or their tangents: those of the `terms` and their arguments, and the
+    times of `jumps`, in the solver's time, None where they have none.
+    """
+
+    terms: PyTree
+    jumps: Any
+
+
 class LinearStep(NamedTuple):
     """A step as linear maps of tangents.
 
@@ -42,10 +51,10 @@ class AbstractSteps(eqx.Module):
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
     @abc.abstractmethod
-    def linearised(self, of: Callable, moved: PyTree[Array], like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
+    def linearised(self, of: Callable, moved: Moving, like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
         """A step at its row.
 
-        **Arguments:** `of(moved)`: the solver's terms and their arguments; `like`: a state before raveling.
+        **Arguments:** `of(moved.terms)`: the solver's terms and their arguments; `like`: a state before raveling.
         """
 
     @abc.abstractmethod

@@ -48,9 +48,14 @@ class WholeSteps(AbstractSteps):
 
     def linearised(self, of, moved, like, row):
         t0, t1, y0, state, jump = row
+        if moved.jumps is not None:
+            raise ValueError(
+                "Derivatives by the times of jumps are known to jaxmb.solvers.Adams only, got "
+                f"{type(self.solver).__name__}: use that, or stop_gradient for the times."
+            )
 
         def step(moved, flat, memory):
-            terms, args = of(moved)
+            terms, args = of(moved.terms)
             before = eqx.combine(memory, state)
             out = self.solver.step(
                 terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump
@@ -85,6 +90,12 @@ def steps_of(solver: Any, controller: Any) -> AbstractSteps:
     if isinstance(solver, WithTangents):
         return WholeSteps(solver.inner, True, jumps)
     return WholeSteps(solver, False, jumps)
+
+
+def jump_times(controller: Any) -> Any:
+    """The times of jumps that a step size controller knows, or None."""
+    # A concrete class, which alone has such times.
+    return controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
 
 
 def _is_none(x):
