@@ -4,7 +4,6 @@ Each stands here once, with what it does and the versions that it was found in; 
 test of each, which says what is missing when an update takes it away.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
@@ -19,7 +18,6 @@ from diffrax._integrate import SaveState, loop
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax.core import ShapedArray
-from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -94,43 +92,6 @@ def define_bilinear(
     batching.primitive_batchers[own] = batched
     return own.bind
 
-
-def only_in_reverse(tree: T, message: str) -> T:
-    """The same tree, whose derivatives may be taken in reverse mode only.
-
-    Where one is evaluated in forward mode, a `TypeError` with a message is raised: when the program is lowered, or at
-    once outside of `jit`. (A linear operation that has a transpose and no value, as jax.custom_vjp has one itself.)
-    """
-    moved, still = eqx.partition(tree, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(moved)
-    return eqx.combine(jax.tree.unflatten(structure, _only_in_reverse(message, *leaves)), still)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _only_in_reverse(message, *leaves):
-    del message
-    return leaves
-
-
-def _only_in_reverse_jvp(message, primals, tangents):
-    # Arrays without a derivative have none after it.
-    push = lambda x: x if isinstance(x, SymbolicZero) else _transposed_only.bind(x, message=message)
-    return _only_in_reverse(message, *primals), tuple(map(push, tangents))
-
-
-_only_in_reverse.defjvp(_only_in_reverse_jvp, symbolic_zeros=True)
-
-
-def _not_forward(*args, message, **kwargs):
-    raise TypeError(message)
-
-
-_transposed_only = Primitive("transposed_only")
-_transposed_only.def_impl(_not_forward)
-_transposed_only.def_abstract_eval(lambda x, *, message: x)
-mlir.register_lowering(_transposed_only, _not_forward)
-ad.deflinear2(_transposed_only, lambda cotangent, x, *, message: [cotangent])
-batching.primitive_batchers[_transposed_only] = _not_forward
 
 
 # equinox

@@ -106,9 +106,10 @@ def simulate(
         servos and internal states.
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
-    - `adjoint`: how to differentiate. Default reverse mode, with up to 4096 steps (at most 256 MB) kept and none of
-        them computed twice. For few parameters forward mode is faster and needs no memory: `jax.jacfwd` with
-        `adjoint=diffrax.ForwardMode()`.
+    - `adjoint`: how to differentiate instead, one of diffrax's. The default serves `jax.grad`, `jvp`, `jacfwd`,
+        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 4096 steps (at most 128 MB),
+        and of longer runs finds those of each part again. Take forward mode (`jacfwd`) for one or two parameters,
+        reverse mode (`grad`, `jacrev`) for more.
     - `direction`: parameters by name with a change of each, for runs that are differentiated; see below.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run at a tenth of the
         tolerances; both together take two to two and a half times as long as one, and nothing more to compile.
@@ -132,8 +133,14 @@ def simulate(
     are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
     members are as if it were not there.
 
-    Derivatives are those of the discrete solution with its mesh frozen; they converge with the tolerance to the true
-    ones. A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
+    Derivatives are taken on the mesh of the run, which is integrated once: steps are linear maps of tangents, and all
+    modes are the same numbers. `Adams` linearises the equations once a step, at its end: that is a discretisation of
+    the tangent equation of the same order as the method. Other solvers are differentiated as they step. Both converge
+    with the tolerance to the true derivatives. Times have derivatives as well: `t0`, `t1`, saved times, that of an
+    event, and, with `Adams`, those of `jumps`. Second derivatives are those of first ones in forward mode
+    (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
+
+    A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
     step to step. So a run that is differentiated also controls the error of a tangent of the state, from a start that
     excites all modes, at ten times `rtol`; its values differ within the tolerance from those of the same run without
     derivatives. A parameter that excites a mode late, after the tangent has died away, needs its `direction`:

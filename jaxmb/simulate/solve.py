@@ -165,14 +165,13 @@ def _solve_with_tangents(arguments, control):
     term, solver, options = arguments
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
-    if options["adjoint"] is None:
-        solution = _solve_states(term, solver, options | {"adjoint": MeshAdjoint(_rows(options))})
-    else:
-        solution = diffrax.diffeqsolve(term, solver, throw=False, **options)
+    adjoint = MeshAdjoint(_rows(options)) if options["adjoint"] is None else options["adjoint"]
+    solve = _solve_states if isinstance(adjoint, MeshAdjoint) else functools.partial(diffrax.diffeqsolve, throw=False)
+    solution = solve(term, solver, **options | {"adjoint": adjoint})
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 
-def _solve_states(term, solver, options):
+def _solve_states(term, solver, **options):
     """The solution with states saved first, and then what the user's function makes of them."""
     function, states = options["saveat"].subs[0].fn, diffrax.SubSaveAt(t1=True).fn
     if function is states:

@@ -24,6 +24,12 @@ from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
 
+_TOO_LONG = (
+    "Second derivatives need the rows of all steps, of which {} are kept; this run has more: simulate(..., "
+    "adjoint=jaxmb.solvers.MeshAdjoint(most)) keeps others."
+)
+
+
 class Row(NamedTuple):
     """What is stored of a step.
 
@@ -135,10 +141,9 @@ class Mesh(eqx.Module):
         return self._out(carry[1])
 
     def push_once(self, x: PyTree) -> Tangents:
-        """`push` in a form that can be differentiated by the rows: NaN where they are more than those kept."""
+        """`push` in a form that can be differentiated by the rows, of a run of one segment."""
         out = self._out(self._pushed(x[0], self._first(*x[1]), self.rows, self.count))
-        lost = self.count > self.size
-        return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), out)
+        return eqx.error_if(out, self.count > self.size, _TOO_LONG.format(self.size))
 
     def _rows_of(self, segment: Any) -> list[Array]:
         """The rows of a segment of the run."""
@@ -507,6 +512,8 @@ def _recorded_jvp(primals, tangents):
     of_start = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
     x = Moving((dterms, dargs), djumps), of_start
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
+    if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
+        raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
     saved = tuple(
         Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)

@@ -1,5 +1,6 @@
 """Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
 
+import functools
 import ast
 import importlib
 import importlib.metadata
@@ -149,21 +150,6 @@ def test_bilinear_operations(compat):
     np.testing.assert_array_equal(jax.vmap(outer, in_axes=(None, 0))(a, several)[1], jnp.outer(a, 2 * b))
 
 
-def test_derivatives_in_reverse_mode_only(compat):
-    def function(x):
-        return jnp.sum(compat.only_in_reverse({"x": x, "name": "x"}, "Not forward.")["x"] ** 3)
-
-    x = jnp.arange(3.0)
-    for through in (lambda f: f, jax.jit):
-        np.testing.assert_array_equal(through(function)(x), 9.0)
-        np.testing.assert_array_equal(through(jax.grad(function))(x), 3 * x**2)
-        np.testing.assert_array_equal(through(jax.vmap(jax.grad(function)))(jnp.stack([x, 2 * x]))[1], 12 * x**2)
-        np.testing.assert_array_equal(through(jax.jacrev(jax.grad(function)))(x), np.diag(6 * x))
-        for forward in (jax.jacfwd(function), lambda x: jax.jvp(function, (x,), (x,))):
-            with pytest.raises(TypeError, match=r"^Not forward\."):
-                through(forward)(x)
-
-
 # equinox
 
 
@@ -205,7 +191,51 @@ def test_modules_can_be_copied_without_their_checks(compat):
         copy.value = 1.0
 
 
+def test_loops_with_buffers(compat):
+    def squares(count):
+        def body(carry):
+            k, table = carry
+            return k + 1, compat.buffer_set(table, k, k**2, k != 2)
+
+        carry = 0, -jnp.ones(5, int)
+        own = lambda carry: carry[1]
+        return compat.while_loop(lambda carry: carry[0] < count, body, carry, buffers=own, max_steps=None, kind="lax")[1]
+
+    np.testing.assert_array_equal(squares(4), [0, 1, -1, 9, -1])
+    batch = jax.jit(jax.vmap(squares))(jnp.array([1, 4]))
+    np.testing.assert_array_equal(batch, [[0, -1, -1, -1, -1], [0, 1, -1, 9, -1]])
+    np.testing.assert_array_equal(compat.buffer_set(jnp.zeros(2), 1, jnp.array(3.0)), [0.0, 3.0])
+
+
 # diffrax
+
+
+def test_the_loop_of_diffrax(compat):
+    """Its arguments, and the fields of its state, by an adjoint that looks at every step."""
+    seen = []
+
+    class Spy(diffrax.AbstractAdjoint):
+        def loop(self, *, throw, passed_solver_state, passed_controller_state, **options):
+            def outer(cond_fun, body_fun, state, *, max_steps, buffers):
+                assert max_steps == 64
+                while cond_fun(state):
+                    before, state = state, body_fun(state)
+                    kept = state.num_accepted_steps - before.num_accepted_steps
+                    seen.append((before.tnext, state.tprev, state.y[0], kept, state.num_steps))
+                    assert [x.save_index for x in compat.save_states(state)][0] <= 2
+                return state
+
+            inner = functools.partial(compat.while_loop, kind="lax")
+            return compat.loop_of_diffrax(inner_while_loop=inner, outer_while_loop=outer, **options)
+
+    saveat = diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=[0.55, 1.0]), diffrax.SubSaveAt(t1=True)))
+    with jax.disable_jit():
+        solution = solve(diffrax.Euler(), adjoint=Spy(), saveat=saveat)
+    assert len(seen) == 10 and all(kept == 1 for *_, kept, _ in seen)
+    np.testing.assert_allclose([end for end, *_ in seen], [start for _, start, *_ in seen])
+    np.testing.assert_allclose(seen[-1][2], 0.9**10, rtol=1e-6)
+    np.testing.assert_allclose(solution.ys[1][0, 0], 0.9**10, rtol=1e-6)
+    assert np.all(np.isfinite(solution.ys[0]))
 
 
 def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=None):

@@ -1,0 +1,205 @@
+"""Derivatives on the mesh of a run: all modes and their combinations are one, in all forms of a run.
+
+The reference is the derivative of the discrete solution step by step, in forward mode by diffrax, on a mesh that
+resolves the same tangents.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import jaxmb as mb
+from jaxmb import parts, planar
+from jaxmb.solvers import Hermite, MeshAdjoint
+
+SYSTEM = mb.Scene(
+    [planar.Body("bar", mass=2.0, inertia=0.3, position=(0.5, 0.0))],
+    joints=[planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))],
+    forces=[
+        mb.Gravity((0.0, -9.81)),
+        planar.SpringDamper(
+            "spring", "ground", "bar", stiffness=30.0, damping=0.4, free_length=0.3, point_a=(1, 1), point_b=(0.3, 0)
+        ),
+    ],
+).compile()
+STATE = mb.assemble(SYSTEM, fix={"bar.angle": 0.2}, rates={"bar.angle_rate": 1.0})
+TIMES = np.linspace(0.0, 1.0, 7)
+POINT = np.array([2.0, 30.0])
+
+
+def run(p, **options):
+    system = mb.with_parameters(SYSTEM, {"bar.mass": p[0], "spring.stiffness": p[1]})
+    return mb.simulate(system, STATE, rtol=1e-9, throw=False, **({"t1": 1.0, "max_steps": 2048} | options))
+
+
+def states(motion):
+    return jnp.concatenate([jnp.ravel(motion.ys.q), jnp.ravel(motion.ys.u)])
+
+
+def at_event(p, **options):
+    event = diffrax.Event(lambda t, y, args, **_: y.u[2] - 0.1, optx.Newton(1e-11, 1e-11))
+    motion = run(p, event=event, **options)
+    return jnp.append(states(motion), motion.ts[-1])
+
+
+def within(p, **options):
+    motion = run(p, saveat=diffrax.SaveAt(dense=True), **options)
+    return jnp.ravel(jax.vmap(lambda t: motion.at(t).q)(jnp.array([0.13, 0.77])))
+
+
+def of_function(p, **options):
+    saveat = diffrax.SaveAt(ts=TIMES, fn=lambda t, y, args: jnp.sin(t) * y.q[1] * y.u)
+    return jnp.ravel(run(p, saveat=saveat, **options).ys)
+
+
+def of_steps(p, **options):
+    ys = run(p, saveat=diffrax.SaveAt(t0=True, steps=3, ts=TIMES), **options).ys
+    # The number of steps does not matter to the last states.
+    last = jnp.sum(jnp.isfinite(ys.q[:, 0])) - 1
+    return jnp.concatenate([ys.q[last], ys.u[last]])
+
+
+with_options = lambda **own: lambda p, **options: states(run(p, **own, **options))
+FORMS = {
+    "end": with_options(),
+    "times": with_options(saveat=diffrax.SaveAt(t0=True, ts=TIMES, t1=True)),
+    "backward": with_options(t1=-1.0, saveat=-TIMES),
+    "jumps": with_options(jumps=[0.3, 0.6], saveat=TIMES),
+    "function": of_function,
+    "steps": of_steps,
+    "dense": within,
+    "event": at_event,
+    "projection": with_options(manifold=mb.manifold.Projection(), saveat=TIMES),
+    "baumgarte": with_options(manifold=mb.manifold.Baumgarte(5.0), saveat=TIMES),
+    "hermite": with_options(solver=Hermite(), saveat=TIMES),
+    "explicit": with_options(solver=diffrax.Dopri5(), saveat=TIMES),
+    "implicit": with_options(solver=diffrax.Kvaerno5(), saveat=TIMES),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_forward_reverse_and_the_discrete_solution(name):
+    observe = FORMS[name]
+    step_by_step = lambda p: observe(p, adjoint=diffrax.ForwardMode())
+    derivatives = jax.jacfwd(observe), jax.jacrev(observe), jax.jacfwd(step_by_step)
+    forward, reverse, exact = (np.asarray(jax.jit(derivative)(POINT)) for derivative in derivatives)
+    scale = np.max(np.abs(exact), axis=0)
+    assert np.all(scale > 1e-4)
+    np.testing.assert_allclose(forward / scale, reverse / scale, rtol=0, atol=5e-11)
+    np.testing.assert_allclose(forward / scale, exact / scale, rtol=0, atol=1e-8)
+
+
+def test_hessian_and_batches_without_an_option():
+    energy = lambda p: jnp.sum(jnp.cos(jnp.arange(6.0)) * states(run(p)))
+    gradient = jax.jit(jax.grad(energy))
+    hessian = jax.jit(jax.hessian(energy))(POINT)
+    h = 1e-4 * POINT
+    differences = np.stack([(gradient(POINT + d) - gradient(POINT - d)) / (2 * d.sum()) for d in np.diag(h)])
+    np.testing.assert_allclose(hessian, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(differences)))
+    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-7)
+    members = POINT[None] * np.array([[1.0, 1.0], [1.1, 0.9], [0.5, 2.0]])
+    batch = jax.jit(jax.vmap(jax.grad(energy)))(members)
+    np.testing.assert_allclose(batch, np.stack([gradient(p) for p in members]), rtol=1e-9)
+    with pytest.raises(TypeError, match=r"in forward mode only: take jax\.hessian"):
+        jax.jacrev(jax.grad(energy))(POINT)
+
+
+def test_runs_longer_than_the_rows_that_are_kept():
+    """Rows of segments are found again from their starts."""
+    end = lambda p, most: states(run(p, adjoint=MeshAdjoint(most), saveat=TIMES))
+    of = lambda most: (
+        jax.jit(jax.jacfwd(lambda p: end(p, most)))(POINT),
+        jax.jit(jax.jacrev(lambda p: end(p, most)))(POINT),
+    )
+    whole, cut = of(2048), of(16)
+    for a, b in zip(whole, cut, strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-11, atol=1e-11 * np.max(np.abs(a)))
+    members = POINT[None] * np.array([[1.0, 1.0], [0.5, 2.0]])
+    batch = jax.jit(jax.vmap(jax.jacrev(lambda p: end(p, 16))))(members)
+    np.testing.assert_allclose(batch[0], whole[1], rtol=1e-8, atol=1e-8 * np.max(np.abs(whole[1])))
+    second = jax.hessian(lambda p: jnp.sum(end(p, 16)))
+    with pytest.raises(RuntimeError, match="Second derivatives need the rows of all steps, of which 16 are kept"):
+        jax.block_until_ready(jax.jit(second)(POINT))
+
+
+class Onset(parts.AbstractPair, parts.AbstractForce):
+    """A force that sets in.
+
+    **Arguments:** `time` [s]; `strength` [N].
+    """
+
+    time: parts.Number = parts.parameter(unit="s")
+    strength: parts.Number = parts.parameter(unit="N")
+
+    def wrenches(self, space, poses, velocities, t):
+        force = jnp.where(t >= self.time, self.strength, 0.0)
+        return jnp.stack([jnp.zeros(3), jnp.array([1.0, 0.0, 0.0]) * force])
+
+
+def test_derivatives_by_all_times():
+    """Start, end, saved times and times of jumps, first and second derivatives, against the solution in closed form."""
+    system = mb.Scene(
+        [planar.Body("body", mass=2.0, inertia=1.0)],
+        forces=[mb.Gravity((0.0, -9.81)), Onset("onset", "ground", "body", time=0.4, strength=3.0)],
+    ).compile()
+    state = mb.State(jnp.zeros(3), jnp.array([1.0, 0.5, 0.0]))
+
+    def motion(x):
+        time, strength, start, middle, end = x
+        changed = mb.with_parameters(system, {"onset.time": time, "onset.strength": strength})
+        saveat = diffrax.SaveAt(ts=middle[None], t1=True)
+        found = mb.simulate(changed, state, t0=start, t1=end, saveat=saveat, jumps=time[None], throw=False)
+        return jnp.append(jnp.concatenate([found.ys.q[:, 0], found.ys.q[:, 1]]), found.ts[-1])
+
+    def closed(x):
+        time, strength, start, middle, end = x
+        t = jnp.stack([middle, end])
+        across = (t - start) + strength / 4 * jnp.maximum(t - time, 0.0) ** 2
+        return jnp.append(jnp.concatenate([across, 0.5 * (t - start) - 9.81 / 2 * (t - start) ** 2]), end)
+
+    x = jnp.array([0.4, 3.0, 0.1, 0.7, 1.0])
+    np.testing.assert_allclose(motion(x), closed(x), rtol=1e-8)
+    exact = jax.jacfwd(closed)(x)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(motion))(x), exact, rtol=1e-7, atol=1e-7)
+    loss = lambda motion: lambda x: jnp.sum(jnp.sin(motion(x)))
+    hessian = jax.jit(jax.hessian(loss(motion)))(x)
+    np.testing.assert_allclose(hessian, jax.hessian(loss(closed))(x), rtol=1e-6, atol=1e-6)
+
+
+def test_the_time_of_an_impulse_has_a_derivative():
+    """A rail whose driver jumps from one rate to another at a time: the position of the load that it carries along."""
+    swing = lambda t, p: jnp.where(t < p["when"], 0.5 * t, 0.5 * p["when"] + 2.0 * (t - p["when"]))
+    system = mb.Scene(
+        [
+            planar.Body("sledge", mass=1.0, inertia=1.0),
+            planar.Body("rod", mass=1.0, inertia=0.1, position=(0.0, -0.5)),
+        ],
+        joints=[
+            planar.Prismatic("rail", "ground", "sledge", point=(0.0, 0.0), axis=(1.0, 0.0)),
+            planar.Driver("drive", "ground", "sledge", quantity="x", motion=swing, parameters={"when": 0.3}),
+            planar.Revolute("pin", "sledge", "rod", point=(0.0, 0.0)),
+        ],
+        forces=[mb.Gravity((0.0, -9.81))],
+    ).compile()
+
+    def angle(when, rtol=1e-9):
+        changed = mb.with_parameters(system, {"drive.when": when})
+        state = mb.assemble(changed, fix={"rod.angle": 0.1}, rates={"rod.angle_rate": 0.0}, throw=False)
+        return mb.simulate(changed, state, t1=0.8, jumps=when[None], rtol=rtol, throw=False).ys.q[-1, 5]
+
+    at, h = jnp.array(0.3), 1e-4
+    value = jax.jit(angle)
+    central = (value(at + h, 1e-12) - value(at - h, 1e-12)) / (2 * h)
+    assert abs(central) > 0.1
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(angle))(at), central, rtol=1e-6)
+    state = mb.assemble(system, fix={"rod.angle": 0.1}, rates={"rod.angle_rate": 0.0})
+    runge_kutta = lambda when: mb.simulate(
+        system, state, t1=0.8, jumps=when[None], solver=diffrax.Tsit5(), throw=False
+    ).ys.q[-1, 5]
+    with pytest.raises(ValueError, match=r"Derivatives by the times of jumps are known to jaxmb\.solvers\.Adams only"):
+        jax.grad(runge_kutta)(at)
