@@ -13,7 +13,6 @@ from jaxtyping import Array, ArrayLike
 from ..._types import State
 from ...system import AbstractSystem
 from ...system.quantities import component_names
-from ..ranges import Interval
 from . import verdict
 from .covariance import combinations, covariance
 from .density import LogDensity, logdensity
@@ -278,8 +277,7 @@ def _judged(problem, z, components, ends, segments, found, own, far, known_noise
     directions = found.root.shape[1]
     doubts = [] if success else ["the iteration did not converge; try another start, or more iterations"]
     if finite:
-        bounded = any(isinstance(each, Interval) for each in problem.free.ranges)
-        tried = verdict.Tried(len(ends), segments, bounded)
+        tried = verdict.Tried(len(ends), segments)
         doubts += verdict.of_residuals(own, far, directions, problem.loss, tried)
     reasons, warnings = {}, list(doubts)
     deviations = np.sqrt(np.diag(found.matrix))

@@ -35,11 +35,10 @@ _AS_WELL, _APART = 10.0, 5.0
 
 
 class Tried(NamedTuple):
-    """The number of `starts` and of `segments` of a fit, and whether unknowns have `bounds` at both ends."""
+    """The number of `starts` and of `segments` of a fit."""
 
     starts: int
     segments: int
-    bounds: bool
 
 
 def of_residuals(
@@ -66,10 +65,9 @@ def _cures(tried: Tried) -> str:
     if tried.segments > 1:
         # Multiple shooting has one start, that of `free`.
         starts, pieces = "another start (free=)", f"shorter pieces than these {tried.segments} (segments=)"
-    bounds = "other ranges (bounds=)" if tried.bounds else "a range of plausible values (bounds=)"
     return (
-        f"Either {ended} ended in a local minimum: try {starts}, {bounds} and, for a fast, unstable or chaotic motion, "
-        f"{pieces}; or the model, the data (a zero, a sign, a unit) or sigma is wrong"
+        f"Either {ended} ended in a local minimum: try {starts}, a range of plausible values (bounds=) and, for a "
+        f"fast, unstable or chaotic motion, {pieces}; or the model, the data (a zero, a sign, a unit) or sigma is wrong"
     )
 
 

@@ -213,8 +213,8 @@ def series(residuals, known=True, predicted=None, label="x", bias=FIXED):
     )
 
 
-def said(own, loss="linear", starts=1, segments=1, bounds=False):
-    tried = verdict.Tried(starts, segments, bounds)
+def said(own, loss="linear", starts=1, segments=1):
+    tried = verdict.Tried(starts, segments)
     return "; ".join(verdict.of_residuals(own, outliers(tuple(own)), 1, LOSSES[loss], tried))
 
 
@@ -231,7 +231,6 @@ def test_what_was_tried_already_is_not_advised():
     assert "Either the best of 8 starts ended" in several and "more starts (starts=)" in several
     pieces = said([series(shifted)], segments=16)
     assert "shorter pieces than these 16 (segments=)" in pieces and "starts=" not in pieces and "free=" in pieces
-    assert "other ranges (bounds=)" in said([series(shifted)], bounds=True)
 
 
 OFFSETS = np.array([0.1, -0.2])
