@@ -73,7 +73,21 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
         return ((0, ball(self.point_a, size)),)
 
 
-class Revolute(AbstractSpatialPart, AbstractJoint):
+class AbstractAxial(AbstractSpatialPart, AbstractJoint):
+    """A joint with an axis in each body, about which one turns in the other; arguments as in `Revolute`."""
+
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    def complete(self, space, poses):
+        return measured_from_given_poses(self, space, poses)
+
+
+class Revolute(AbstractAxial):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, and two of the tilt.
 
     Its coordinate is `angle` [rad], the turn of `body_b` about the axis: from `x_a` to `x_b` if they are given, else
@@ -84,16 +98,7 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
     the angle is measured between them.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 5
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), _parallel(space, self, poses)])
@@ -201,29 +206,8 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
         }
 
 
-class Cylindrical(AbstractSpatialPart, AbstractJoint):
-    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
-
-    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
-    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
-
-    **Arguments:** as in `Revolute`.
-    """
-
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
-    rows: ClassVar[int] = 4
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
-
-    def residual(self, space, poses, t):
-        shift = offset_in_a(space, self, poses)
-        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+class AbstractSliding(AbstractAxial):
+    """A joint whose two axes stay on one line, along which one body also slides."""
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
@@ -238,7 +222,23 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
         return ((1, sleeve(self.point_b, size, self.axis_b)),)
 
 
-class Screw(AbstractSpatialPart, AbstractJoint):
+class Cylindrical(AbstractSliding):
+    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
+
+    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
+    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+
+    **Arguments:** as in `Revolute`.
+    """
+
+    rows: ClassVar[int] = 4
+
+    def residual(self, space, poses, t):
+        shift = offset_in_a(space, self, poses)
+        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+
+
+class Screw(AbstractSliding):
     """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
 
     With the angle θ from `x_a` to `x_b` about the axis, the shift s = a·d and ψ = θ − 2π (s − offset)/pitch, the last
@@ -254,14 +254,8 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     """
 
     pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -276,18 +270,6 @@ class Screw(AbstractSpatialPart, AbstractJoint):
         cosine, sine = c * jnp.cos(turn) + s * jnp.sin(turn), s * jnp.cos(turn) - c * jnp.sin(turn)
         thread = lead * half_sine(sine[None], cosine)
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
-
-    def coordinates(self, space, poses):
-        return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
-
-    def pictured(self, space):
-        return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
-    def shapes(self, space, size):
-        return ((1, sleeve(self.point_b, size, self.axis_b)),)
 
 
 class Prismatic(AbstractSpatialPart, AbstractJoint):
@@ -330,7 +312,7 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
         return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)
 
 
-class Planar(AbstractSpatialPart, AbstractJoint):
+class Planar(AbstractAxial):
     """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: two of the tilt, `a·d`.
 
     Its coordinates are `angle` as in `Revolute`, and `displacement` [m], shape (2,), the components of d along `x_a`
@@ -339,16 +321,7 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 3
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
