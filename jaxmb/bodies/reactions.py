@@ -11,16 +11,14 @@ from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import cross
 from ..system.quantities import Reaction
-from .constraint_groups import AbstractConstraintGroup
-from .force_groups import ForceGroup, NonIdealGroup
-from .groups import Group
+from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, ForceGroup, Group, NonIdealGroup
 
 
 def reaction_wrenches(
     joints: Sequence[AbstractConstraintGroup],
     t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
+    poses: BodyPoses,
+    velocities: BodyVelocities,
     multipliers: Float[Array, "rows"],
 ) -> list[Float[Array, "parts k v"]]:
     """Wrenches of the constraints on their bodies, group by group."""
@@ -36,8 +34,8 @@ def nonideal_wrenches(
     joints: Sequence[AbstractConstraintGroup],
     laws: Sequence[NonIdealGroup],
     t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
+    poses: BodyPoses,
+    velocities: BodyVelocities,
     multipliers: Float[Array, "rows"],
 ) -> list[Float[Array, "parts k v"]]:
     """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
@@ -66,8 +64,8 @@ def reaction(
     joints: Sequence[AbstractConstraintGroup],
     name: str,
     t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
+    poses: BodyPoses,
+    velocities: BodyVelocities,
     multipliers: Float[Array, "rows"],
 ) -> Reaction:
     """Reaction of one joint at one state, from the multipliers of the rows of all joints."""

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import solve_constrained
 from ..linalg.elimination import Factor, PivotOrder, eliminate, solve_positive
@@ -45,7 +45,7 @@ class ConstrainedAcceleration(eqx.Module):
     whether friction `failed` to determine the accelerations; None of a system without.
     """
 
-    u: Float[Array, "nu"]
+    u: Velocities
     udot: Float[Array, "nu"]
     factor: Factor
     failed: Bool[Array, ""] | None = None
@@ -56,15 +56,13 @@ def shares_split(system: AbstractEquation) -> bool:
     return system.rates_are_velocities and system.velocity_rows == system.position_rows
 
 
-def coordinate_factor(system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices) -> Factor:
+def coordinate_factor(system: AbstractEquation, t: Scalar, q: Coordinates, split: ChartIndices) -> Factor:
     """Factor of the coordinates' Jacobian in a chart."""
     order = split.velocity if split.coordinate is None else split.coordinate
     return eliminate(system.coordinate_jacobian(t, q), order, system.coordinate_rank)
 
 
-def correct_positions(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices
-) -> Float[Array, "nq"]:
+def correct_positions(system: AbstractEquation, t: Scalar, q: Coordinates, split: ChartIndices) -> Float[Array, "nq"]:
     """Coordinates nearer to the manifold, by one modified-Newton correction with the stored matrix."""
     if system.coordinate_rank == 0:
         return q
@@ -77,8 +75,8 @@ def ideal_acceleration(
     system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
+    q: Coordinates,
+    u: Velocities,
     order: PivotOrder,
 ) -> ConstrainedAcceleration:
     """Accelerations of a system with ideal constraints at coordinates on the manifold or near it.
@@ -107,8 +105,8 @@ def general_acceleration(
     system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
+    q: Coordinates,
+    u: Velocities,
     split: ChartIndices,
 ) -> ConstrainedAcceleration:
     """The same for any constraints, ideal or not, also those that bind accelerations only. The factors are those of
@@ -145,7 +143,7 @@ def _ideal_acceleration_jvp(primals, tangents):
 
 @eqx.filter_custom_jvp
 def restore_positions(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], split: ChartIndices, tol: float
+    system: AbstractEquation, t: Scalar, q: Coordinates, split: ChartIndices, tol: float
 ) -> tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]:
     """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`."""
     if system.coordinate_rank == 0:

@@ -34,9 +34,8 @@ from .chart import (
 from .constraints import SolvedState, restore
 from .diagnosis import diagnose
 from .impulse import after_impulse
-from .manifold import AbstractManifold, newton_tolerance
+from .manifold import AbstractManifold, VectorField, newton_tolerance
 from .orthogonal_projection import project_normalized
-from .vector_field import VectorField
 
 # A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4

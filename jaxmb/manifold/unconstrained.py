@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import diffrax
 
-from .manifold import AbstractManifold, all_rows_formulation
+from .manifold import AbstractManifold, VectorField
 from .orthogonal_projection import project_normalized
-from .vector_field import VectorField
 
 
 class Unconstrained(AbstractManifold):
@@ -22,15 +21,6 @@ class Unconstrained(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         return diffrax.ODETerm(VectorField(system, formulation)), solver
 
-    def default_formulation(self, system):
-        return all_rows_formulation(system)
-
     def correction(self, interpolated):
         # No step ends on the constraints, and Euler parameters are not of unit length.
         return project_normalized
-
-    def statistics(self, solver_state):
-        return {}
-
-    def diagnose(self, system, t, y, solver_state, result, failed):
-        return result

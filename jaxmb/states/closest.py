@@ -27,7 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
@@ -84,7 +84,7 @@ def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) 
 
 
 def residual_size(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
+    system: AbstractEquation, t: Scalar, q: Coordinates, jacobian: Float[Array, "m nq"]
 ) -> Float[Array, ""]:
     """`largest_residual` of the coordinates; `jacobian`: theirs at this configuration or near it."""
     jacobian = jacobian * system.coordinate_scale()[None, :]
@@ -95,7 +95,7 @@ def residual_size(
 
 
 def meet_constraints(
-    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
+    system: AbstractEquation, t: Scalar, start: Coordinates, scale: Float[Array, "nq"]
 ) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
     """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
 
@@ -125,7 +125,7 @@ def meet_constraints(
 
 
 def meet_in_blocks(
-    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
+    system: AbstractEquation, t: Scalar, start: Coordinates, fixed: Bool[np.ndarray, "nu"]
 ) -> Float[Array, "nq"]:
     """The same along the velocities, without motion along fixed ones, and without a dense matrix where the system has
     an order of elimination. The normal equations are regularised in the measure of the residuals.
@@ -180,7 +180,7 @@ def _in_blocks(system, given):
 def closest_configuration(
     system: AbstractEquation,
     t: Scalar,
-    guess: Float[Array, "nq"],
+    guess: Coordinates,
     held: tuple[bool, ...],
     rank: int,
     in_blocks: bool | None = None,
@@ -243,8 +243,8 @@ def _refine(residual, x):
 def closest_velocities(
     system: AbstractEquation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    guess: Float[Array, "nu"],
+    q: Coordinates,
+    guess: Velocities,
     held: tuple[bool, ...],
     in_blocks: bool | None = None,
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:

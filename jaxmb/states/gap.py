@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State, VectorLike
+from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.newton import newton
 from ..system import AbstractSystem
 from .arguments import check_system, checked_guess, checked_time
@@ -63,7 +63,7 @@ def assembly_gap(
 
 
 @eqx.filter_jit
-def _gap(system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...]) -> Float[Array, ""]:
+def _gap(system: AbstractSystem, t: Scalar, guess: Coordinates, held: tuple[bool, ...]) -> Float[Array, ""]:
     if system.coordinate_rows == 0:
         return jnp.zeros((), guess.dtype)
     scale = jnp.where(np.array(held), 0.0, system.coordinate_scale())

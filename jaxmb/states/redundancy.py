@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from .._types import Coordinates
 from ..system import AbstractSystem
 
 # Number of displaced poses, and the displacement in scales of the coordinates as a power of eps: 1e-2 in double
@@ -163,7 +164,7 @@ def _unit_rows(jacobian):
 
 
 def check_implied_as_one(
-    system: AbstractSystem, q: Float[Array, "nq"], positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
+    system: AbstractSystem, q: Coordinates, positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
 ) -> None:
     """`check_implied` of all rows as one group, by full matrices.
 

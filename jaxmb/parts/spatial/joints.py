@@ -47,7 +47,16 @@ def _parallel(space, part, poses):
     return half_sine(across(part.axis_a, b), jnp.dot(part.axis_a, b))
 
 
-class Spherical(AbstractSpatialPart, AbstractJoint):
+class AbstractOriented(AbstractSpatialPart, AbstractJoint):
+    """A joint that knows the relative attitude at which its rotation is zero, `orientation`, as in `Spherical`."""
+
+    orientation: fields.Number = fields.attitude(optional=True)
+
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
+
+
+class Spherical(AbstractOriented):
     """A ball: two points coincide. Rows 3: `d`.
 
     Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
@@ -57,11 +66,7 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
     shape (4,), unit Euler parameters of B relative to A where the rotation is zero, default those of the given poses.
     """
 
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -159,7 +164,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
         return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
 
 
-class Gimbal(AbstractSpatialPart, AbstractJoint):
+class Gimbal(AbstractOriented):
     """Three hinges in succession about perpendicular axes through one point: a ball with angles. Rows 3: `d`.
 
     Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
@@ -178,7 +183,6 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
     axis_1_W: fields.Number = fields.axis(body=None, gives=("axis_1",))
     axis_2_W: fields.Number = fields.axis(body=None, gives=("axis_2",))
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
     angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
 
@@ -186,7 +190,7 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
         if np.max(np.abs(triad @ triad.T - np.eye(3))) > 1e-6:
             raise ValueError(f"{self.label}: the three axes must be perpendicular to each other, got {triad.tolist()}.")
-        return with_given_orientation(self, poses)
+        return super().complete(space, poses)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -272,7 +276,7 @@ class Screw(AbstractSliding):
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
 
 
-class Prismatic(AbstractSpatialPart, AbstractJoint):
+class Prismatic(AbstractOriented):
     """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
 
     The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
@@ -290,11 +294,7 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 5
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
@@ -333,17 +333,13 @@ class Planar(AbstractAxial):
         return {"displacement": displacement, "angle": angle(space, self, poses)}
 
 
-class Fixed(AbstractSpatialPart, AbstractJoint):
+class Fixed(AbstractOriented):
     """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the rotation (3) as in `Prismatic`.
 
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """
 
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 6
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])
