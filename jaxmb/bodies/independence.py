@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..linalg.graphs import components
-from ..linalg.sparse_pivots import SparsePivots, pivot_rows
+from ..linalg.independent_rows import SparsePivots, dense_pivots, least_size, sparse_pivots
 from .layout import Layout
 
 # An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the nearest of true ranks 1e-4.
@@ -112,7 +112,7 @@ class JointBlocks(NamedTuple):
                 shares = tuple(_sparse_share(pivots, sizes, rows, r) for r in order[rank:].tolist())
             else:
                 whole = self.dense(own, columns)
-                order, rank = _pivot_rows(whole * self.scale[columns], level[rows])
+                order, rank = dense_pivots(whole * self.scale[columns], level[rows], _ZERO)
                 shares = _dense_shares(whole, rows, order[:rank], order[rank:]) if rank < rows.size else ()
             out.append(Subset(own, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
         return out
@@ -135,9 +135,9 @@ class JointBlocks(NamedTuple):
                 rows.append(entries)
         eps = float(np.finfo(self.scale.dtype).eps)
         sizes = np.array([math.sqrt(sum(x * x for x in entries.values())) for entries in rows], self.scale.dtype)
-        sizes = np.maximum(sizes, _floor(sizes))
+        sizes = np.maximum(sizes, least_size(sizes))
         unit = [{c: x / size for c, x in entries.items()} for entries, size in zip(rows, sizes.tolist(), strict=True)]
-        return pivot_rows(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes
+        return sparse_pivots(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes
 
     def absolute_parts(self, motions: Float[np.ndarray, "d b v"]) -> frozenset[int]:
         """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
@@ -165,7 +165,7 @@ class JointBlocks(NamedTuple):
             yield np.array(own), np.array([self.parts[p].bodies for p in own]), np.stack([self.blocks[p] for p in own])
 
     def _regular_parts(self, held):
-        """Those of some parts whose rows are all independent, each with one of its bodies held: `_pivot_rows` of many
+        """Those of some parts whose rows are all independent, each with one of its bodies held: `dense_pivots` of many
         matrices at once.
         """
         out = set()
@@ -176,7 +176,7 @@ class JointBlocks(NamedTuple):
             free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])
             work = (own * free[:, None]).reshape(*own.shape[:2], -1)
             size = np.linalg.norm(work, axis=2)
-            work = work / np.maximum(size, _floor(size))[:, :, None]
+            work = work / np.maximum(size, least_size(size))[:, :, None]
             number, rows = np.arange(len(work)), work.shape[1]
             independent = np.full(len(work), rows <= work.shape[2])
             for _ in range(rows):
@@ -205,30 +205,3 @@ def _sparse_share(pivots, sizes, rows, r):
     own = {k: x for k, x in pivots.shares(r).items() if abs(x) > _NEGLIGIBLE}
     by = np.array(list(own), int)
     return Share(int(rows[r]), rows[by], np.array(list(own.values())) * sizes[r] / sizes[by])
-
-
-def _floor(sizes):
-    """The norm of a row that counts as zero, for each set of rows."""
-    info = np.finfo(sizes.dtype)
-    return np.maximum(info.eps**0.75 * np.max(sizes, axis=-1, initial=0.0, keepdims=True), info.tiny)
-
-
-def _pivot_rows(A, level):
-    """Rows in the order of full pivoting, independent ones first, and their number."""
-    m, n = A.shape
-    eps = float(np.finfo(A.dtype).eps)
-    size = np.linalg.norm(A, axis=1)
-    work = A / np.maximum(size, _floor(size))[:, None]
-    left = np.ones(m, bool)
-    kept = []
-    for own in np.unique(level):
-        while n and len(kept) < min(m, n):
-            sizes = np.where((left & (level == own))[:, None], np.abs(work), 0.0)
-            r, c = np.unravel_index(np.argmax(sizes), sizes.shape)
-            if not sizes[r, c] > eps**_ZERO:
-                break
-            left[r] = False
-            kept.append(int(r))
-            ratio = np.where(left, work[:, c] / work[r, c], 0.0)
-            work = work - ratio[:, None] * work[r]
-    return np.array([*kept, *np.flatnonzero(left)], int), len(kept)
