@@ -326,7 +326,7 @@ class RigidBodySystem(AbstractSystem):
     # Parameters and names
 
     def parameter_paths(self):
-        return parameter_paths(self._gravity_name, self._groups, self.servos)
+        return parameter_paths(None if self.gravity is None else self.gravity_name, self._groups, self.servos)
 
     def with_frames_of(self, before):
         pairs = zip(self.bodies, before.bodies, strict=True)
@@ -366,10 +366,6 @@ class RigidBodySystem(AbstractSystem):
     def _groups(self):
         kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
         return {kind: getattr(self, kind) for kind in (*kinds, "free_joints")}
-
-    @property
-    def _gravity_name(self):
-        return None if self.gravity is None else self.gravity_name
 
     def signals(self):
         return signals_of(self._groups)
@@ -622,7 +618,7 @@ class RigidBodySystem(AbstractSystem):
         own = self._own_wrenches(u)
         if own is not None:
             wrenches.append(own)
-            bodies.append(_all_bodies(self.layout))
+            bodies.append(np.arange(self.layout.bodies)[:, None])
         return self._add_up(wrenches, bodies, u.dtype)
 
     def _add_up(self, wrenches, bodies, dtype):
@@ -689,15 +685,11 @@ class RigidBodySystem(AbstractSystem):
             energy = energy - jnp.sum(self.mass * (position @ self.gravity))
         return energy
 
-    def linear_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "d"]:
-        """`Σ m v` [kg m/s], world axes."""
+    def linear_momentum(self, q, u):
         del q
         return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
 
-    def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
-        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
-        space.
-        """
+    def angular_momentum(self, q, u):
         poses, velocities = self.poses(q), self.velocities(u)
         if not self.spatial:
             x, v = poses[:, :2], velocities[:, :2]
@@ -760,10 +752,6 @@ def _join(blocks, dtype):
 
 def _rotating(layout: Layout):
     return [k for k, rotates in enumerate(layout.rotates) if rotates]
-
-
-def _all_bodies(layout: Layout):
-    return np.arange(layout.bodies)[:, None]
 
 
 @eqx.filter_jit

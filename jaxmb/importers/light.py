@@ -52,14 +52,7 @@ def _alone(machine, notes, joint):
     coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
     if acting or along or len(coupled) > 1:
         return False
-    own = {
-        "springs": joint.stiffness,
-        "damping": joint.damping,
-        "armature": joint.armature,
-        "friction": joint.friction,
-        "limits": joint.limits is not None,
-    }
-    return not coupled or not any(value and kind not in notes.ignore for kind, value in own.items())
+    return not coupled or notes.ignore.issuperset(joint.passive)
 
 
 def _coupled(coupling):

@@ -18,10 +18,18 @@ from ..linalg.failure import nan_where
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions, rates_of
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import (
+    check_system,
+    checked_guess,
+    checked_time,
+    holding,
+    prescribe,
+    split_internal_states,
+    split_names,
+    split_rates,
+)
 from .closest import closest_configuration, closest_velocities
 from .consistency import listed
-from .held_coordinates import holding, prescribe, split_internal_states, split_names, split_rates
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0

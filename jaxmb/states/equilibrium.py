@@ -25,10 +25,9 @@ from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import check_system, checked_guess, checked_time, holding, split_internal_states, split_names
 from .assembly import configuration
 from .closest import tolerance
-from .held_coordinates import holding, split_internal_states, split_names
 
 _ITERATIONS = 200
 

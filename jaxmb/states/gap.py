@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.newton import newton
 from ..system import AbstractSystem
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import check_system, checked_guess, checked_time, holding, prescribe, split_internal_states, split_names
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, prescribe, split_internal_states, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200
