@@ -8,43 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import cross
 from ..system.quantities import Reaction
 from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, ForceGroup, Group, NonIdealGroup
-
-
-def reaction_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of the constraints on their bodies, group by group."""
-    out, row = [], 0
-    for g in joints:
-        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-        out.append(g.wrenches(t, poses, velocities, own))
-        row += own.size
-    return out
-
-
-def nonideal_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    laws: Sequence[NonIdealGroup],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
-    wrenches = [own.reshape(-1) for own in reaction_wrenches(joints, t, poses, velocities, multipliers)]
-    reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
-    bodies = [(g.group.names, g.group.bodies) for g in joints]
-    # A joint may be made of several constraints, all between the same bodies.
-    take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
-    return [g.wrenches(t, poses, velocities, jnp.sum(take(g), axis=1)) for g in laws]
 
 
 def applied_wrenches(

@@ -37,6 +37,8 @@ from .groups import (
     FrameGroup,
     NonIdealGroup,
     VelocityConstraintGroup,
+    nonideal_wrenches,
+    reaction_wrenches,
 )
 from .internal_states import (
     StateField,
@@ -61,7 +63,7 @@ from .parameters import (
     with_signals,
 )
 from .picture import picture
-from .reactions import applied_wrenches, nonideal_wrenches, reaction, reaction_wrenches
+from .reactions import applied_wrenches, reaction
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
