@@ -8,6 +8,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 Scalar: TypeAlias = ArrayLike
 VectorLike: TypeAlias = ArrayLike | Sequence[Any]
+# The coordinates q and the velocities u of a system, with one axis.
+Coordinates: TypeAlias = Float[Array, "nq"]
+Velocities: TypeAlias = Float[Array, "nu"]
 
 
 class State(eqx.Module):

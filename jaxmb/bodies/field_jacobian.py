@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import unchecked_take
 from ..linalg.block_elimination import BlockFactor, eliminate_blocks
 from ..linalg.block_jacobian import BlockJacobian
@@ -26,11 +26,7 @@ from .motion_graph import MotionOrder, motion_order
 
 
 def contributions(
-    system: Any,
-    t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
-    multipliers: Float[Array, "m"],
+    system: Any, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "m"]
 ) -> tuple[Float[Array, "e v v"], Float[Array, "e v v"]]:
     """K and D: derivatives of the wrenches of forces and of constraints with given multipliers, with respect to
     displacements along velocities and to the velocities. Each part contributes a block for each pair of its bodies,

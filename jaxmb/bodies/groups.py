@@ -1,7 +1,10 @@
-"""Parts of one type, stacked: one kernel and one `vmap` serve any number of them."""
+"""Parts of one type, stacked, with the kernels of their kind: one kernel and one `vmap` serve any number of them."""
 
+import abc
+import dataclasses
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,10 +16,15 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
-from ..parts.contents import anonymous, entry, inner_parts
+from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal
+from ..parts.servo import Servo
 from ..parts.space import AbstractSpace
 from .layout import Layout
+
+# Prepared poses, and velocities or accelerations, of all bodies, scalar coordinates and the ground, in this order.
+BodyPoses: TypeAlias = Float[Array, "b_ground p"]
+BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 
 class Input(eqx.Module):
@@ -150,7 +158,7 @@ class CoordinateGroup(AbstractGroup):
     def rows(self) -> int:
         return 0
 
-    def coordinates(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> dict[str, Float[Array, "parts *shape"]]:
+    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
         """Their coordinates, by name within the part."""
         space = self.group.layout.space
         return self.group.map(lambda at, x: at(t).coordinates_at(space, x), self.group.gather(poses))
@@ -159,18 +167,293 @@ class CoordinateGroup(AbstractGroup):
 class FrameGroup(AbstractGroup):
     """Stacked frames."""
 
-    def poses(self, t: Scalar, poses: Float[Array, "b_ground p"]) -> Float[Array, "parts p"]:
+    def poses(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts p"]:
         """Prepared poses of the frames."""
         space = self.group.layout.space
         return self.group.map(lambda at, x: at(t).pose(space, x[0]), self.group.gather(poses))
 
-    def velocities(
-        self, t: Scalar, poses: Float[Array, "b_ground p"], velocities: Float[Array, "b_ground v"]
-    ) -> Float[Array, "parts v"]:
+    def velocities(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts v"]:
         """Velocities of the frames."""
         space = self.group.layout.space
         own = self.group.gather(poses), self.group.gather(velocities)
         return self.group.map(lambda at, x, v: at(t).velocity(space, x[0], v[0]), *own)
+
+
+class AbstractConstraintGroup(AbstractGroup):
+    """Kernels of stacked constraints."""
+
+    @abc.abstractmethod
+    def velocity(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts rows"]:
+        """Residuals of the velocity constraints, or rates of the position constraints."""
+
+    @abc.abstractmethod
+    def jacobian(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts rows k v"]:
+        """Derivative with respect to velocities, body by body."""
+
+    @abc.abstractmethod
+    def wrenches(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, multipliers: Float[Array, "parts rows"]
+    ) -> Float[Array, "parts k v"]:
+        """Wrenches of the constraints on their bodies, `Aᵀ λ` body by body."""
+
+    @abc.abstractmethod
+    def wrench_derivatives(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, multipliers: Float[Array, "parts rows"]
+    ) -> Float[Array, "parts k v k v"]:
+        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies."""
+
+    @abc.abstractmethod
+    def acceleration(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
+    ) -> Float[Array, "parts rows"]:
+        """The time derivative of `velocity`."""
+
+    @property
+    def rows(self) -> int:
+        return self.group.rows
+
+    @property
+    def _space(self):
+        return self.group.layout.space
+
+    def _map(self, kernel, *of_bodies, more=()):
+        """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
+        return self.group.map(kernel, *map(self.group.gather, of_bodies), *more)
+
+
+class ConstraintGroup(AbstractConstraintGroup):
+    """Kernels of stacked position constraints; with the gains `damping` and `stiffness`, of the programs of servos,
+    which act on accelerations.
+    """
+
+    damping: Float[Array, "parts"] | None = None
+    stiffness: Float[Array, "parts"] | None = None
+
+    def part(self, name=""):
+        part = super().part(name)
+        return part if self.damping is None else Servo(part, self.damping, self.stiffness)
+
+    @property
+    def rheonomic(self) -> bool:
+        """Whether the residuals depend on time."""
+        return self.group.part.rheonomic or bool(self.group.inputs)
+
+    def _residual(self, at, t, x):
+        part = at(t)
+        return part.residual(self._space, part.seen_poses(self._space, x), t)
+
+    def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts rows"]:
+        return self._map(lambda at, x: self._residual(at, t, x), poses)
+
+    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
+        """The joints' own coordinates, by name within the joint."""
+        return self._map(lambda at, x: at(t).coordinates_at(self._space, x), poses)
+
+    def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
+        """Derivatives along `n` motions of every body, one at a time."""
+
+        def single(at, x, moves):
+            def along_one(body):
+                residual = lambda own: self._residual(at, t, x.at[body].set(own))
+                push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
+                return jax.vmap(push, out_axes=-1)(moves[body])
+
+            # One body moves, the others rest.
+            return jnp.stack([along_one(body) for body in range(len(moves))], axis=1)
+
+        return self._map(single, poses, moves)
+
+    def jacobian(self, t, poses, velocities):
+        del velocities
+        moves = jax.vmap(self._space.moves)(poses)
+        return self.along(t, poses, moves)
+
+    def velocity(self, t, poses, velocities):
+        return self._map(lambda at, x, xdot: self._rate(at, t, x, xdot), poses, self._rates(poses, velocities))
+
+    def wrenches(self, t, poses, velocities, multipliers):
+        del velocities
+        return self._map(functools.partial(self._wrench, t), poses, more=(multipliers,))
+
+    def _wrench(self, t, at, x, multipliers):
+        _, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
+        return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
+
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        del velocities
+        single = lambda at, x, own: along_moves(self._space, lambda x: self._wrench(t, at, x, own), x)
+        return self._map(single, poses, more=(multipliers,))
+
+    def acceleration(self, t, poses, velocities, accelerations):
+        rates = self._rates(poses, velocities)
+        _, second = jax.jvp(self._rates, (poses, velocities), (rates, accelerations))
+
+        def single(at, x, xdot, xddot):
+            rate = lambda t, x, xdot: self._rate(at, t, x, xdot)
+            return jax.jvp(rate, (t, x, xdot), (jnp.ones_like(t), xdot, xddot))[1]
+
+        out = self._map(single, poses, rates, second)
+        if self.damping is None or self.stiffness is None:
+            return out
+        rate, value = self.velocity(t, poses, velocities), self.residual(t, poses)
+        return out + self.damping[:, None] * rate + self.stiffness[:, None] * value
+
+    def _rates(self, poses, velocities):
+        return jax.vmap(self._space.rates)(poses, velocities)
+
+    def _rate(self, at, t, x, xdot):
+        """Velocity residuals of one part, from the rates of its bodies' poses."""
+        if self.rheonomic:
+            residual = lambda t, x: self._residual(at, t, x)
+            return jax.jvp(residual, (t, x), (jnp.ones_like(t), xdot))[1]
+        return jax.jvp(lambda x: self._residual(at, t, x), (x,), (xdot,))[1]
+
+
+class VelocityConstraintGroup(AbstractConstraintGroup):
+    """Kernels of stacked velocity constraints."""
+
+    @property
+    def homogeneous(self) -> bool:
+        """Whether the residuals vanish at rest."""
+        return self.group.part.homogeneous and not self.group.inputs
+
+    def _residual(self, at, t, x, v):
+        part, space = at(t), self._space
+        return part.residual(space, *part.seen(space, x, v), t)
+
+    def velocity(self, t, poses, velocities):
+        return self._map(lambda at, x, v: self._residual(at, t, x, v), poses, velocities)
+
+    def jacobian(self, t, poses, velocities):
+        single = lambda at, x, v: jax.jacfwd(lambda w: self._residual(at, t, x, w))(v)
+        return self._map(single, poses, velocities)
+
+    def wrenches(self, t, poses, velocities, multipliers):
+        return self._map(functools.partial(self._wrench, t), poses, velocities, more=(multipliers,))
+
+    def _wrench(self, t, at, x, v, multipliers):
+        return jax.vjp(lambda w: self._residual(at, t, x, w), v)[1](multipliers)[0]
+
+    def wrench_derivatives(self, t, poses, velocities, multipliers):
+        single = lambda at, x, v, own: along_moves(self._space, lambda x: self._wrench(t, at, x, v, own), x)
+        return self._map(single, poses, velocities, more=(multipliers,))
+
+    def acceleration(self, t, poses, velocities, accelerations):
+        def single(at, x, xdot, v, a):
+            residual = lambda t, x, v: self._residual(at, t, x, v)
+            return jax.jvp(residual, (t, x, v), (jnp.ones_like(t), xdot, a))[1]
+
+        rates = jax.vmap(self._space.rates)(poses, velocities)
+        return self._map(single, poses, rates, velocities, accelerations)
+
+
+def servo_group(group: Group) -> ConstraintGroup:
+    """The programs of stacked servos with their gains."""
+    part = group.part
+    own = dataclasses.replace(group, part=part.program.with_fields(body_frames=part.body_frames))
+    return ConstraintGroup(own, part.damping, part.stiffness)
+
+
+class ForceGroup(AbstractGroup):
+    """Kernels of stacked forces."""
+
+    def wrenches(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts k v"]:
+        single = lambda at, x, v: self._wrenches(at, t, x, v)
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
+    def _wrenches(self, at, t, x, v):
+        part, space = at(t), self.group.layout.space
+        wrenches = part.wrenches(space, *part.seen(space, x, v), t)
+        return part.wrenches_on_bodies(space, x, wrenches)
+
+    def state_rates(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
+    ) -> dict[str, Float[Array, "parts *shape"]]:
+        """Rates of the parts' internal states, by the name of the field."""
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            part = at(t)
+            return part.state_rates(space, *part.seen(space, x, v), t)
+
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
+    def derivatives(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
+    ) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
+        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies, and to the
+        velocities.
+        """
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            of_positions = along_moves(space, lambda x: self._wrenches(at, t, x, v), x)
+            return of_positions, jax.jacfwd(lambda v: self._wrenches(at, t, x, v))(v)
+
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
+    def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
+        if not self.group.part.conservative:
+            return jnp.zeros((), poses.dtype)
+        space = self.group.layout.space
+
+        def single(at, x):
+            part = at(t)
+            return part.energy(space, part.seen_poses(space, x), t)
+
+        return jnp.sum(self.group.map(single, self.group.gather(poses)))
+
+
+class NonIdealGroup(AbstractGroup):
+    """Kernels of stacked non-ideal laws; `joints`: the joint's name for each."""
+
+    joints: tuple[str, ...] = eqx.field(static=True)
+
+    def wrenches(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, reactions: Float[Array, "parts k v"]
+    ) -> Float[Array, "parts k v"]:
+        """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
+        space = self.group.layout.space
+
+        def single(at, x, v, own):
+            part = at(t)
+            wrenches = part.wrenches(space, *part.seen(space, x, v), part.seen_wrenches(space, x, own), t)
+            return part.wrenches_on_bodies(space, x, wrenches)
+
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)
+
+
+def reaction_wrenches(
+    joints: Sequence[AbstractConstraintGroup],
+    t: Scalar,
+    poses: BodyPoses,
+    velocities: BodyVelocities,
+    multipliers: Float[Array, "rows"],
+) -> list[Float[Array, "parts k v"]]:
+    """Wrenches of the constraints on their bodies, group by group."""
+    out, row = [], 0
+    for g in joints:
+        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
+        out.append(g.wrenches(t, poses, velocities, own))
+        row += own.size
+    return out
+
+
+def nonideal_wrenches(
+    joints: Sequence[AbstractConstraintGroup],
+    laws: Sequence[NonIdealGroup],
+    t: Scalar,
+    poses: BodyPoses,
+    velocities: BodyVelocities,
+    multipliers: Float[Array, "rows"],
+) -> list[Float[Array, "parts k v"]]:
+    """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
+    wrenches = [own.reshape(-1) for own in reaction_wrenches(joints, t, poses, velocities, multipliers)]
+    reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
+    bodies = [(g.group.names, g.group.bodies) for g in joints]
+    # A joint may be made of several constraints, all between the same bodies.
+    take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
+    return [g.wrenches(t, poses, velocities, jnp.sum(take(g), axis=1)) for g in laws]
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:

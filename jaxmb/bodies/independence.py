@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..linalg.sparse_pivots import SparsePivots, pivot_rows
-from .block_cut_tree import components
+from ..linalg.graphs import components
+from ..linalg.independent_rows import SparsePivots, dense_pivots, least_size, sparse_pivots
 from .layout import Layout
 
 # An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the nearest of true ranks 1e-4.
@@ -30,6 +30,11 @@ class JointRows(NamedTuple):
     bodies: tuple[int, ...]
     first: int
     rows: int
+
+    @property
+    def numbers(self) -> Int[np.ndarray, "rows"]:
+        """Those of its rows."""
+        return np.arange(self.first, self.first + self.rows)
 
 
 class Subset(NamedTuple):
@@ -57,65 +62,133 @@ class Share(NamedTuple):
     multiples: Float[np.ndarray, "k"]
 
 
-def matrix(
-    parts: Sequence[JointRows],
-    blocks: Sequence[Float[np.ndarray, "rows k v"]],
-    layout: Layout,
-    own: Sequence[int],
-    columns: Int[np.ndarray, "n"],
-) -> Float[np.ndarray, "m n"]:
-    """Rows of some parts in some columns, from the blocks of all parts."""
-    out = np.zeros((sum(parts[p].rows for p in own), columns.size), blocks[0].dtype if blocks else float)
-    row = 0
-    for p in own:
-        for k, body in enumerate(parts[p].bodies):
-            index = layout.velocity_index[body]
-            place = np.minimum(np.searchsorted(columns, index), columns.size - 1) if columns.size else index
-            here = (columns[place] == index) if columns.size else np.zeros(index.size, bool)
-            out[row : row + parts[p].rows, place[here]] += blocks[p][:, k, here]
-        row += parts[p].rows
-    return out
+class JointBlocks(NamedTuple):
+    """The rows of the constraints as blocks of joints on bodies.
 
-
-def subsets(
-    parts: Sequence[JointRows],
-    blocks: Sequence[Float[np.ndarray, "rows k v"]],
-    layout: Layout,
-    scale: Float[np.ndarray, "nu"],
-    level: Int[np.ndarray, "rows"],
-    absolute: frozenset[int],
-    dense: int = _DENSE,
-) -> list[Subset]:
-    """The rows of each component, and which of them are independent.
-
-    **Arguments:** `blocks` of the parts; `scale` of the columns; `level` of each row: rows of low levels are kept
-    first; `absolute`: parts that do not depend on relative motions alone; `dense`: components of more rows than this
-        are eliminated as sparse matrices.
+    **Fields:** the `parts`, and their `blocks`; the `layout` of the bodies; the `scale` of the columns.
     """
-    ground = layout.ground
-    vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(parts)]
-    found = components(vertices, ground)
-    alone = {own.joints[0]: own.top for own in found if len(own.joints) == 1}
-    regular = _regular_parts(parts, blocks, layout, scale, alone)
-    out = []
-    for component in found:
-        bodies = sorted({body for p in component.joints for body in vertices[p]} - {component.top, ground})
-        columns = layout.velocity_index[bodies].ravel() if bodies else np.zeros(0, int)
-        columns = np.sort(columns[columns < layout.nu])
-        rows = np.concatenate([np.arange(parts[p].first, parts[p].first + parts[p].rows) for p in component.joints])
-        own, shares, is_sparse = component.joints, (), rows.size > dense
-        if len(own) == 1 and own[0] in regular:
-            order, rank = np.argsort(level[rows], kind="stable"), rows.size
-        elif is_sparse:
-            pivots, sizes = eliminate(parts, blocks, layout, own, columns, scale, level[rows], _ZERO)
-            order, rank = pivots.order, pivots.rank
-            shares = tuple(_sparse_share(pivots, sizes, rows, r) for r in order[rank:].tolist())
-        else:
-            whole = matrix(parts, blocks, layout, own, columns)
-            order, rank = _pivot_rows(whole * scale[columns], level[rows])
-            shares = _dense_shares(whole, rows, order[:rank], order[rank:]) if rank < rows.size else ()
-        out.append(Subset(own, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
-    return out
+
+    parts: Sequence[JointRows]
+    blocks: Sequence[Float[np.ndarray, "rows k v"]]
+    layout: Layout
+    scale: Float[np.ndarray, "nu"]
+
+    def dense(self, own: Sequence[int], columns: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m n"]:
+        """Rows of some parts in some columns."""
+        out = np.zeros((sum(self.parts[p].rows for p in own), columns.size), self.scale.dtype)
+        row = 0
+        for p in own:
+            for k, body in enumerate(self.parts[p].bodies):
+                index = self.layout.velocity_index[body]
+                place = np.minimum(np.searchsorted(columns, index), columns.size - 1) if columns.size else index
+                here = (columns[place] == index) if columns.size else np.zeros(index.size, bool)
+                out[row : row + self.parts[p].rows, place[here]] += self.blocks[p][:, k, here]
+            row += self.parts[p].rows
+        return out
+
+    def subsets(self, level: Int[np.ndarray, "rows"], absolute: frozenset[int], dense: int = _DENSE) -> list[Subset]:
+        """The rows of each component, and which of them are independent.
+
+        **Arguments:** `level` of each row: rows of low levels are kept first; `absolute`: parts that do not depend on
+        relative motions alone; `dense`: components of more rows than this are eliminated as sparse matrices.
+        """
+        ground = self.layout.ground
+        vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(self.parts)]
+        found = components(vertices, ground)
+        alone = {own.joints[0]: own.top for own in found if len(own.joints) == 1}
+        regular = self._regular_parts(alone)
+        out = []
+        for component in found:
+            bodies = sorted({body for p in component.joints for body in vertices[p]} - {component.top, ground})
+            columns = self.layout.velocity_index[bodies].ravel() if bodies else np.zeros(0, int)
+            columns = np.sort(columns[columns < self.layout.nu])
+            rows = np.concatenate([self.parts[p].numbers for p in component.joints])
+            own, shares, is_sparse = component.joints, (), rows.size > dense
+            if len(own) == 1 and own[0] in regular:
+                order, rank = np.argsort(level[rows], kind="stable"), rows.size
+            elif is_sparse:
+                pivots, sizes = self.eliminate(own, columns, level[rows], _ZERO)
+                order, rank = pivots.order, pivots.rank
+                shares = tuple(_sparse_share(pivots, sizes, rows, r) for r in order[rank:].tolist())
+            else:
+                whole = self.dense(own, columns)
+                order, rank = dense_pivots(whole * self.scale[columns], level[rows], _ZERO)
+                shares = _dense_shares(whole, rows, order[:rank], order[rank:]) if rank < rows.size else ()
+            out.append(Subset(own, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
+        return out
+
+    def eliminate(
+        self, own: Sequence[int], columns: Int[np.ndarray, "n"], level: Int[np.ndarray, "m"], zero: float
+    ) -> tuple[SparsePivots, Float[np.ndarray, "m"]]:
+        """Independent rows of some parts in some columns without a dense matrix, and the norms of the rows. Pivots
+        follow from sparsity; those below this power `zero` of eps are none.
+        """
+        rows: list[dict[int, float]] = []
+        known, scales = set(columns.tolist()), self.scale.tolist()
+        for p in own:
+            index = self.layout.velocity_index[list(self.parts[p].bodies)].ravel().tolist()
+            for row in self.blocks[p].reshape(self.parts[p].rows, -1).tolist():
+                entries: dict[int, float] = {}
+                for c, value in zip(index, row, strict=True):
+                    if value and c in known:
+                        entries[c] = entries.get(c, 0.0) + value * scales[c]
+                rows.append(entries)
+        eps = float(np.finfo(self.scale.dtype).eps)
+        sizes = np.array([math.sqrt(sum(x * x for x in entries.values())) for entries in rows], self.scale.dtype)
+        sizes = np.maximum(sizes, least_size(sizes))
+        unit = [{c: x / size for c, x in entries.items()} for entries, size in zip(rows, sizes.tolist(), strict=True)]
+        return sparse_pivots(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes
+
+    def absolute_parts(self, motions: Float[np.ndarray, "d b v"]) -> frozenset[int]:
+        """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
+        world.
+
+        **Arguments:** `motions`: velocities of all bodies, and zeros of scalar coordinates and the ground, in some
+            motions as one.
+        """
+        ground = motions.shape[1] - 1
+        out = set()
+        for numbers, bodies, own in self._alike(range(len(self.parts))):
+            change = np.einsum("prkv,dpkv->prd", own, motions[:, bodies])
+            size = np.einsum("prkv,dpkv->prd", np.abs(own), np.abs(motions[:, bodies]))
+            moved = np.abs(change) > np.finfo(change.dtype).eps ** 0.75 * (size + 1e-300)
+            bound = np.any(moved, axis=(1, 2)) | (bodies.shape[1] == 1)
+            out.update(numbers[bound & ~np.any(bodies == ground, axis=1)].tolist())
+        return frozenset(out)
+
+    def _alike(self, numbers):
+        """Parts with blocks of one shape: their numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for p in numbers:
+            groups.setdefault(self.blocks[p].shape, []).append(p)
+        for own in groups.values():
+            yield np.array(own), np.array([self.parts[p].bodies for p in own]), np.stack([self.blocks[p] for p in own])
+
+    def _regular_parts(self, held):
+        """Those of some parts whose rows are all independent, each with one of its bodies held: `dense_pivots` of many
+        matrices at once.
+        """
+        out = set()
+        of_bodies = np.append(self.scale, 0.0)[np.minimum(self.layout.velocity_index, self.layout.nu)]
+        of_bodies[self.layout.ground] = 0.0
+        for numbers, bodies, own in self._alike(held):
+            top = np.array([held[p] for p in numbers])
+            free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])
+            work = (own * free[:, None]).reshape(*own.shape[:2], -1)
+            size = np.linalg.norm(work, axis=2)
+            work = work / np.maximum(size, least_size(size))[:, :, None]
+            number, rows = np.arange(len(work)), work.shape[1]
+            independent = np.full(len(work), rows <= work.shape[2])
+            for _ in range(rows):
+                pivot = np.argmax(np.abs(work).reshape(len(work), -1), axis=1)
+                r, c = np.divmod(pivot, work.shape[2])
+                value, row = work[number, r, c], work[number, r]
+                independent &= np.abs(value) > np.finfo(work.dtype).eps ** _ZERO
+                ratio = work[number, :, c] / np.where(independent, value, 1.0)[:, None]
+                work = work - ratio[:, :, None] * row[:, None]
+                work[number, r] = 0.0
+            out.update(numbers[independent].tolist())
+        return out
 
 
 def _dense_shares(whole, rows, kept, dropped):
@@ -132,116 +205,3 @@ def _sparse_share(pivots, sizes, rows, r):
     own = {k: x for k, x in pivots.shares(r).items() if abs(x) > _NEGLIGIBLE}
     by = np.array(list(own), int)
     return Share(int(rows[r]), rows[by], np.array(list(own.values())) * sizes[r] / sizes[by])
-
-
-def absolute_parts(
-    parts: Sequence[JointRows], blocks: Sequence[Float[np.ndarray, "rows k v"]], motions: Float[np.ndarray, "d b v"]
-) -> frozenset[int]:
-    """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
-    world.
-
-    **Arguments:** `motions`: velocities of all bodies, and zeros of scalar coordinates and the ground, in some motions
-        as one.
-    """
-    ground = motions.shape[1] - 1
-    out = set()
-    for numbers, bodies, own in _alike(parts, blocks, range(len(parts))):
-        change = np.einsum("prkv,dpkv->prd", own, motions[:, bodies])
-        size = np.einsum("prkv,dpkv->prd", np.abs(own), np.abs(motions[:, bodies]))
-        moved = np.abs(change) > np.finfo(change.dtype).eps ** 0.75 * (size + 1e-300)
-        bound = np.any(moved, axis=(1, 2)) | (bodies.shape[1] == 1)
-        out.update(numbers[bound & ~np.any(bodies == ground, axis=1)].tolist())
-    return frozenset(out)
-
-
-def _alike(parts, blocks, numbers):
-    """Parts with blocks of one shape: their numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for p in numbers:
-        groups.setdefault(blocks[p].shape, []).append(p)
-    for own in groups.values():
-        yield np.array(own), np.array([parts[p].bodies for p in own]), np.stack([blocks[p] for p in own])
-
-
-def _regular_parts(parts, blocks, layout, scale, held):
-    """Those of some parts whose rows are all independent, each with one of its bodies held: `_pivot_rows` of many
-    matrices at once.
-    """
-    out = set()
-    of_bodies = np.append(scale, 0.0)[np.minimum(layout.velocity_index, layout.nu)]
-    of_bodies[layout.ground] = 0.0
-    for numbers, bodies, own in _alike(parts, blocks, held):
-        top = np.array([held[p] for p in numbers])
-        free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])
-        work = (own * free[:, None]).reshape(*own.shape[:2], -1)
-        size = np.linalg.norm(work, axis=2)
-        work = work / np.maximum(size, _floor(size))[:, :, None]
-        number, rows = np.arange(len(work)), work.shape[1]
-        independent = np.full(len(work), rows <= work.shape[2])
-        for _ in range(rows):
-            pivot = np.argmax(np.abs(work).reshape(len(work), -1), axis=1)
-            r, c = np.divmod(pivot, work.shape[2])
-            value, row = work[number, r, c], work[number, r]
-            independent &= np.abs(value) > np.finfo(work.dtype).eps ** _ZERO
-            ratio = work[number, :, c] / np.where(independent, value, 1.0)[:, None]
-            work = work - ratio[:, :, None] * row[:, None]
-            work[number, r] = 0.0
-        out.update(numbers[independent].tolist())
-    return out
-
-
-def _floor(sizes):
-    """The norm of a row that counts as zero, for each set of rows."""
-    info = np.finfo(sizes.dtype)
-    return np.maximum(info.eps**0.75 * np.max(sizes, axis=-1, initial=0.0, keepdims=True), info.tiny)
-
-
-def _pivot_rows(A, level):
-    """Rows in the order of full pivoting, independent ones first, and their number."""
-    m, n = A.shape
-    eps = float(np.finfo(A.dtype).eps)
-    size = np.linalg.norm(A, axis=1)
-    work = A / np.maximum(size, _floor(size))[:, None]
-    left = np.ones(m, bool)
-    kept = []
-    for own in np.unique(level):
-        while n and len(kept) < min(m, n):
-            sizes = np.where((left & (level == own))[:, None], np.abs(work), 0.0)
-            r, c = np.unravel_index(np.argmax(sizes), sizes.shape)
-            if not sizes[r, c] > eps**_ZERO:
-                break
-            left[r] = False
-            kept.append(int(r))
-            ratio = np.where(left, work[:, c] / work[r, c], 0.0)
-            work = work - ratio[:, None] * work[r]
-    return np.array([*kept, *np.flatnonzero(left)], int), len(kept)
-
-
-def eliminate(
-    parts: Sequence[JointRows],
-    blocks: Sequence[Float[np.ndarray, "rows k v"]],
-    layout: Layout,
-    own: Sequence[int],
-    columns: Int[np.ndarray, "n"],
-    scale: Float[np.ndarray, "nu"],
-    level: Int[np.ndarray, "m"],
-    zero: float,
-) -> tuple[SparsePivots, Float[np.ndarray, "m"]]:
-    """Independent rows of some parts in some columns without a dense matrix, and the norms of the rows. Pivots follow
-    from sparsity; those below this power `zero` of eps are none.
-    """
-    rows: list[dict[int, float]] = []
-    known, scales = set(columns.tolist()), scale.tolist()
-    for p in own:
-        index = layout.velocity_index[list(parts[p].bodies)].ravel().tolist()
-        for row in blocks[p].reshape(parts[p].rows, -1).tolist():
-            entries: dict[int, float] = {}
-            for c, value in zip(index, row, strict=True):
-                if value and c in known:
-                    entries[c] = entries.get(c, 0.0) + value * scales[c]
-            rows.append(entries)
-    eps = float(np.finfo(scale.dtype).eps)
-    sizes = np.array([math.sqrt(sum(x * x for x in entries.values())) for entries in rows], scale.dtype)
-    sizes = np.maximum(sizes, _floor(sizes))
-    unit = [{c: x / size for c, x in entries.items()} for entries, size in zip(rows, sizes.tolist(), strict=True)]
-    return pivot_rows(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..parts.contents import entry, internal_states
+from ..parts.fields import entry, internal_states
 from ..system.quantities import Quantity
-from .force_groups import ForceGroup
+from .groups import BodyPoses, BodyVelocities, ForceGroup
 
 
 class StateField(NamedTuple):
@@ -78,11 +78,7 @@ def with_states(
 
 
 def state_rates(
-    forces: Sequence[ForceGroup],
-    fields: Sequence[StateField],
-    t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
+    forces: Sequence[ForceGroup], fields: Sequence[StateField], t: Scalar, poses: BodyPoses, velocities: BodyVelocities
 ) -> Float[Array, "nz"]:
     """ż of parts that have their internal states."""
     rates = {g: forces[g].state_rates(t, poses, velocities) for g in dict.fromkeys(own.group for own in fields)}

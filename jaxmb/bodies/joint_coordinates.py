@@ -15,8 +15,7 @@ from .._types import Scalar
 from ..parts.coordinate_parts import JointDriver
 from ..system.catalogue import AbstractSystem
 from ..system.quantities import Quantity
-from .constraint_groups import ConstraintGroup
-from .groups import CoordinateGroup, Group
+from .groups import ConstraintGroup, CoordinateGroup, Group
 from .layout import Layout
 
 # A coordinate and its derivatives with respect to time, by the ends of their names.

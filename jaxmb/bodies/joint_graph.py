@@ -18,8 +18,8 @@ import numpy as np
 from ..linalg.block_jacobian import JointOrder
 from ..linalg.digest import digest_of_fields
 from ..linalg.elimination_order import order_nodes
+from ..linalg.graphs import components
 from ..linalg.sums import placed_sums
-from .block_cut_tree import components
 from .layout import Layout
 
 # A body on which this many joints hang is a node of the elimination. (A step of two coupled carriers, each with five

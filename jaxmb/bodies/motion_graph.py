@@ -16,7 +16,6 @@ Source: J. Brüdigam and Z. Manchester, "Linear-time variational integrators in 
 over the graph of bodies and joints).
 """
 
-import collections
 import dataclasses
 import functools
 from typing import Any
@@ -26,6 +25,7 @@ import numpy as np
 from ..linalg.block_jacobian import JointOrder
 from ..linalg.digest import digest_of_fields
 from ..linalg.elimination_order import NodeOrder, order_nodes
+from ..linalg.graphs import vertices_before
 from ..linalg.sums import PlacedSums, placed_sums
 from .joint_graph import joint_order
 from .layout import Layout
@@ -99,7 +99,7 @@ def _motion_order(
         for body in own:
             neighbours[body].add(joint)
     widest = size if joints is None else max(size, joints.rows.shape[1])
-    after = [*([()] * ground), *_bodies_before(of_joints, ground)]
+    after = [*([()] * ground), *vertices_before(of_joints, ground)]
     nodes = order_nodes(neighbours, widest, after=after, every_bound=True)
 
     # Blocks of pairs, of joints on bodies, their transposes, identities of joints, and a zero.
@@ -133,52 +133,3 @@ def _motion_order(
         nodes=nodes,
     )
     return dataclasses.replace(order, key=digest_of_fields(order))
-
-
-def _bodies_before(joints: list[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
-    """The bodies that are eliminated before each joint."""
-    at: list[list[int]] = [[] for _ in range(ground + 1)]
-    vertices = [own if len(own) > 1 else (*own, ground) for own in joints]
-    for joint, own in enumerate(vertices):
-        for vertex in own:
-            at[vertex].append(joint)
-    before: list[tuple[int, ...]] = [()] * len(joints)
-    reached = [False] * (ground + 1)
-    waits = [False] * len(joints)
-    for root in [ground, *range(ground)]:
-        if reached[root]:
-            continue
-        reached[root] = True
-        queue = collections.deque([root])
-        while queue:
-            for joint in at[queue.popleft()]:
-                below = next((vertex for vertex in vertices[joint] if not reached[vertex]), None)
-                if below is not None and not waits[joint]:
-                    reached[below] = waits[joint] = True
-                    before[joint] = (below,)
-                    queue.append(below)
-    for joint, own in enumerate(vertices):
-        if not waits[joint]:
-            before[joint] = tuple(body for body in _shortest_loop(joint, own, at, vertices) if body != ground)
-    return before
-
-
-def _shortest_loop(joint, own, at, vertices):
-    """The vertices of a shortest loop through a joint; those of the joint where it is on none."""
-    start, *ends = own
-    found = set(own)
-    for end in ends:
-        above = {start: start}
-        queue = collections.deque([start])
-        while queue and end not in above:
-            vertex = queue.popleft()
-            for other in at[vertex]:
-                if other != joint:
-                    for far in vertices[other]:
-                        if far not in above:
-                            above[far] = vertex
-                            queue.append(far)
-        while end in above and end != start:
-            end = above[end]
-            found.add(end)
-    return found

@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ..linalg.arrays import is_traced
-from ..parts.checks import in_range
-from ..parts.contents import entry, inner_parts, paths
-from ..parts.fields import Declaration
+from ..parts.fields import Declaration, entry, in_range, inner_parts, paths
 from ..parts.series import AbstractSignal
 from ..system.catalogue import ParameterPath
 from .groups import Input

@@ -8,45 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..linalg.arrays import unchecked_take
 from ..linalg.rotations import cross
 from ..system.quantities import Reaction
-from .constraint_groups import AbstractConstraintGroup
-from .force_groups import ForceGroup, NonIdealGroup
-from .groups import Group
-
-
-def reaction_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of the constraints on their bodies, group by group."""
-    out, row = [], 0
-    for g in joints:
-        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-        out.append(g.wrenches(t, poses, velocities, own))
-        row += own.size
-    return out
-
-
-def nonideal_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    laws: Sequence[NonIdealGroup],
-    t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
-    wrenches = [own.reshape(-1) for own in reaction_wrenches(joints, t, poses, velocities, multipliers)]
-    reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
-    bodies = [(g.group.names, g.group.bodies) for g in joints]
-    # A joint may be made of several constraints, all between the same bodies.
-    take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
-    return [g.wrenches(t, poses, velocities, jnp.sum(take(g), axis=1)) for g in laws]
+from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, ForceGroup, Group, NonIdealGroup
 
 
 def applied_wrenches(
@@ -66,8 +30,8 @@ def reaction(
     joints: Sequence[AbstractConstraintGroup],
     name: str,
     t: Scalar,
-    poses: Float[Array, "b_ground p"],
-    velocities: Float[Array, "b_ground v"],
+    poses: BodyPoses,
+    velocities: BodyVelocities,
     multipliers: Float[Array, "rows"],
 ) -> Reaction:
     """Reaction of one joint at one state, from the multipliers of the rows of all joints."""

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced, unchecked_take
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
@@ -24,11 +24,22 @@ from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Ranks
 from ..system.quantities import Quantity
-from .constraint_groups import AbstractConstraintGroup, ConstraintGroup, ServoGroup, VelocityConstraintGroup
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
-from .force_groups import ForceGroup, NonIdealGroup
-from .groups import BodyGroup, CoordinateGroup, FrameGroup
+from .groups import (
+    AbstractConstraintGroup,
+    BodyGroup,
+    BodyPoses,
+    BodyVelocities,
+    ConstraintGroup,
+    CoordinateGroup,
+    ForceGroup,
+    FrameGroup,
+    NonIdealGroup,
+    VelocityConstraintGroup,
+    nonideal_wrenches,
+    reaction_wrenches,
+)
 from .internal_states import (
     StateField,
     initial_states,
@@ -52,7 +63,7 @@ from .parameters import (
     with_signals,
 )
 from .picture import picture
-from .reactions import applied_wrenches, nonideal_wrenches, reaction, reaction_wrenches
+from .reactions import applied_wrenches, reaction
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
@@ -79,7 +90,7 @@ class RigidBodySystem(AbstractSystem):
     gravity: Float[Array, "d"] | None
     constraints: tuple[ConstraintGroup, ...]
     velocity_constraints: tuple[VelocityConstraintGroup, ...]
-    servos: tuple[ServoGroup, ...]
+    servos: tuple[ConstraintGroup, ...]
     nonideal: tuple[NonIdealGroup, ...]
     forces: tuple[ForceGroup, ...]
     guess: State
@@ -140,21 +151,21 @@ class RigidBodySystem(AbstractSystem):
 
     # Kinematics
 
-    def prepared_poses(self, q: Float[Array, "nq"]) -> Float[Array, "b_ground p"]:
+    def prepared_poses(self, q: Coordinates) -> BodyPoses:
         """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
         return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
 
-    def all_velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b_ground v"]:
+    def all_velocities(self, u: Velocities) -> BodyVelocities:
         """Velocities of the bodies, of scalar coordinates and of the ground."""
         return jnp.pad(self._velocities(u), ((0, 1), (0, 0)))
 
-    def poses(self, q: Float[Array, "nq"]) -> Float[Array, "b p"]:
+    def poses(self, q: Coordinates) -> Float[Array, "b p"]:
         """Poses of the bodies."""
         return self._poses(q)[: self.layout.bodies]
 
-    def velocities(self, u: Float[Array, "nu"]) -> Float[Array, "b v"]:
+    def velocities(self, u: Velocities) -> Float[Array, "b v"]:
         """Velocities of the bodies."""
         return self._velocities(u)[: self.layout.bodies]
 
@@ -317,7 +328,7 @@ class RigidBodySystem(AbstractSystem):
     # Parameters and names
 
     def parameter_paths(self):
-        return parameter_paths(self._gravity_name, self._groups, self.servos)
+        return parameter_paths(None if self.gravity is None else self.gravity_name, self._groups, self.servos)
 
     def with_frames_of(self, before):
         pairs = zip(self.bodies, before.bodies, strict=True)
@@ -357,10 +368,6 @@ class RigidBodySystem(AbstractSystem):
     def _groups(self):
         kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
         return {kind: getattr(self, kind) for kind in (*kinds, "free_joints")}
-
-    @property
-    def _gravity_name(self):
-        return None if self.gravity is None else self.gravity_name
 
     def signals(self):
         return signals_of(self._groups)
@@ -535,9 +542,7 @@ class RigidBodySystem(AbstractSystem):
             return DenseJacobian(self.jacobian(t, q, u))
         return self.block_jacobian(t, q, u, self.elimination)
 
-    def block_jacobian(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], order: JointOrder
-    ) -> BlockJacobian:
+    def block_jacobian(self, t: Scalar, q: Coordinates, u: Velocities, order: JointOrder) -> BlockJacobian:
         """`A` in blocks of joints on bodies."""
         blocks = [*self._blocks(t, q, u, self.joints), jnp.zeros(1, q.dtype)]
         return block_jacobian(_join(blocks, q.dtype), order)
@@ -615,7 +620,7 @@ class RigidBodySystem(AbstractSystem):
         own = self._own_wrenches(u)
         if own is not None:
             wrenches.append(own)
-            bodies.append(_all_bodies(self.layout))
+            bodies.append(np.arange(self.layout.bodies)[:, None])
         return self._add_up(wrenches, bodies, u.dtype)
 
     def _add_up(self, wrenches, bodies, dtype):
@@ -641,7 +646,7 @@ class RigidBodySystem(AbstractSystem):
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         return sum(parts[1:], start=parts[0]) if parts else None
 
-    def gyroscopic_damping(self, u: Float[Array, "nu"]) -> Float[Array, "ground v v"]:
+    def gyroscopic_damping(self, u: Velocities) -> Float[Array, "ground v v"]:
         """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
         coordinates.
         """
@@ -682,15 +687,11 @@ class RigidBodySystem(AbstractSystem):
             energy = energy - jnp.sum(self.mass * (position @ self.gravity))
         return energy
 
-    def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
-        """`Σ m v` [kg m/s], world axes."""
+    def linear_momentum(self, q, u):
         del q
         return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
 
-    def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
-        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
-        space.
-        """
+    def angular_momentum(self, q, u):
         poses, velocities = self.poses(q), self.velocities(u)
         if not self.spatial:
             x, v = poses[:, :2], velocities[:, :2]
@@ -753,10 +754,6 @@ def _join(blocks, dtype):
 
 def _rotating(layout: Layout):
     return [k for k, rotates in enumerate(layout.rotates) if rotates]
-
-
-def _all_bodies(layout: Layout):
-    return np.arange(layout.bodies)[:, None]
 
 
 @eqx.filter_jit

@@ -25,8 +25,7 @@ from ..parts.base import (
     rows_of,
 )
 from ..parts.boundary import check_kernels
-from ..parts.contents import anonymous, inner_parts
-from ..parts.fields import as_parameter, declarations, values_of
+from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
 from ..parts.names import unknown
@@ -35,9 +34,17 @@ from ..parts.servo import Servo
 from ..parts.spatial.kinematics import SPACE
 from ..system.description import Description
 from ..system.equation import Ranks
-from .constraint_groups import ConstraintGroup, VelocityConstraintGroup, servo_group
-from .force_groups import ForceGroup, NonIdealGroup
-from .groups import BodyGroup, CoordinateGroup, FrameGroup, stack
+from .groups import (
+    BodyGroup,
+    ConstraintGroup,
+    CoordinateGroup,
+    ForceGroup,
+    FrameGroup,
+    NonIdealGroup,
+    VelocityConstraintGroup,
+    servo_group,
+    stack,
+)
 from .layout import Layout
 from .rigid_bodies import RigidBodySystem
 from .structure import with_structure

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..linalg.graphs import connected
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.rotations import cross, unrotate
 from ..states.assembly import violated_joints
@@ -31,7 +32,7 @@ from ..states.redundancy import (
 )
 from ..system.equation import Ranks
 from ..system.residuals import binding_velocities, displaced, position_rows
-from .independence import JointRows, absolute_parts, eliminate, matrix, subsets
+from .independence import JointBlocks, JointRows
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
 
@@ -61,22 +62,21 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
             f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
             "points and axes for joints that contradict each other, or give better poses."
         )
-    parts = _parts(system)
-    blocks, scale = _of_parts(at.blocks), np.asarray(at.scale)
+    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, np.asarray(at.scale))
     check_gradients(system, np.asarray(at.row_norms))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
-    absolute = absolute_parts(parts, blocks, np.asarray(at.as_one))
-    found = subsets(parts, blocks, system.layout, scale, level, absolute)
+    absolute = joints.absolute_parts(np.asarray(at.as_one))
+    found = joints.subsets(level, absolute)
     dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
     shares = [share for own in found for share in own.shares]
 
     order = joint_order(system, dropped, absolute)
     _check_contradictions(dataclasses.replace(system, elimination=order), q, shares)
-    _check_locked(system, parts, blocks, scale, found)
+    _check_locked(system, joints, found)
     implied = _implied(system, shares)
     _check_determined(system, implied)
-    _check_nearby(dataclasses.replace(of_positions, elimination=order), q, parts, found, scale)
+    _check_nearby(dataclasses.replace(of_positions, elimination=order), q, joints, found)
     position, velocity, acceleration = (sum(int(np.sum(level[own.kept] <= k)) for own in found) for k in range(3))
     return dataclasses.replace(
         system,
@@ -203,7 +203,7 @@ def _check_contradictions(system, q, shares):
             )
 
 
-def _check_locked(system, parts, blocks, scale, found):
+def _check_locked(system, joints, found):
     """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
 
     Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
@@ -212,18 +212,19 @@ def _check_locked(system, parts, blocks, scale, found):
     independent = np.zeros(system.acceleration_rows, bool)
     for subset in found:
         independent[subset.kept] = True
+    parts = joints.parts
     for bodies, own in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = np.sort(columns[columns < system.nu])
         # Where rows are fewer than columns, or some implied by others, the bodies move.
-        if sum(np.sum(independent[parts[p].first : parts[p].first + parts[p].rows]) for p in own) < len(columns):
+        if sum(np.sum(independent[parts[p].numbers]) for p in own) < len(columns):
             continue
-        scaled = matrix(parts, blocks, system.layout, own, columns) * scale[columns]
+        scaled = joints.dense(own, columns) * joints.scale[columns]
         scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
         left, sizes, _ = np.linalg.svd(scaled)
         if _MOVES < sizes[-1] < _LOCKED:
             share = np.abs(left[:, len(columns) - 1])
-            rows = [r for p in own for r in range(parts[p].first, parts[p].first + parts[p].rows)]
+            rows = [r for p in own for r in parts[p].numbers]
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
             moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
             raise ValueError(
@@ -238,27 +239,16 @@ def _connected(system, parts):
     driver.
     """
     ground = system.layout.ground
-    # A union-find forest: the root of a tree represents all bodies connected to it.
-    parent = list(range(ground))
-
-    def root(body):
-        while parent[body] != body:
-            parent[body] = parent[parent[body]]
-            body = parent[body]
-        return body
-
     rheonomic = [moving for g in system.constraints for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
-    for own in moving:
-        for k in own[1:]:
-            parent[root(k)] = root(own[0])
-    bodies, of_parts, driven = ([[] for _ in parent] for _ in range(3))
+    first = connected(ground, filter(None, moving))
+    bodies, of_parts, driven = ([[] for _ in first] for _ in range(3))
     for k in range(ground):
-        bodies[root(k)].append(k)
+        bodies[first[k]].append(k)
     for p, own in enumerate(moving):
         if own:
-            of_parts[root(own[0])].append(p)
-            driven[root(own[0])].append(rheonomic[p])
+            of_parts[first[own[0]]].append(p)
+            driven[first[own[0]]].append(rheonomic[p])
     return [(b, p) for b, p, d in zip(bodies, of_parts, driven, strict=True) if d and not any(d)]
 
 
@@ -293,19 +283,19 @@ def _implied(system, shares):
     return tuple(sorted(out, key=lambda item: (item.name, item.row)))
 
 
-def _check_nearby(system, q, parts, found, scale):
+def _check_nearby(system, q, joints, found):
     """Refuse rows that are implied at this configuration, but not near it."""
     groups = [own for own in found if own.dropped.size]
-    is_sparse, layout = any(own.is_sparse for own in groups), system.layout
+    is_sparse = any(own.is_sparse for own in groups)
 
     def evaluate(t, moved):
         t = np.asarray(t, q.dtype)
         at = _displaced(system, t, q, moved)
-        blocks, unmet = _of_parts(at.blocks), np.asarray(at.unmet)
+        there, unmet = joints._replace(blocks=_of_parts(at.blocks)), np.asarray(at.unmet)
         back: Any = np.asarray(_way_back(system, t, q, moved)) if is_sparse else None
 
         def dense(own):
-            return matrix(parts, blocks, layout, own.parts, own.columns) * scale[own.columns]
+            return there.dense(own.parts, own.columns) * joints.scale[own.columns]
 
         def step(k, rows):
             own = groups[k]
@@ -319,8 +309,7 @@ def _check_nearby(system, q, parts, found, scale):
                 off, sizes, by = dense_remains(dense(own), *(np.searchsorted(own.rows, x) for x in (kept, dropped)))
                 return Remains(off, sizes, lambda bad: own.rows[by(bad)])
             place, later = np.searchsorted(own.rows, dropped), np.isin(own.rows, dropped)
-            given = own.parts, own.columns, scale, later.astype(int), ZERO
-            pivots, sizes = eliminate(parts, blocks, layout, *given)
+            pivots, sizes = there.eliminate(own.parts, own.columns, later.astype(int), ZERO)
             # What remains of a row is not zero where it became a pivot.
             off = np.isin(place, pivots.order[: pivots.rank]).astype(q.dtype)
             implied_by = {share.row: share.by for share in own.shares}

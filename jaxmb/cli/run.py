@@ -20,9 +20,8 @@ from ..states.assembly import assemble
 from ..studies.identify import identify
 from ..system import parameters, with_parameters
 from ..trajectory import Trajectory
-from .folders import check_folder, made_folder, write_figures
+from .folders import check_folder, check_picture, made_folder, show_motion, write_figures
 from .options import add_parameters
-from .picture import check_picture, show_motion
 from .subject import mechanism_of
 
 # What `run` does: saved times, and the fit of one parameter to every other saved time of the

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
@@ -60,9 +60,7 @@ class AbstractFormulation(eqx.Module):
         return self
 
 
-def pivoted_jacobian(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-) -> DenseJacobian:
+def pivoted_jacobian(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> DenseJacobian:
     """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
     jacobian = system.jacobian(t, q, u)
     pivots = full_pivot(jacobian, scale=system.velocity_scale(), level=row_levels(system))
@@ -88,8 +86,8 @@ def accelerations(
     system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
+    q: Coordinates,
+    u: Velocities,
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
     """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
@@ -128,8 +126,8 @@ def solve_constrained(
     system: AbstractEquation,
     formulation: AbstractFormulation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
+    q: Coordinates,
+    u: Velocities,
     jacobian: AbstractJacobian,
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> Solution:
@@ -171,11 +169,7 @@ def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
 
 
 def friction_coupling(
-    system: AbstractEquation,
-    formulation: AbstractFormulation,
-    t: Scalar,
-    q: Float[Array, "nq"],
-    u: Float[Array, "nu"],
+    system: AbstractEquation, formulation: AbstractFormulation, t: Scalar, q: Coordinates, u: Velocities
 ) -> Float[Array, "k k"]:
     """How much the multipliers that friction depends on change with themselves, through its force, at a state; see
     `friction`. Without derivative.

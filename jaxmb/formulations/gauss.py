@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 from ..system import AbstractEquation
 
 
 def gauss_function(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
 ) -> Float[Array, ""]:
     """Gauss' function `𝒢(u̇) = (u̇ − a)ᵀ M (u̇ − a)`, `a = M⁻¹F`, of any accelerations at a state [N²/kg].
 

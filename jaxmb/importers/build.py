@@ -168,14 +168,7 @@ class _Builder:
     def _passive(self, joint: Joint, a: str, b: chains.PlacedLink):
         """What acts on a joint of itself."""
         coordinate = self.coordinates[joint.name]
-        values = {
-            "springs": joint.stiffness,
-            "damping": joint.damping,
-            "armature": joint.armature,
-            "friction": joint.friction,
-            "limits": joint.limits is not None,
-        }
-        wanted = {kind for kind, value in values.items() if value and not self.notes.leaves_out(kind, joint.name)}
+        wanted = {kind for kind in joint.passive if not self.notes.leaves_out(kind, joint.name)}
         if coordinate is None or joint.kind == "ball":
             self._of_ball(joint, a, b, coordinate, wanted)
             return

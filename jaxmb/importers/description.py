@@ -63,6 +63,18 @@ class Joint:
     stop: tuple[float, float] | None = None
     where: str = ""
 
+    @property
+    def passive(self) -> tuple[str, ...]:
+        """What acts on the joint of itself, by the words that leave it out."""
+        values = {
+            "springs": self.stiffness,
+            "damping": self.damping,
+            "armature": self.armature,
+            "friction": self.friction,
+            "limits": self.limits is not None,
+        }
+        return tuple(kind for kind, value in values.items() if value)
+
 
 @dataclasses.dataclass
 class Loop:

@@ -186,21 +186,18 @@ def _hinges(part, **axes):
     return out
 
 
-def _revolute(part):
-    return _hinges(part, angle=("hinge", part.direction("axis_a")))
+# The types of the joints that a part has about axes of its own, by the names of its coordinates, each with the axis and
+# the number of the body that this is fixed in.
+_OWN_AXES = {
+    "Revolute": {"angle": ("hinge", "axis_a", 0)},
+    "Prismatic": {"displacement": ("slide", "axis_a", 0)},
+    "Cylindrical": {"displacement": ("slide", "axis_a", 0), "angle": ("hinge", "axis_a", 0)},
+    "Universal": {"angle_a": ("hinge", "axis_a", 0), "angle_b": ("hinge", "axis_b", 1)},
+}
 
 
-def _prismatic(part):
-    return _hinges(part, displacement=("slide", part.direction("axis_a")))
-
-
-def _cylindrical(part):
-    axis = part.direction("axis_a")
-    return _hinges(part, displacement=("slide", axis), angle=("hinge", axis))
-
-
-def _universal(part):
-    return _hinges(part, angle_a=("hinge", part.direction("axis_a")), angle_b=("hinge", part.direction("axis_b", 1)))
+def _about_own_axes(part):
+    return _hinges(part, **{name: (kind, part.direction(*at)) for name, (kind, *at) in _OWN_AXES[part.kind].items()})
 
 
 def _gimbal(part):
@@ -255,10 +252,7 @@ def _planar(part):
 
 
 _JOINTS = {
-    "Revolute": _revolute,
-    "Prismatic": _prismatic,
-    "Cylindrical": _cylindrical,
-    "Universal": _universal,
+    **dict.fromkeys(_OWN_AXES, _about_own_axes),
     "Gimbal": _gimbal,
     "Composite": _composite,
     "Spherical": _spherical,

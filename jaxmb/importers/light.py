@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 
+from ..linalg.graphs import connected
 from .description import GROUND, Joint, Link, Machine
 from .notes import Notes
 
@@ -13,20 +14,10 @@ _ROUNDED = 0.05
 
 def bodies_of(machine: Machine) -> dict[str, str]:
     """For each link and the ground the first one of the file that it is fixed to."""
-    order = {name: k for k, name in enumerate((GROUND, *machine.links))}
-    parent = {name: name for name in order}
-
-    def root(name):
-        while parent[name] != name:
-            parent[name] = parent[parent[name]]
-            name = parent[name]
-        return name
-
-    for joint in machine.joints:
-        if joint.kind == "fixed":
-            first, last = sorted((root(joint.parent), root(joint.child)), key=order.__getitem__)
-            parent[last] = first
-    return {name: root(name) for name in order}
+    names = (GROUND, *machine.links)
+    number = {name: k for k, name in enumerate(names)}
+    welds = [(number[own.parent], number[own.child]) for own in machine.joints if own.kind == "fixed"]
+    return {name: names[k] for name, k in zip(names, connected(len(names), welds), strict=True)}
 
 
 def without_ends(machine: Machine, notes: Notes) -> None:
@@ -61,14 +52,7 @@ def _alone(machine, notes, joint):
     coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
     if acting or along or len(coupled) > 1:
         return False
-    own = {
-        "springs": joint.stiffness,
-        "damping": joint.damping,
-        "armature": joint.armature,
-        "friction": joint.friction,
-        "limits": joint.limits is not None,
-    }
-    return not coupled or not any(value and kind not in notes.ignore for kind, value in own.items())
+    return not coupled or notes.ignore.issuperset(joint.passive)
 
 
 def _coupled(coupling):

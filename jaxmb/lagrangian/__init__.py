@@ -8,7 +8,6 @@ from .constraints import (
     Pfaffian as Pfaffian,
     ServoConstraint as ServoConstraint,
 )
-from .equations import Projected as Projected
 from .hamel import Hamel as Hamel, pivoted_frame as pivoted_frame, structure_functions as structure_functions
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,
@@ -16,7 +15,7 @@ from .kinematics import (
     QuasiVelocityFrame as QuasiVelocityFrame,
     Rates as Rates,
 )
-from .model import AbstractEquations as AbstractEquations
+from .model import AbstractEquations as AbstractEquations, Projected as Projected
 from .nonideal import (
     AbstractNonIdealForce as AbstractNonIdealForce,
     CoulombFriction as CoulombFriction,

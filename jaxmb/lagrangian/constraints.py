@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar
 from .dataflow import depends
 from .kinematics import Parameters
 
@@ -30,19 +30,21 @@ class AbstractCoordinateConstraint(eqx.Module):
 
     @abc.abstractmethod
     def value(
-        self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"], a: Float[Array, "nq"], parameters: Parameters
+        self, t: Scalar, q: Coordinates, v: Float[Array, "nq"], a: Float[Array, "nq"], parameters: Parameters
     ) -> Float[Array, "rows"]:
         """The residual, with `v = q̇` and `a = q̈`; derivatives above the constraint's level are not used."""
 
-    @abc.abstractmethod
-    def is_linear(self, q: Float[Array, "nq"], parameters: Parameters) -> bool:
-        """Whether the rows are linear in velocities up to a term without them; of a constraint between accelerations
-        always true.
+    def is_linear(self, q: Coordinates, parameters: Parameters) -> bool:
+        """Hook: whether the rows are linear in velocities up to a term without them; of a constraint between
+        accelerations always true.
         """
+        del q, parameters
+        return True
 
-    @abc.abstractmethod
-    def is_drift_free(self, q: Float[Array, "nq"], parameters: Parameters) -> bool:
-        """Whether the rows between velocities vanish at rest; of a constraint between accelerations always true."""
+    def is_drift_free(self, q: Coordinates, parameters: Parameters) -> bool:
+        """Hook: whether rows between velocities vanish at rest; of a constraint between accelerations always true."""
+        del q, parameters
+        return True
 
 
 class Holonomic(AbstractCoordinateConstraint):
@@ -54,9 +56,6 @@ class Holonomic(AbstractCoordinateConstraint):
 
     def value(self, t, q, v, a, parameters):
         return jnp.ravel(self.residual(t, q, parameters))
-
-    def is_linear(self, q, parameters):
-        return True
 
     def is_drift_free(self, q, parameters):
         t = jnp.zeros((), q.dtype)
@@ -76,7 +75,8 @@ class Nonholonomic(AbstractCoordinateConstraint):
         return jnp.ravel(self.residual(t, q, v, parameters))
 
     def is_linear(self, q, parameters):
-        return _is_linear(self, q, parameters)
+        slope = lambda t, q, v, p: jax.jacfwd(self.value, 2)(t, q, v, v, p)
+        return not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)
 
     def is_drift_free(self, q, parameters):
         # A function does not say so.
@@ -98,9 +98,6 @@ class Pfaffian(AbstractCoordinateConstraint):
         out = jnp.atleast_2d(self.matrix(t, q, parameters)) @ v
         return out if self.drift is None else out + jnp.ravel(self.drift(t, q, parameters))
 
-    def is_linear(self, q, parameters):
-        return True
-
     def is_drift_free(self, q, parameters):
         return self.drift is None
 
@@ -121,12 +118,6 @@ class AccelerationConstraint(AbstractCoordinateConstraint):
     def value(self, t, q, v, a, parameters):
         matrix = jnp.atleast_2d(self.matrix(t, q, v, parameters))
         return matrix @ a - jnp.ravel(self.right(t, q, v, parameters))
-
-    def is_linear(self, q, parameters):
-        return True
-
-    def is_drift_free(self, q, parameters):
-        return True
 
 
 class ServoConstraint(AbstractCoordinateConstraint):
@@ -160,12 +151,6 @@ class ServoConstraint(AbstractCoordinateConstraint):
         rate, second = jax.jvp(first, (t, q, v), (one, v, a))
         return second + self.damping * rate + self.stiffness * phi(t, q)
 
-    def is_linear(self, q, parameters):
-        return True
-
-    def is_drift_free(self, q, parameters):
-        return True
-
 
 def check_names(constraints: tuple[Any, ...]) -> None:
     """Raise a `ValueError` unless every entry is a constraint, with a name of its own."""
@@ -179,8 +164,3 @@ def check_names(constraints: tuple[Any, ...]) -> None:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise ValueError(f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs its own.")
-
-
-def _is_linear(constraint: AbstractCoordinateConstraint, q: Array, parameters: Parameters) -> bool:
-    slope = lambda t, q, v, p: jax.jacfwd(constraint.value, 2)(t, q, v, v, p)
-    return not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)

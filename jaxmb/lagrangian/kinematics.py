@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -36,7 +36,7 @@ class AbstractKinematics(eqx.Module):
         """The number of velocities of a system with nq coordinates."""
 
     @abc.abstractmethod
-    def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], parameters: Parameters) -> Array:
+    def rates(self, t: Scalar, q: Coordinates, u: Velocities, parameters: Parameters) -> Array:
         """q̇, shape (nq,)."""
 
 
@@ -84,7 +84,7 @@ class QuasiVelocityFrame(AbstractKinematics):
             )
         return self.columns
 
-    def columns_of(self, t: Scalar, q: Float[Array, "nq"], parameters: Parameters) -> Float[Array, "nq columns"]:
+    def columns_of(self, t: Scalar, q: Coordinates, parameters: Parameters) -> Float[Array, "nq columns"]:
         """N."""
         return jnp.asarray(self.matrix(t, q, parameters))
 

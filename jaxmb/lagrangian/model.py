@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..parts.series import AbstractSignal
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
@@ -33,9 +33,7 @@ class AbstractEquations(eqx.Module):
         """Raise a `ValueError` for a system that the equations cannot be written for."""
 
     @abc.abstractmethod
-    def force(
-        self, system: "AbstractLagrangian", t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-    ) -> Float[Array, "nu"]:
+    def force(self, system: "AbstractLagrangian", t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
         """`F(t, q, u)`."""
 
 
@@ -193,7 +191,7 @@ class AbstractLagrangian(AbstractSystem):
 
     # Dynamics
 
-    def momentum(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
+    def momentum(self, t: Scalar, q: Coordinates, v: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """`∂L/∂q̇`."""
         return jax.grad(self.lagrangian, 2)(t, q, v, self.parameters_at(t))
 
@@ -213,7 +211,7 @@ class AbstractLagrangian(AbstractSystem):
     def force(self, t, q, u):
         return self.equations.force(self, jnp.asarray(t, q.dtype), q, u)
 
-    def applied_force(self, t: Scalar, q: Float[Array, "nq"], v: Float[Array, "nq"]) -> Float[Array, "nq"]:
+    def applied_force(self, t: Scalar, q: Coordinates, v: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """Q, the generalized forces on the coordinates that have no potential."""
         return jnp.zeros_like(v) if self.applied is None else jnp.asarray(self.applied(t, q, v, self.parameters_at(t)))
 
@@ -266,6 +264,23 @@ class AbstractLagrangian(AbstractSystem):
         if self.applied is None:
             specialised.append("no forces besides those of the Lagrangian")
         return Description(tuple(facts), tables, {"specialised away": tuple(specialised)})
+
+
+class Projected(AbstractEquations):
+    """Lagrange's equations in the coordinates, projected on the directions that velocities move them in.
+
+    For any kinematics, also nonlinear ones. The cheapest way: two derivatives of L, and one of the kinematics.
+    """
+
+    def check(self, system):
+        del system
+
+    def force(self, system, t, q, u):
+        v, pull = jax.vjp(lambda u: system.rates(t, q, u), u)
+        momentum = lambda t, q: system.momentum(t, q, system.rates(t, q, u))
+        _, rate = jax.jvp(momentum, (t, q), (jnp.ones_like(t), v))
+        total = jax.grad(system.lagrangian, 1)(t, q, v, system.parameters_at(t)) - rate
+        return pull(total + system.applied_force(t, q, v))[0]
 
 
 def _parameter(name: str) -> Callable[[Any], Array]:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar
 from ..linalg.rotations import norm
 from ..parts.smooth import dry_friction
 from .kinematics import Parameters
@@ -40,7 +40,7 @@ class AbstractNonIdealForce(eqx.Module):
     def force(
         self,
         t: Scalar,
-        q: Float[Array, "nq"],
+        q: Coordinates,
         v: Float[Array, "nq"],
         reaction: Float[Array, "nq"],
         multipliers: Float[Array, "rows"],

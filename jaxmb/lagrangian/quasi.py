@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import Scalar, VectorLike
+from .._types import Coordinates, Scalar, VectorLike, Velocities
 from ..linalg.elimination import eliminate, full_pivot
 from ..linalg.newton import newton
 from .kinematics import AbstractKinematics, Parameters
@@ -66,7 +66,7 @@ class QuasiVelocities(AbstractKinematics):
             raise ValueError(f"dependent lists some of the {nq} quasi-velocities, each once; got {self.dependent}.")
         return nq - len(self.dependent)
 
-    def all_of(self, nq: int, u: Float[Array, "nu"]) -> Float[Array, "nq"]:
+    def all_of(self, nq: int, u: Velocities) -> Float[Array, "nq"]:
         """ω, from the independent ones."""
         return jnp.zeros(nq, u.dtype).at[np.delete(np.arange(nq), self.dependent)].set(u)
 
@@ -74,7 +74,7 @@ class QuasiVelocities(AbstractKinematics):
         return self.rates_of_all(t, q, self.all_of(q.size, u), parameters)
 
     def rates_of_all(
-        self, t: Scalar, q: Float[Array, "nq"], omega: Float[Array, "nq"], parameters: Parameters
+        self, t: Scalar, q: Coordinates, omega: Float[Array, "nq"], parameters: Parameters
     ) -> Float[Array, "nq"]:
         """`q̇(t, q, ω)`; NaN where Newton's method does not converge."""
         if callable(self.near):
@@ -116,7 +116,7 @@ def _solve(matrix, right):
 
 
 def kinetostatic_forces(
-    system: LagrangianSystem, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+    system: LagrangianSystem, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
 ) -> Float[Array, "dependent"]:
     """The generalized forces Λ_D that hold the dependent quasi-velocities at zero, in the order of `dependent`.
 

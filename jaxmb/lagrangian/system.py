@@ -12,12 +12,12 @@ from jaxtyping import Array
 from .._compat import with_values
 from .._types import State, VectorLike
 from ..parts.fields import as_jax
+from ..parts.series import AbstractSignal
 from ..system.equation import Ranks
 from .constraints import check_names
-from .equations import Projected
-from .inputs import inputs_of
+from .dataflow import depends
 from .kinematics import AbstractKinematics, Rates
-from .model import AbstractEquations, AbstractLagrangian
+from .model import AbstractEquations, AbstractLagrangian, DrivenParameter, Projected
 from .nonideal import AbstractNonIdealForce
 from .structure import Unanalysed, constraint_sizes, find_structure
 
@@ -113,10 +113,32 @@ class LagrangianSystem(AbstractLagrangian):
         self.equations.check(self)
 
     def with_signals(self, signals):
-        inputs = self.inputs | inputs_of(self, signals)
+        inputs = self.inputs | _inputs_of(self, signals)
         drift_free = self.drift_free and not any(own.binds for own in inputs.values())
         same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return with_values(self, same | {"inputs": inputs, "drift_free": drift_free})
+
+
+def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]) -> dict[str, DrivenParameter]:
+    """Signals as inputs of a system, by name.
+
+    **Raises:** `ValueError` for a value that jumps and that position constraints or rates of the coordinates depend on.
+    """
+    q, u = system.guess.q, system.guess.u
+    t = jnp.zeros((), q.dtype)
+    with_number = lambda name, x: eqx.tree_at(lambda s: s.parameters[name], system, x)
+    out = {}
+    for name, signal in signals.items():
+        number = (system.parameters[name],)
+        reaches = lambda kernel, name=name, number=number: depends(lambda x: kernel(with_number(name, x)), number, 0)
+        of_rates = reaches(lambda s: s.rates(t, q, u))
+        if not signal.continuous and (of_rates or reaches(lambda s: s.position_residual(t, q))):
+            raise ValueError(
+                f"A position constraint or the rates of coordinates depend on {name!r}, so it must not jump: use "
+                "interpolation='linear' or 'cubic' instead of 'held'."
+            )
+        out[name] = DrivenParameter(signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u)))
+    return out
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:

@@ -5,6 +5,7 @@ with `A M⁻¹ Aᵀ` by an elimination that follows the structure.
 """
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -20,6 +21,9 @@ from .rotations import norm
 # A solution is refined until its rows are met to this many rounding errors of what adds up in them, or as often.
 _ROUNDING = 512
 _REFINEMENTS = 4
+# Conjugate gradients: reduction of the residual, and largest number of iterations.
+_REDUCTION = 1e-13
+_GRADIENTS = 300
 
 
 class AbstractJacobian(eqx.Module):
@@ -160,6 +164,47 @@ class MassProjector(eqx.Module):
         iterations, which evaluate the residual again. A metric with infinite entries holds these velocities.
         """
         return -self.direction(self.multipliers(residual))
+
+    def balancing(self, force: Float[Array, "n"]) -> Float[Array, "m"]:
+        """The multipliers λ for which `M⁻¹ (f − Aᵀ λ)` is in the null space of A."""
+        return self.multipliers(self.jacobian.product(self.metric.solve(force)))
+
+    def null_space_solution(
+        self, curved: Callable[[Float[Array, "n"]], Float[Array, "n"]], force: Float[Array, "n"]
+    ) -> Float[Array, "n"]:
+        """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients, where `curved` gives
+        `H v`. Where a direction of negative curvature is met, what was found until then, or that direction.
+
+        Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic
+        programming problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001.
+        """
+
+        def project(force):
+            # Of a residual only its part along the null space is kept: the constraint forces would grow beside it.
+            force = force - self.jacobian.transpose_product(self.balancing(force))
+            towards = self.metric.solve(force)
+            return force, towards - self.direction(self.multipliers(self.jacobian.product(towards)))
+
+        force, towards = project(force)
+        size = jnp.vdot(force, towards)
+
+        def correct(carry):
+            x, left, along, size, k, _ = carry
+            curve = curved(along)
+            curvature = jnp.vdot(along, curve)
+            convex = curvature > 0
+            length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
+            x = x + length * along
+            left, towards = project(left - length * curve)
+            new = jnp.vdot(left, towards)
+            along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
+            return x, left, along, new, k + 1, convex
+
+        def proceed(carry):
+            return (carry[3] > _REDUCTION**2 * size) & (carry[4] < _GRADIENTS) & carry[5]
+
+        start = jnp.zeros_like(force), force, towards, size, jnp.array(0), jnp.array(True)
+        return lax.while_loop(proceed, correct, start)[0]
 
 
 class DenseJacobian(AbstractJacobian):

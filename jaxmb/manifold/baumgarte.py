@@ -15,7 +15,7 @@ from .._types import State
 from ..formulations import AbstractFormulation, accelerations
 from ..formulations.formulation import check_mass
 from ..system import AbstractEquation
-from .manifold import AbstractManifold, all_rows_formulation, normalize_state
+from .manifold import AbstractManifold, normalize_state
 
 
 class Baumgarte(AbstractManifold):
@@ -41,18 +41,9 @@ class Baumgarte(AbstractManifold):
         check_mass(system, formulation)
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
 
-    def default_formulation(self, system):
-        return all_rows_formulation(system)
-
     def correction(self, interpolated):
         # How far the states are off the constraints is of interest, and stays.
         return normalize_state
-
-    def statistics(self, solver_state):
-        return {}
-
-    def diagnose(self, system, t, y, solver_state, result, failed):
-        return result
 
 
 class StabilisedField(eqx.Module):

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.inertia import AbstractInertia
 from ..system import AbstractEquation
 
@@ -35,9 +35,7 @@ class AbstractConstraints(eqx.Module):
         """`restore`, without derivative."""
 
     @abc.abstractmethod
-    def at(
-        self, system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-    ) -> "AbstractConstraints":
+    def at(self, system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "AbstractConstraints":
         """The same rows in the same split or metric, linearised at another state."""
 
     @abc.abstractmethod
@@ -81,8 +79,8 @@ class RestoredState(eqx.Module):
     and whether any iteration `failed`; all but the first three are None in tangents.
     """
 
-    q: Float[Array, "nq"]
-    u: Float[Array, "nu"]
+    q: Coordinates
+    u: Velocities
     udot: Float[Array, "nu"]
     multipliers: Float[Array, "m"] | None = None
     iterations: Int[Array, ""] | None = None

@@ -1,14 +1,34 @@
-"""The policy of a simulation that names none."""
+"""The policy of a simulation that names none, and the one of systems without constraints."""
+
+from typing import ClassVar
 
 import diffrax
 
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
 from ..system import AbstractEquation
-from .manifold import AbstractManifold
+from .manifold import AbstractManifold, VectorField
+from .orthogonal_projection import project_normalized
 from .partition import Partition
 from .projection import Projection
-from .unconstrained import Unconstrained
+
+
+class Unconstrained(AbstractManifold):
+    """Integrate all coordinates, and constraints on the level of accelerations only.
+
+    The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
+    that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
+    """
+
+    restores: ClassVar[bool] = False
+    takes_impulses: ClassVar[bool] = False
+
+    def prepare(self, system, formulation, solver, rtol):
+        return diffrax.ODETerm(VectorField(system, formulation)), solver
+
+    def correction(self, interpolated):
+        # No step ends on the constraints, and Euler parameters are not of unit length.
+        return project_normalized
 
 
 def default_manifold(

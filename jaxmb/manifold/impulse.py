@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State
 from ..system import AbstractEquation
 from .orthogonal_projection import project_velocities
 
@@ -73,7 +73,7 @@ class Jump(NamedTuple):
 
 
 def find_jumps(
-    system: AbstractEquation, q: Float[Array, "nq"], t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
+    system: AbstractEquation, q: Coordinates, t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
 ) -> list[Jump]:
     """Look for times between two others at which prescribed rates, or their derivatives, jump.
 

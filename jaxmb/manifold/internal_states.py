@@ -1,4 +1,4 @@
-"""Terms of systems whose parts have internal states.
+"""Terms of systems whose parts have internal states, and the blocks of their states.
 
 Forces depend on internal states, constraints do not. So charts, projections and accelerations are those of the system
 that has the internal states of the moment, and the states themselves are integrated beside (q, u) as they are.
@@ -9,9 +9,12 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._types import State
-from ..solvers import AbstractManifoldTerm
+from ..solvers import AbstractManifoldTerm, Block
+from ..system import AbstractSystem
 
 
 def with_internal_states(term: Any) -> Any:
@@ -108,3 +111,22 @@ def _with_states(system, t, z, out):
     """An evaluation with the internal states and their rates at its state."""
     rates = system.state_rates(t, out.y.q, out.y.u)
     return out._replace(y=State(out.y.q, out.y.u, z), f=State(out.f.q, out.f.u, rates))
+
+
+def state_blocks(system: AbstractSystem, rate: Any) -> tuple[Block, ...]:
+    """The blocks of a raveled state.
+
+    **Arguments:** `rate`: that of velocities where nothing is known of them, in their natural units [1/s].
+    """
+    kinds = np.diff([0, *system.state_ends])
+    return (
+        Block("coordinates", system.nq, 1.0),
+        Block("velocities", system.nu, rate, rate_of="coordinates"),
+        *(Block(f"states {k}", int(size)) for k, size in enumerate(kinds)),
+    )
+
+
+def natural_units(system: AbstractSystem, velocities: Float[Array, " nu"], dtype: Any) -> Float[Array, " n"]:
+    """The natural sizes of the components of a raveled state, with given ones of velocities."""
+    units = [system.coordinate_scale(), velocities, *([system.state_scale()] if system.nz else [])]
+    return jnp.concatenate(units).astype(dtype)

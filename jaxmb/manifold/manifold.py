@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._types import Scalar, State
-from ..formulations import AbstractFormulation, Multipliers, NullSpace
+from ..formulations import AbstractFormulation, Multipliers, NullSpace, accelerations
 from ..linalg.arrays import as_array, namespace
 from ..system import AbstractEquation
 
@@ -43,9 +43,11 @@ class AbstractManifold(eqx.Module):
         **Raises:** `ValueError` for a solver that the policy cannot work with.
         """
 
-    @abc.abstractmethod
     def default_formulation(self, system: AbstractEquation) -> AbstractFormulation:
-        """The formulation of a simulation that names none."""
+        """The formulation of a simulation that names none: the cheapest one that the mass matrix allows, of those that
+        need no partition of the velocities.
+        """
+        return Multipliers() if system.positive_definite_mass else NullSpace()
 
     @abc.abstractmethod
     def correction(self, interpolated: bool) -> Correction | None:
@@ -54,11 +56,11 @@ class AbstractManifold(eqx.Module):
         **Arguments:** `interpolated`: whether states between steps are among those that are saved.
         """
 
-    @abc.abstractmethod
     def statistics(self, solver_state: Any) -> dict[str, Array]:
         """Counts of the policy's work, from the final state of the solver."""
+        del solver_state
+        return {}
 
-    @abc.abstractmethod
     def diagnose(
         self, system: AbstractEquation, t: Scalar, y: State, solver_state: Any, result: Any, failed: Bool[Array, ""]
     ) -> Any:
@@ -67,17 +69,27 @@ class AbstractManifold(eqx.Module):
         **Arguments:** `t`, `y`: the last state; `result`: a `RESULTS`; `failed`: whether it is a failure that starts
         from finite numbers.
         """
+        del system, t, y, solver_state, failed
+        return result
+
+
+class VectorField(eqx.Module):
+    """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+
+    def __call__(self, t, y, args):
+        del args
+        q = self.system.normalize(y.q)
+        udot, _ = accelerations(self.system, self.formulation, t, q, y.u)
+        return State(self.system.rates(t, q, y.u), udot)
 
 
 def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state with its coordinates' own invariants satisfied."""
     del t
     return dataclasses.replace(y, q=system.normalize(y.q))
-
-
-def all_rows_formulation(system: AbstractEquation) -> AbstractFormulation:
-    """A formulation that needs no partition of the velocities: the cheapest one that the mass matrix allows."""
-    return Multipliers() if system.positive_definite_mass else NullSpace()
 
 
 def newton_tolerance(given: float | None, rtol: Scalar) -> Any:

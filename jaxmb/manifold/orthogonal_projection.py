@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
@@ -44,7 +44,7 @@ class ProjectorConstraints(AbstractConstraints):
     matrix.
     """
 
-    q: Float[Array, "nq"]
+    q: Coordinates
     projector: MassProjector
 
     def restore(self, system, t, y, near, tol):
@@ -173,7 +173,7 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
 
 
 def project_velocities(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], metric: AbstractInertia
+    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, metric: AbstractInertia
 ) -> tuple[Float[Array, "nu"], Float[Array, "nu"]]:
     """The velocities that satisfy ψ after the smallest change in a metric, and the last correction."""
     change = u

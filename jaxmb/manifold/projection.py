@@ -23,9 +23,8 @@ from ..system.residuals import binding_velocities, drops_rows, row_sizes, violat
 from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
-from .manifold import AbstractManifold, all_rows_formulation, newton_tolerance, normalize_state
+from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import ProjectorConstraints, project_in_metric, project_normalized, projected
-from .vector_field import VectorField
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
@@ -87,14 +86,8 @@ class Projection(AbstractManifold):
             tol = namespace(tol).minimum(tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
         return ProjectionTerm(system, formulation, tol), solver
 
-    def default_formulation(self, system):
-        return all_rows_formulation(system)
-
     def correction(self, interpolated):
         return _returned if interpolated else None
-
-    def statistics(self, solver_state):
-        return {}
 
     def diagnose(self, system, t, y, solver_state, result, failed):
         if system.elimination is None:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from .._compat import with_values
 from .._types import Scalar
 from ..linalg.arrays import namespace
-from . import checks, fields
+from . import fields
 from .names import check_arguments
 from .shapes import AbstractShape
 from .space import AbstractSpace
@@ -89,7 +89,7 @@ class AbstractPart(eqx.Module):
         return super().__new__(cls)
 
     def __check_init__(self):
-        checks.check_kinds(self, self.label)
+        fields.check_kinds(self, self.label)
 
     @property
     def kind(self) -> str:
@@ -106,7 +106,7 @@ class AbstractPart(eqx.Module):
 
         **Arguments:** `dimension`: that of the scene, default that of the part.
         """
-        checks.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
+        fields.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
         type(self).validate(self)
 
     def validate(self) -> None:
@@ -198,7 +198,7 @@ class AbstractLaw(eqx.Module):
     """A law with parameters that is a field of a part, such as a terrain or a contact law; it has no name."""
 
     def __check_init__(self):
-        checks.check_kinds(self, type(self).__name__)
+        fields.check_kinds(self, type(self).__name__)
 
 
 class AbstractActor(AbstractPart):

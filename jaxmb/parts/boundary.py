@@ -15,7 +15,7 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
-from .contents import entry, internal_states
+from .fields import entry, internal_states
 from .space import AbstractSpace
 
 

@@ -1,4 +1,4 @@
-"""Declarations of the fields of a part: the meaning of each field, stated in one place.
+"""Declarations of the fields of a part, checks of its numbers against them, and what it holds by them.
 
 A part declares its fields with the helpers of this file, in place of `equinox.field`:
 
@@ -16,16 +16,17 @@ and pictures and reactions to find where a part acts.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
-from .._compat import default_float, is_weakly_typed
+from .._compat import default_float, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
@@ -37,6 +38,9 @@ else:
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d"] | None
+
+# A direction counts as a unit vector if its length differs from one by no more than this.
+_UNIT = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +140,7 @@ def as_jax(value: Any) -> Array:
 
 
 def _lenient(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A converter that returns invalid values unchanged: `checks.check_kinds` then names the part and the field."""
+    """A converter that returns invalid values unchanged: `check_kinds` then names the part and the field."""
 
     def converter(value: Any) -> Any:
         try:
@@ -348,3 +352,193 @@ def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool
 
 def _optional(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda value: None if value is None else convert(value)
+
+
+# Checks of values against declarations
+
+
+def check_kinds(part: Any, label: str) -> None:
+    """Raise a `ValueError` if the value of a field is not of the declared kind."""
+    values = values_of(part)
+    for field, declared in declarations(type(part)).items():
+        value = values[field]
+        if declared.is_number:
+            if not _is_number(value) and not (value is None and declared.optional):
+                raise ValueError(
+                    f"{label}: {field}: expected a real number or an array of real numbers, got {value!r}."
+                )
+        elif declared.kind in ("identity", "body"):
+            if not isinstance(value, str):
+                raise ValueError(f"{label}: {field} must be a name, got {value!r}.")
+        elif declared.kind in ("identities", "bodies"):
+            given = value or declared.optional
+            if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value) or not given:
+                what = "a body" if declared.kind == "bodies" else "a part"
+                raise ValueError(f"{label}: {field} must be the name of {what} or several names, got {value!r}.")
+        elif declared.kind == "choice":
+            if value not in declared.of:
+                raise ValueError(f"{label}: {field} must be one of {declared.of}, got {value!r}.")
+        elif declared.kind in ("numbers", "internals"):
+            if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+                raise ValueError(f"{label}: {field} must be a dictionary of numbers, got {value!r}.")
+            for key, number in value.items():
+                if not key or "." in key:
+                    raise ValueError(f"{label}: names of {field} must not be empty or contain a dot, got {key!r}.")
+                if not _is_number(number):
+                    raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
+        elif not isinstance(value, declared.of):
+            raise ValueError(f"{label}: {field} must be {declared.what}, got {value!r}.")
+
+
+def _is_number(value: Any) -> bool:
+    # JAX transformations may put other objects in place of arrays.
+    return hasattr(value, "shape") and hasattr(value, "dtype") and value.dtype.kind == "f"
+
+
+def in_range(declared: Declaration, values: Float[Array, "..."]) -> Bool[Array, ""]:
+    """Whether numbers that are traced, perhaps of several parts, are finite, of the declared sign, and unit vectors."""
+    values, sign = lax.stop_gradient(values), declared.sign
+    ok = jnp.all(jnp.isfinite(values))
+    if sign == "nonzero":
+        ok &= jnp.all(values != 0)
+    elif sign == "positive":
+        ok &= jnp.all(values > 0)
+    elif sign == "non-negative":
+        ok &= jnp.all(values >= 0)
+    elif sign == "positive definite":
+        minors = [jnp.linalg.det(values[..., :k, :k]) for k in range(1, values.shape[-1] + 1)]
+        ok &= jnp.all(jnp.stack(minors) > 0)
+    if declared.is_direction or declared.is_attitude:
+        ok &= jnp.all(jnp.abs(jnp.linalg.norm(values, axis=-1) - 1.0) <= _UNIT)
+    return ok
+
+
+def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
+    """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
+    vectors, in the part and its laws.
+    """
+    values = values_of(part)
+    for field, declared in declarations(type(part)).items():
+        value, shown = values[field], prefix + field
+        if declared.kind == "law":
+            if value is not None:
+                check_numbers(value, label, dimension, f"{shown}.")
+        elif declared.kind == "numbers":
+            for key, number in value.items():
+                if not is_traced(number) and not np.all(np.isfinite(number)):
+                    raise ValueError(f"{label}: {prefix}{key} must be finite, got {np.asarray(number)}.")
+        elif declared.is_number and value is not None and not is_traced(value):
+            _check_number(declared, label, shown, np.asarray(value), dimension)
+
+
+def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
+    if declared.shape is not None:
+        shape = tuple(dimension if size == "d" else size for size in declared.shape)
+        any_size = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
+        if not any_size:
+            wanted = str(shape).replace("None", "any")
+            raise ValueError(f"{label}: {shown} must have shape {wanted}, got {value.shape}.")
+    if declared.kind == "internal":
+        return  # In a compiled scene its values are in the state.
+    if not np.isfinite(value).all():
+        raise ValueError(f"{label}: {shown} must be finite, got {value.tolist()}.")
+    sign = declared.sign
+    if sign == "nonzero" and (value == 0).any():
+        raise ValueError(f"{label}: {shown} must not be zero.")
+    if (sign == "positive" and (value <= 0).any()) or (sign == "non-negative" and (value < 0).any()):
+        raise ValueError(f"{label}: {shown} must be {sign}, got {value.tolist()}.")
+    for row in np.atleast_2d(value) if declared.is_direction or declared.is_attitude else ():
+        size = float(np.linalg.norm(row))
+        if abs(size - 1.0) <= _UNIT:
+            continue
+        if declared.is_attitude:
+            raise ValueError(
+                f"{label}: {shown} must be unit Euler parameters (e0, e1, e2, e3), scalar first, got {row.tolist()} "
+                f"of length {size:.6g}; normalise them, or make them with rotations.from_axis_angle."
+            )
+        cure = "divide it by its length" if size > 0 else "give a direction"
+        raise ValueError(f"{label}: {shown} must be a unit vector, got {row.tolist()} of length {size:.6g}; {cure}.")
+
+
+# Contents of a part
+
+
+def anonymous(part: Any) -> Any:
+    """The part without the names that distinguish stacked parts, and without the initial guess of bodies."""
+    declared, values = declarations(type(part)), values_of(part)
+    out = {}
+    for field in field_names(type(part)):
+        value, kind = values[field], declared[field].kind if field in declared else None
+        if kind in ("identity", "body"):
+            value = ""
+        elif kind in ("identities", "bodies"):
+            value = ("",) * len(value)
+        elif kind == "state":
+            value = None
+        elif kind in ("part", "law"):
+            value = None if value is None else anonymous(value)
+        elif kind == "parts":
+            value = {key: anonymous(own) for key, own in value.items()}
+        out[field] = value
+    return with_values(part, out)
+
+
+def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
+    for name in _fields_of_parts(type(part)):
+        value: Any = getattr(part, name)
+        held = value if isinstance(value, dict) else {} if value is None else {None: value}
+        for key, inner in held.items():
+            keys = (*prefix, name) if key is None else (*prefix, name, key)
+            yield keys, inner
+            yield from inner_parts(inner, keys)
+
+
+@functools.cache
+def _fields_of_parts(cls: type) -> tuple[str, ...]:
+    return tuple(name for name, own in declarations(cls).items() if own.kind in ("part", "parts"))
+
+
+def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
+    """The paths of keys to the internal states of a part, by their names."""
+    found = {}
+    for name, declared in declarations(type(part)).items():
+        if declared.kind == "internal" and getattr(part, name) is not None:
+            found[name] = (name,)
+        elif declared.kind == "internals":
+            found |= {key: (name, key) for key in getattr(part, name)}
+    return found
+
+
+def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
+    """The parameters of a part itself, not of parts that it holds.
+
+    For each: the path of keys to it; the path in its name, which leaves out the keys of dictionaries' fields; and its
+    declaration, an empty one for an entry of a dictionary.
+    """
+    declared = declarations(type(part))
+    for field in field_names(type(part)):
+        own = declared.get(field, _ANY_NUMBER)
+        if own.kind not in ("state", "internal", "internals", "part", "parts"):
+            yield from _paths(getattr(part, field), (field,), (field,), own)
+
+
+_ANY_NUMBER = Declaration("number")
+
+
+def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: Declaration):
+    if eqx.is_inexact_array(value):
+        yield keys, shown, declared
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _ANY_NUMBER)
+    elif isinstance(value, eqx.Module):
+        for inner, name, own in paths(value):
+            yield (*keys, *inner), (*shown, *name), own
+
+
+def entry(value: Any, keys: tuple[str, ...]) -> Any:
+    """The value at a path of attribute names and dictionary keys."""
+    for key in keys:
+        value = value[key] if isinstance(value, dict) else getattr(value, key)
+    return value

@@ -29,6 +29,8 @@ class AbstractShape(abc.ABC):
 
     # Which mesh of unit size the shape is a scaled copy of; "own" for one with vertices of its own.
     primitive: ClassVar[Literal["box", "sphere", "cylinder", "own", "ground"]]
+    # The fields that are lengths.
+    lengths: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self):
         for name, size in (("position", 3), ("orientation", 4)):
@@ -39,6 +41,12 @@ class AbstractShape(abc.ABC):
         if not np.any(self.orientation):
             raise ValueError(f"{type(self).__name__}: orientation must not be zero.")
         object.__setattr__(self, "orientation", self.orientation / np.linalg.norm(self.orientation))
+        for name in self.lengths:
+            value = getattr(self, name)
+            if not (np.all(np.isfinite(value)) and np.all(np.asarray(value) > 0)):
+                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value}.")
+            if np.shape(self.scale) != (3,):
+                raise ValueError(f"{type(self).__name__}: {name} must be three lengths, got {value}.")
 
     @property
     @abc.abstractmethod
@@ -64,12 +72,7 @@ class Box(AbstractShape):
 
     size: VectorLike
     primitive = "box"
-
-    def __post_init__(self):
-        super().__post_init__()
-        _check_lengths(self, size=self.size)
-        if np.shape(self.size) != (3,):
-            raise ValueError(f"Box: size must be three lengths, got {self.size}.")
+    lengths = ("size",)
 
     @property
     def scale(self):
@@ -85,10 +88,7 @@ class Sphere(AbstractShape):
 
     radius: float
     primitive = "sphere"
-
-    def __post_init__(self):
-        super().__post_init__()
-        _check_lengths(self, radius=self.radius)
+    lengths = ("radius",)
 
     @property
     def scale(self):
@@ -104,12 +104,7 @@ class Ellipsoid(AbstractShape):
 
     radii: VectorLike
     primitive = "sphere"
-
-    def __post_init__(self):
-        super().__post_init__()
-        _check_lengths(self, radii=self.radii)
-        if np.shape(self.radii) != (3,):
-            raise ValueError(f"Ellipsoid: radii must be three lengths, got {self.radii}.")
+    lengths = ("radii",)
 
     @property
     def scale(self):
@@ -126,10 +121,7 @@ class Cylinder(AbstractShape):
     radius: float
     length: float
     primitive = "cylinder"
-
-    def __post_init__(self):
-        super().__post_init__()
-        _check_lengths(self, radius=self.radius, length=self.length)
+    lengths = ("radius", "length")
 
     @property
     def scale(self):
@@ -207,12 +199,6 @@ class Ground(AbstractShape):
     @property
     def scale(self):
         return np.ones(3)
-
-
-def _check_lengths(shape: AbstractShape, **lengths: Any) -> None:
-    for name, value in lengths.items():
-        if not (np.all(np.isfinite(value)) and np.all(np.asarray(value) > 0)):
-            raise ValueError(f"{type(shape).__name__}: {name} must be positive, got {value}.")
 
 
 def along(axis: VectorLike) -> np.ndarray:

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced
-from . import checks, fields
+from . import fields
 from .base import AbstractLaw
 from .smooth import step
 
@@ -26,7 +26,7 @@ class AbstractTerrain(AbstractLaw):
 
     def __check_init__(self):
         if not is_traced(self):
-            checks.check_numbers(self, type(self).__name__, 2)
+            fields.check_numbers(self, type(self).__name__, 2)
 
     @abc.abstractmethod
     def height(self, place: Place) -> Float[Array, ""]:

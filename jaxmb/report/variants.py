@@ -10,13 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import State
-from ..bodies.constraint_groups import ConstraintGroup, VelocityConstraintGroup
-from ..bodies.force_groups import ForceGroup
-from ..bodies.groups import Group, stack
+from ..bodies.groups import ConstraintGroup, ForceGroup, Group, VelocityConstraintGroup, stack
 from ..bodies.structure import with_structure
 from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
-from ..parts.contents import paths
-from ..parts.fields import field_names
+from ..parts.fields import field_names, paths
 from ..parts.forces import Damper
 from ..system import AbstractSystem, parameters, with_parameters
 

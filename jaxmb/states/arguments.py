@@ -1,14 +1,21 @@
-"""Checks of what a user gives to `assemble` and `equilibrium`."""
+"""The arguments of `assemble`, `equilibrium` and `assembly_gap`: checks, and coordinates that are prescribed by name,
+those of the system and the own coordinates of joints.
+"""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
-from jaxtyping import Array
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from .._arguments import check_kind, real_array
-from .._types import Scalar, State
-from ..linalg.arrays import is_traced
+from .._arguments import check_kind, real_array, real_shape
+from .._types import Scalar, State, VectorLike
+from ..linalg.arrays import as_array, is_traced, replaced
+from ..parts.names import unknown
 from ..system import AbstractSystem
+from ..system.quantities import rates_of
 
 
 def check_system(function: str, system: Any) -> None:
@@ -53,3 +60,93 @@ def _vector(label: str, value: Any, like: Array) -> Array:
         # As it is: under a trace a copy of known numbers would be traced as well.
         return value
     return array if is_traced(array) else jax.device_put(array)
+
+
+def prescribe(
+    what: str, names: Mapping[str, list[int]], values: Mapping[str, VectorLike], vector: Float[Array, "n"]
+) -> tuple[Float[Array, "n"], Bool[np.ndarray, "n"]]:
+    """Write values by name into a vector.
+
+    **Returns:** the vector, and a static mask of the entries that were prescribed.
+
+    **Raises:** `ValueError` for unknown names, wrong shapes, and values that are no real numbers.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"A {what} is prescribed by name, {{'crank.angle': 0.3}}; got {values!r}.")
+    fixed = np.zeros(vector.shape[0], bool)
+    for name, value in values.items():
+        if name not in names:
+            raise unknown(what, name, names)
+        index = names[name]
+        shape = real_shape(f"{what.capitalize()} {name!r}", value)
+        if shape not in ((), (len(index),)) or (shape == () and len(index) > 1):
+            raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {shape}.")
+        value = as_array(value, vector.dtype)
+        vector = replaced(vector, np.array(index), value)
+        fixed[index] = True
+    return vector, fixed
+
+
+def split_names(
+    what: str, system: AbstractSystem, own: Mapping[str, Any], values: Mapping[str, VectorLike] | None
+) -> tuple[dict[str, VectorLike], dict[str, Any]]:
+    """Prescribed values of the system's own coordinates or rates, and of coordinates of joints, which become arrays.
+
+    **Raises:** `ValueError` for names of neither kind and for values of the wrong shape.
+    """
+    if values is None or not isinstance(values, Mapping) or all(name in own for name in values):
+        return ({} if values is None else values), {}  # pyright: ignore[reportReturnType]
+    known, dtype = system.joint_coordinates(), jnp.result_type(float)
+    of_joints = {}
+    for name, value in values.items():
+        if name not in own:
+            if name not in known:
+                raise unknown(what, name, (*own, *known, *system.state_names()))
+            of_joints[name] = jnp.asarray(
+                real_array(f"{what.capitalize()} {name!r}", value, dtype, (known[name].shape,))
+            )
+    return {name: value for name, value in values.items() if name in own}, of_joints
+
+
+def split_rates(
+    system: AbstractSystem, values: Mapping[str, VectorLike] | None
+) -> tuple[dict[str, VectorLike], dict[str, Any]]:
+    """As `split_names` of rates, which are known by the names of their coordinates as well.
+
+    **Returns:** the values of the system's own rates, and those of coordinates of joints by the coordinates' names.
+
+    **Raises:** `ValueError` for a rate that is named twice, and as `split_names`.
+    """
+    joints = system.joint_coordinates()
+    if isinstance(values, Mapping):
+        twice = [name for name in values if f"{name}_rate" in values]
+        if twice:
+            raise ValueError(f"{twice[0]!r} and '{twice[0]}_rate' are the same rate; prescribe one of them.")
+        of_joints = {f"{name}_rate": name for name in joints}
+        values = {of_joints.get(name, name): value for name, value in values.items()}
+    return split_names("rate", system, rates_of(system.rate_names()), values)
+
+
+def split_internal_states(
+    system: AbstractSystem, z: Float[Array, "nz"] | None, values: Mapping[str, VectorLike] | None
+) -> tuple[Float[Array, "nz"] | None, Mapping[str, VectorLike] | None]:
+    """Internal states with some of them prescribed by name, and the prescribed values of all else.
+
+    **Raises:** `ValueError` for values of the wrong shape and for those that are not finite.
+    """
+    names = system.state_names()
+    if z is None or not isinstance(values, Mapping):
+        return z, values
+    own = {name: value for name, value in values.items() if name in names}
+    z, _ = prescribe("internal state", names, own, z)
+    if not is_traced(z) and not np.all(np.isfinite(z)):
+        raise ValueError(f"The guess or the fixed internal states are not finite: {np.asarray(z)}.")
+    return z, {name: value for name, value in values.items() if name not in own}
+
+
+def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
+    """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
+    if not values:
+        return system
+    rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}
+    return system.holding(values, rates, t)

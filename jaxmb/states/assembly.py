@@ -12,15 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, State, VectorLike
+from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions, rates_of
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import (
+    check_system,
+    checked_guess,
+    checked_time,
+    holding,
+    prescribe,
+    split_internal_states,
+    split_names,
+    split_rates,
+)
 from .closest import closest_configuration, closest_velocities
-from .held_coordinates import holding, prescribe, split_internal_states, split_names, split_rates
+from .consistency import listed
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
@@ -94,7 +103,7 @@ def assemble(
 
 
 def configuration(
-    system: AbstractSystem, guess: Float[Array, "nq"], fix: Mapping[str, VectorLike] | None, t: Scalar, throw: bool
+    system: AbstractSystem, guess: Coordinates, fix: Mapping[str, VectorLike] | None, t: Scalar, throw: bool
 ) -> tuple[Float[Array, "nq"], Bool[np.ndarray, "nq"], Bool[Array, ""]]:
     """The first half of `assemble`: the coordinates, a mask of those that were prescribed, and whether the constraints
     hold; an error if not, with `throw` and outside `jit`.
@@ -125,17 +134,13 @@ def _check_finite(vector, what):
         raise ValueError(f"The guess or the fixed {what} are not finite: {np.asarray(vector)}.")
 
 
-def violated_joints(system: AbstractSystem, t: Scalar, q: Float[Array, "nq"], least: float = 1e-9) -> str:
+def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: float = 1e-9) -> str:
     """The joints that a configuration violates with their largest residuals, the largest first, for messages.
 
     `least`: residuals below it, relative to the system's size, do not count.
     """
     residual = np.nan_to_num(np.abs(np.asarray(system.position_residual(t, q))), nan=np.inf)
-    worst: dict[str, float] = {}
-    for (name, _), value in zip(system.rows, residual, strict=False):
-        worst[name] = max(worst.get(name, 0.0), float(value))
-    listed = sorted(worst.items(), key=lambda item: -item[1])
-    return ", ".join(f"{name} ({value:.3g})" for name, value in listed[:8] if value >= least * float(system.length))
+    return listed(system, residual >= least * float(system.length), residual)
 
 
 def _cannot_assemble(system, t, q, fixed, names):
@@ -144,11 +149,11 @@ def _cannot_assemble(system, t, q, fixed, names):
     if held:
         text += f" with {', '.join(held)} fixed"
     dependent = _dependent(system, t, q, held, names)
-    listed = violated_joints(system, t, q)
-    remain = f"residuals remain in {listed}"
+    violated = violated_joints(system, t, q)
+    remain = f"residuals remain in {violated}"
     if dependent:
-        return f"{text}: {dependent}{f'; {remain}' if listed else ''}. Fix fewer of them, or give values that agree."
-    if listed:
+        return f"{text}: {dependent}{f'; {remain}' if violated else ''}. Fix fewer of them, or give values that agree."
+    if violated:
         return f"{text}: {remain}. Check lengths, points and axes, or give a better guess."
     if held:
         return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."

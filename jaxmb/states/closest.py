@@ -12,9 +12,6 @@ the scales S the closest configuration satisfies
 
 The linear systems of Newton's method are solved by conjugate gradients in the null space of A, with the metric
 `M = Kᵀ S⁻² K` as the preconditioner, which the elimination of `A M⁻¹ Aᵀ` projects.
-
-Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic programming
-problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001 (projected conjugate gradients).
 """
 
 from collections.abc import Callable
@@ -27,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
@@ -66,9 +63,6 @@ _INDEPENDENT = 1e-12
 # that is small enough to be the last but one.
 _STEPS = 60
 _LAST = 1e-6
-# Conjugate gradients: reduction of the residual, and largest number of iterations.
-_REDUCTION = 1e-13
-_GRADIENTS = 300
 
 
 def tolerance(dtype) -> float:
@@ -84,7 +78,7 @@ def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) 
 
 
 def residual_size(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], jacobian: Float[Array, "m nq"]
+    system: AbstractEquation, t: Scalar, q: Coordinates, jacobian: Float[Array, "m nq"]
 ) -> Float[Array, ""]:
     """`largest_residual` of the coordinates; `jacobian`: theirs at this configuration or near it."""
     jacobian = jacobian * system.coordinate_scale()[None, :]
@@ -95,7 +89,7 @@ def residual_size(
 
 
 def meet_constraints(
-    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], scale: Float[Array, "nq"]
+    system: AbstractEquation, t: Scalar, start: Coordinates, scale: Float[Array, "nq"]
 ) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
     """Gauss–Newton from a guess to the constraints, along scaled gradients, with step halving; without derivative.
 
@@ -125,7 +119,7 @@ def meet_constraints(
 
 
 def meet_in_blocks(
-    system: AbstractEquation, t: Scalar, start: Float[Array, "nq"], fixed: Bool[np.ndarray, "nu"]
+    system: AbstractEquation, t: Scalar, start: Coordinates, fixed: Bool[np.ndarray, "nu"]
 ) -> Float[Array, "nq"]:
     """The same along the velocities, without motion along fixed ones, and without a dense matrix where the system has
     an order of elimination. The normal equations are regularised in the measure of the residuals.
@@ -180,7 +174,7 @@ def _in_blocks(system, given):
 def closest_configuration(
     system: AbstractEquation,
     t: Scalar,
-    guess: Float[Array, "nq"],
+    guess: Coordinates,
     held: tuple[bool, ...],
     rank: int,
     in_blocks: bool | None = None,
@@ -243,8 +237,8 @@ def _refine(residual, x):
 def closest_velocities(
     system: AbstractEquation,
     t: Scalar,
-    q: Float[Array, "nq"],
-    guess: Float[Array, "nu"],
+    q: Coordinates,
+    guess: Velocities,
     held: tuple[bool, ...],
     in_blocks: bool | None = None,
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
@@ -360,7 +354,7 @@ def _optimality(system, t, q, guess, fixed):
     metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(system, t, q)))
     projector = binding_velocities(system, t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
     gradient = _gradient(system, t, q, guess, jnp.zeros(system.acceleration_rows, q.dtype))
-    multipliers = -projector.multipliers(projector.jacobian.product(metric.solve(gradient)))
+    multipliers = -projector.balancing(gradient)
     return _Optimality(projector, multipliers, gradient + projector.jacobian.transpose_product(multipliers))
 
 
@@ -381,7 +375,7 @@ def _weights(system, t, q):
 def _newton_step(system, t, q, guess, fixed):
     at = _optimality(system, t, q, guess, fixed)
     curved = _curvature(system, t, q, guess, fixed, at.multipliers)
-    return _null_space_solution(curved, at.projector, -at.gradient)
+    return at.projector.null_space_solution(curved, -at.gradient)
 
 
 def _curvature(system, t, q, guess, fixed, multipliers):
@@ -415,56 +409,16 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
     def displacement(rows):
         return projector.direction(projector.multipliers(rows))
 
-    def constraint_multipliers(forces):
-        return projector.multipliers(projector.jacobian.product(projector.metric.solve(forces)))
-
     def solve(_, b):
         forces, rows = b[: system.nu], b[system.nu :]
         particular = displacement(rows)
-        v = particular + _null_space_solution(curved, projector, forces - curved(particular))
+        v = particular + projector.null_space_solution(curved, forces - curved(particular))
         # Both are refined once: the last pivots of long loops are small.
         v = v + displacement(rows - projector.jacobian.product(v))
         left = forces - curved(v)
-        multipliers = constraint_multipliers(left)
-        multipliers += constraint_multipliers(left - projector.jacobian.transpose_product(multipliers))
+        multipliers = projector.balancing(left)
+        multipliers += projector.balancing(left - projector.jacobian.transpose_product(multipliers))
         return join(jnp.where(free, v, forces), multipliers + (1 - independent) * rows)
 
     right = join(jnp.where(free, gradient, 0.0), independent * unmet)
     return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[: system.nu]
-
-
-def _null_space_solution(curved, projector, force):
-    """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients. Where a direction of
-    negative curvature is met, what was found until then, or that direction.
-    """
-
-    def project(force):
-        # Only its part along the null space is kept of a residual: the constraint forces in it would grow beside it.
-        force = force - constraint_force(force)
-        towards = projector.metric.solve(force)
-        return force, towards - projector.direction(projector.multipliers(projector.jacobian.product(towards)))
-
-    def constraint_force(force):
-        free = projector.metric.solve(force)
-        return projector.jacobian.transpose_product(projector.multipliers(projector.jacobian.product(free)))
-
-    force, towards = project(force)
-    size = jnp.vdot(force, towards)
-
-    def correct(carry):
-        x, left, along, size, k, _ = carry
-        curve = curved(along)
-        curvature = jnp.vdot(along, curve)
-        convex = curvature > 0
-        length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
-        x = x + length * along
-        left, towards = project(left - length * curve)
-        new = jnp.vdot(left, towards)
-        along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
-        return x, left, along, new, k + 1, convex
-
-    def proceed(carry):
-        return (carry[3] > _REDUCTION**2 * size) & (carry[4] < _GRADIENTS) & carry[5]
-
-    start = jnp.zeros_like(force), force, towards, size, jnp.array(0), jnp.array(True)
-    return lax.while_loop(proceed, correct, start)[0]

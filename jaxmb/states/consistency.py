@@ -38,11 +38,11 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
         "state = jaxmb.assemble(system, state, t=t0) makes this one consistent."
     )
     if np.any(positions):
-        listed = _listed(system, positions, system.position_residual(t, state.q))
-        raise ValueError(f"The state violates the constraints {listed} {cure}")
+        names = listed(system, positions, system.position_residual(t, state.q))
+        raise ValueError(f"The state violates the constraints {names} {cure}")
     if np.any(velocities):
-        listed = _listed(system, velocities, system.velocity_residual(t, state.q, state.u))
-        raise ValueError(f"The velocities of the state violate the constraints {listed} {cure}")
+        names = listed(system, velocities, system.velocity_residual(t, state.q, state.u))
+        raise ValueError(f"The velocities of the state violate the constraints {names} {cure}")
     return state
 
 
@@ -50,7 +50,7 @@ def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
     """A message about implied rows that are violated at the end of a motion."""
     residual = np.abs(np.asarray(system.velocity_residual(t, state.q, state.u)))
     residual[: system.position_rows] = np.abs(np.asarray(system.position_residual(t, state.q)))
-    names = _listed(system, residual > 1e-3 * np.max(residual), residual)
+    names = listed(system, residual > 1e-3 * np.max(residual), residual)
     return (
         f"At t = {float(t):g} the constraints {names} contradict the others: rows of them, which others implied when "
         "the system was compiled, are violated. Remove them, or make dimensions and prescribed motions agree."
@@ -64,8 +64,8 @@ def _violated(system, t, y) -> Any:
     return jax.tree.map(lambda of_rows: of_rows > tol, violations(system, t, y, row_sizes(system, t, y)))
 
 
-def _listed(system, violated, residual):
-    """The constraints of some rows with their largest residuals, the largest first."""
+def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:
+    """The constraints of some rows with their largest residuals, the largest first, for messages."""
     worst: dict[str, float] = {}
     for (name, _), bad, value in zip(system.rows, violated, np.abs(np.asarray(residual)), strict=False):
         if bad:

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, State, VectorLike
+from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.newton import root
@@ -25,10 +25,9 @@ from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import check_system, checked_guess, checked_time, holding, split_internal_states, split_names
 from .assembly import configuration
 from .closest import tolerance
-from .held_coordinates import holding, split_internal_states, split_names
 
 _ITERATIONS = 200
 
@@ -212,7 +211,7 @@ class _Linearised(NamedTuple):
     implied: Float[Array, "m m"]
 
 
-def _linearise(balance: _Balance, q: Float[Array, "nq"]) -> _Linearised:
+def _linearise(balance: _Balance, q: Coordinates) -> _Linearised:
     jacobian = balance.jacobian(q)
     m, n = jacobian.shape
     sizes = norm(jacobian)
@@ -263,7 +262,7 @@ def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
 
 @eqx.filter_jit
 def _balanced(
-    system: AbstractSystem, t: Array, start: Float[Array, "nq"], held: tuple[int, ...], stable: bool
+    system: AbstractSystem, t: Array, start: Coordinates, held: tuple[int, ...], stable: bool
 ) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Float[Array, "nu"], Bool[Array, ""]]:
     """The equilibrium, the residual forces there, the displacement along which one that was left falls, zero if none
     was, and whether the equilibrium was found.
@@ -292,13 +291,13 @@ def _balanced(
     return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), falling, ok
 
 
-def _nearest(balance: _Balance, start: Float[Array, "nq"]):
+def _nearest(balance: _Balance, start: Coordinates):
     """The equilibrium to which Newton's method leads from a guess."""
     q, local, found = _search(balance, start, downhill=False)
     return q, local, balance.rest, found
 
 
-def _settled(balance: _Balance, start: Float[Array, "nq"]):
+def _settled(balance: _Balance, start: Coordinates):
     """The equilibrium to which the forces lead from a guess, or from beside an equilibrium that is not stable."""
 
     def proceed(carry):
@@ -339,7 +338,7 @@ def _unknown(balance, q):
 
 
 def _search(
-    balance: _Balance, start: Float[Array, "nq"], *, downhill: bool
+    balance: _Balance, start: Coordinates, *, downhill: bool
 ) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
     """Follow the forces until they vanish, or the steps of Newton's method; also returns whether they do."""
     close = jnp.finfo(start.dtype).eps ** 0.5

@@ -9,12 +9,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State, VectorLike
+from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.newton import newton
 from ..system import AbstractSystem
-from .arguments import check_system, checked_guess, checked_time
+from .arguments import check_system, checked_guess, checked_time, holding, prescribe, split_internal_states, split_names
 from .closest import meet_constraints, residual_size, tolerance
-from .held_coordinates import holding, prescribe, split_internal_states, split_names
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
 _ITERATIONS = 200
@@ -63,7 +62,7 @@ def assembly_gap(
 
 
 @eqx.filter_jit
-def _gap(system: AbstractSystem, t: Scalar, guess: Float[Array, "nq"], held: tuple[bool, ...]) -> Float[Array, ""]:
+def _gap(system: AbstractSystem, t: Scalar, guess: Coordinates, held: tuple[bool, ...]) -> Float[Array, ""]:
     if system.coordinate_rows == 0:
         return jnp.zeros((), guess.dtype)
     scale = jnp.where(np.array(held), 0.0, system.coordinate_scale())

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from .._types import Coordinates
+from ..linalg.independent_rows import independent_in_order
 from ..system import AbstractSystem
 
 # Number of displaced poses, and the displacement in scales of the coordinates as a power of eps: 1e-2 in double
@@ -163,7 +165,7 @@ def _unit_rows(jacobian):
 
 
 def check_implied_as_one(
-    system: AbstractSystem, q: Float[Array, "nq"], positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
+    system: AbstractSystem, q: Coordinates, positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
 ) -> None:
     """`check_implied` of all rows as one group, by full matrices.
 
@@ -183,7 +185,7 @@ def check_implied_as_one(
     coordinate_rows = np.arange(system.coordinate_rows)
     first = np.append(positions, np.arange(system.position_rows, system.coordinate_rows)).astype(int)
     of_coordinates = np.asarray(_evaluate(system, np.zeros((), dtype), q, np.zeros(q.size, dtype))[1])
-    kept = _independent_rows(of_coordinates, [*first, *np.setdiff1d(coordinate_rows, first)])
+    kept = independent_in_order(of_coordinates, [*first, *np.setdiff1d(coordinate_rows, first)])
     check_implied(system, [DependentRows(rows, independent, kept)], [np.arange(q.size)], evaluate, q.size, dtype)
 
 
@@ -194,16 +196,6 @@ def _evaluate(system, t, q, moved):
     q = q + scale * moved
     jacobian = system.jacobian(t, q, system.guess.u) * system.velocity_scale()[None, :]
     return system.coordinate_residual(t, q), system.coordinate_jacobian(t, q) * scale[None, :], jacobian
-
-
-def _independent_rows(jacobian: Float[np.ndarray, "m n"], order: Iterable[int]) -> Int[np.ndarray, "r"]:
-    """Rows that do not depend on those before them, in an order."""
-    kept, basis = [], np.zeros((0, jacobian.shape[1]), jacobian.dtype)
-    for k in order:
-        own = jacobian[k] - basis.T @ (basis @ jacobian[k])
-        if np.linalg.norm(own) > np.finfo(jacobian.dtype).eps ** 0.5 * np.linalg.norm(jacobian[k]):
-            kept, basis = [*kept, k], np.vstack([basis, own / np.linalg.norm(own)])
-    return np.array(kept, int)
 
 
 def _not_implied(system, t, rows, by, bodies):

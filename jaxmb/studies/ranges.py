@@ -286,15 +286,21 @@ def range_of(
     low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
     if np.any(value <= low) or np.any(value >= high):
         raise ValueError(f"The start of {name!r} must lie strictly between {low} and {high}, got {np.asarray(value)}.")
-    if np.all(np.isfinite(low)) and np.all(np.isfinite(high)):
-        return Interval(value, low, high)
-    if np.all(np.isfinite(low)) or np.all(np.isfinite(high)):
-        return HalfLine(value, low if np.all(np.isfinite(low)) else high)
     if scale is not None:
-        return WholeLine(value, jnp.broadcast_to(scale, value.shape))
+        return range_between(value, low, high, jnp.broadcast_to(scale, value.shape))
     largest = jnp.max(jnp.abs(value))
     typical = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    return WholeLine(value, jnp.where(value == 0, typical, jnp.abs(value)))
+    return range_between(value, low, high, jnp.where(value == 0, typical, jnp.abs(value)))
+
+
+def range_between(start: Array, low: Array, high: Array, scale: Array) -> AbstractRange:
+    """The values between two bounds, each finite for all components or for none; `scale`: a typical change if neither
+    is.
+    """
+    below, above = (bool(np.all(np.isfinite(bound))) for bound in (low, high))
+    if below and above:
+        return Interval(start, low, high)
+    return HalfLine(start, low if below else high) if below or above else WholeLine(start, scale)
 
 
 def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
 from ..parts.series import AbstractSignal
 from .description import Description, count_independent, count_rows, shorten, specialised_constraints
@@ -75,7 +75,7 @@ class AbstractSystem(AbstractEquation):
         """Indices in z by name; one name may denote several internal states."""
         return {}
 
-    def normalize_fixed(self, q: Float[Array, "nq"], fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
+    def normalize_fixed(self, q: Coordinates, fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
         """Coordinates that satisfy the invariants of fixed entries alone, and the number of these invariants.
 
         Such invariants have no free coordinate that could satisfy them.
@@ -87,7 +87,7 @@ class AbstractSystem(AbstractEquation):
         """The own coordinates of joints, by name; each has a `shape`."""
         return {}
 
-    def joint_coordinate(self, coordinate: Any, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "*shape"]:
+    def joint_coordinate(self, coordinate: Any, t: Scalar, q: Coordinates) -> Float[Array, "*shape"]:
         """The value of one of `joint_coordinates`; an angle known up to full turns is in (−π, π]."""
         raise ValueError("This system has no joints between bodies, and so no coordinates of joints.")
 
@@ -144,11 +144,11 @@ class AbstractSystem(AbstractEquation):
     # Energy
 
     @abc.abstractmethod
-    def kinetic_energy(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, ""]:
+    def kinetic_energy(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, ""]:
         """Kinetic energy [J]."""
 
     @abc.abstractmethod
-    def potential_energy(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, ""]:
+    def potential_energy(self, t: Scalar, q: Coordinates) -> Float[Array, ""]:
         """Potential energy [J] of gravity and of every conservative force."""
 
     # A motion, with time as axis 0: `ts` of shape (times,), `ys` a `State`, `multipliers` of shape (times, rows).
@@ -220,11 +220,11 @@ class AbstractSystem(AbstractEquation):
         """
         raise ValueError(_NO_FORCES)
 
-    def linear_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "d"]:
+    def linear_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "d"]:
         """`Σ m v` [kg m/s], world axes."""
         raise ValueError(_NO_MOMENTUM)
 
-    def angular_momentum(self, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "*d"]:
+    def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
         """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
         space.
         """
@@ -253,7 +253,7 @@ class AbstractSystem(AbstractEquation):
             f"A picture shows bodies, and a {type(self).__name__} has none; viz.plot_motion shows its coordinates."
         )
 
-    def not_finite(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> tuple[str, ...]:
+    def not_finite(self, t: Scalar, q: Coordinates, u: Velocities) -> tuple[str, ...]:
         """The forces, residuals and rates of internal states that are not finite at a state, by name, for messages."""
         t, rows = jnp.asarray(t, q.dtype), self.rows
         residuals = (self.position_residual(t, q), self.acceleration_residual(t, q, u, jnp.zeros_like(u)))

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
@@ -113,11 +113,11 @@ class AbstractEquation(eqx.Module):
         """Whether q̇ = u."""
         return True
 
-    def rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nq"]:
+    def rates(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nq"]:
         """`K(t, q, u)`."""
         return u
 
-    def normalize(self, q: Float[Array, "nq"]) -> Float[Array, "nq"]:
+    def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
         """The nearest coordinates that satisfy the coordinates' own invariants."""
         return q
 
@@ -130,11 +130,11 @@ class AbstractEquation(eqx.Module):
         """Size of a typical displacement along each velocity; without derivative."""
 
     @abc.abstractmethod
-    def inertia(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> AbstractInertia:
+    def inertia(self, t: Scalar, q: Coordinates, u: Velocities) -> AbstractInertia:
         """`M(t, q, u)`."""
 
     @abc.abstractmethod
-    def force(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nu"]:
+    def force(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
         """`F(t, q, u)`, applied forces and the bias of inertia."""
 
     # Internal states z, for which ż = h(t, q, u, z). Forces depend on them, constraints do not, so the equations above
@@ -154,7 +154,7 @@ class AbstractEquation(eqx.Module):
         """The same system with the internal states of a state, if there are any."""
         return self if y.z is None else self.with_states(y.z)
 
-    def state_rates(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "nz"]:
+    def state_rates(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nz"]:
         """ż, of a system that has its internal states."""
         del t, u
         return jnp.zeros(0, q.dtype)
@@ -165,53 +165,49 @@ class AbstractEquation(eqx.Module):
 
     # Constraints
 
-    def position_residual(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "position_rows"]:
+    def position_residual(self, t: Scalar, q: Coordinates) -> Float[Array, "position_rows"]:
         """`Φ(t, q)`."""
         del t
         return jnp.zeros(0, q.dtype)
 
-    def coordinate_residual(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "coordinate_rows"]:
+    def coordinate_residual(self, t: Scalar, q: Coordinates) -> Float[Array, "coordinate_rows"]:
         """`Φ(t, q)` and the coordinates' own invariants."""
         return self.position_residual(t, q)
 
     @eqx.filter_jit
-    def coordinate_jacobian(self, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "coordinate_rows nq"]:
+    def coordinate_jacobian(self, t: Scalar, q: Coordinates) -> Float[Array, "coordinate_rows nq"]:
         """Derivative of `coordinate_residual` with respect to q."""
         return jax.jacfwd(self.coordinate_residual, 1)(t, q)
 
-    def velocity_residual(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-    ) -> Float[Array, "velocity_rows"]:
+    def velocity_residual(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "velocity_rows"]:
         """`ψ(t, q, u)`."""
         del t, u
         return jnp.zeros(0, q.dtype)
 
     def acceleration_residual(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], udot: Float[Array, "nu"]
+        self, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
     ) -> Float[Array, "acceleration_rows"]:
         """`A u̇ − γ`; its first rows are the time derivative of ψ along the motion."""
         del t, u, udot
         return jnp.zeros(0, q.dtype)
 
     @eqx.filter_jit
-    def jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> Float[Array, "acceleration_rows nu"]:
+    def jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "acceleration_rows nu"]:
         """`A`."""
         # Residuals are linear in accelerations, so that their derivative is the same anywhere.
         return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
 
-    def velocity_jacobian(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-    ) -> Float[Array, "velocity_rows nu"]:
+    def velocity_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "velocity_rows nu"]:
         """`∂ψ/∂u`, the first rows of A."""
         return self.jacobian(t, q, u)[: self.velocity_rows]
 
-    def structured_jacobian(self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]) -> AbstractJacobian:
+    def structured_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> AbstractJacobian:
         """`A` in blocks where the system has an order of `elimination`, else as a dense matrix without a factor."""
         return DenseJacobian(self.jacobian(t, q, u))
 
     @eqx.filter_jit
     def constraint_force(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "acceleration_rows"]
+        self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
         """`Aᵀ λ`, without the matrix."""
         _, pull = jax.vjp(lambda udot: self.acceleration_residual(t, q, u, udot), jnp.zeros_like(u))
@@ -241,7 +237,7 @@ class AbstractEquation(eqx.Module):
         return np.zeros(0, int)
 
     def nonideal_force(
-        self, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"], multipliers: Float[Array, "acceleration_rows"]
+        self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
         """`C`, from the multipliers λ of the same equation."""
         del t, q, multipliers

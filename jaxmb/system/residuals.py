@@ -4,34 +4,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.jacobian import AbstractJacobian
 from .equation import AbstractEquation
 
 
-def position_rows(system: AbstractEquation, t: Scalar, q: Float[Array, "nq"]) -> Float[Array, "m"]:
+def position_rows(system: AbstractEquation, t: Scalar, q: Coordinates) -> Float[Array, "m"]:
     """Φ, and zeros for the rows that bind velocities or accelerations only."""
     return jnp.pad(system.position_residual(t, q), (0, system.acceleration_rows - system.position_rows))
 
 
-def velocity_rows(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-) -> Float[Array, "m"]:
+def velocity_rows(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "m"]:
     """ψ, and zeros for the rows that bind accelerations only."""
     return jnp.pad(system.velocity_residual(t, q, u), (0, system.acceleration_rows - system.velocity_rows))
 
 
-def binding_velocities(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], u: Float[Array, "nu"]
-) -> AbstractJacobian:
+def binding_velocities(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> AbstractJacobian:
     """A whose independent rows are those that bind positions or velocities."""
     jacobian = system.structured_jacobian(t, q, u)
     return jacobian if system.acceleration_rows == system.velocity_rows else jacobian.of_first(system.velocity_rows)
 
 
-def displaced(
-    system: AbstractEquation, t: Scalar, q: Float[Array, "nq"], step: Float[Array, "nu"]
-) -> Float[Array, "nq"]:
+def displaced(system: AbstractEquation, t: Scalar, q: Coordinates, step: Float[Array, "nu"]) -> Float[Array, "nq"]:
     """The coordinates after a small displacement along the velocities."""
     if system.rates_are_velocities:
         return q + step

@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from stiff_problems import PROBLEMS
 
 import jaxmb as mb
-from jaxmb.manifold.vector_field import VectorField
+from jaxmb.manifold.manifold import VectorField
 from jaxmb.solvers import Adams, Hermite, MultistepController
 
 MAX_STEPS = 200_000

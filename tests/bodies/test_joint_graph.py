@@ -12,12 +12,12 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.bodies.block_cut_tree import components
-from jaxmb.bodies.independence import JointRows, subsets
+from jaxmb.bodies.independence import JointBlocks, JointRows
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.bodies.layout import Layout
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.formulations.formulation import pivoted_jacobian
+from jaxmb.linalg.graphs import components
 from jaxmb.manifold import Partition, Projection
 from jaxmb.parts.spatial.kinematics import SPACE
 
@@ -238,7 +238,7 @@ def test_ranks_of_random_graphs(seed):
                 whole[part.first : part.first + 5, 6 * body : 6 * body + 6] += block[:, side]
     level = np.sort(rng.integers(0, 3, 5 * len(parts)))
     found, by_dense = (
-        subsets(parts, blocks, layout, np.ones(6 * bodies), level, frozenset(), dense=most) for most in (-1, 100)
+        JointBlocks(parts, blocks, layout, np.ones(6 * bodies)).subsets(level, frozenset(), most) for most in (-1, 100)
     )
     for own, expected in zip(found, by_dense, strict=True):
         np.testing.assert_array_equal(np.bincount(level[own.kept]), np.bincount(level[expected.kept]))

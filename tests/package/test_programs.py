@@ -17,7 +17,7 @@ from jaxmb import lagrangian, planar, spatial
 from jaxmb.bodies import rigid_bodies
 from jaxmb.formulations import formulation
 from jaxmb.linalg import elimination, rotations
-from jaxmb.manifold import chart, orthogonal_projection, partition
+from jaxmb.manifold import orthogonal_projection, partition
 from jaxmb.parts import contact
 
 
@@ -56,7 +56,7 @@ def test_unconstrained_body_has_nothing_of_constraints(monkeypatch):
     system = mb.Scene([planar_body()], forces=[mb.Gravity((0.0, -9.81))]).compile()
     for module, names in {
         elimination: ["full_pivot", "eliminate", "gauss_jordan"],
-        chart: ["ideal_acceleration", "eliminate"],
+        partition: ["ideal_acceleration", "eliminate"],
         orthogonal_projection: ["_multipliers", "full_pivot"],
     }.items():
         refuse(monkeypatch, module, *names)
@@ -94,7 +94,7 @@ def test_free_body_in_space_has_no_charts(monkeypatch):
     body = spatial.Body("body", mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0.1, 2.0, 0.1))
     system = mb.Scene([body]).compile()
     refuse(monkeypatch, elimination, "full_pivot", "eliminate", "gauss_jordan")
-    refuse(monkeypatch, chart, "ideal_acceleration", "eliminate")
+    refuse(monkeypatch, partition, "ideal_acceleration", "eliminate")
     assert program(system)["argmax"] == 0
 
 

@@ -16,7 +16,7 @@ from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
-from jaxmb.cli.picture import check_picture, show_motion
+from jaxmb.cli.folders import check_picture, show_motion
 from jaxmb.linalg import rotations as rot
 from jaxmb.parts import contact
 from jaxmb.viz.solids import solids

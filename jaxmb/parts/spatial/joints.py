@@ -47,7 +47,16 @@ def _parallel(space, part, poses):
     return half_sine(across(part.axis_a, b), jnp.dot(part.axis_a, b))
 
 
-class Spherical(AbstractSpatialPart, AbstractJoint):
+class AbstractOriented(AbstractSpatialPart, AbstractJoint):
+    """A joint that knows the relative attitude at which its rotation is zero, `orientation`, as in `Spherical`."""
+
+    orientation: fields.Number = fields.attitude(optional=True)
+
+    def complete(self, space, poses):
+        return with_given_orientation(self, poses)
+
+
+class Spherical(AbstractOriented):
     """A ball: two points coincide. Rows 3: `d`.
 
     Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
@@ -57,11 +66,7 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
     shape (4,), unit Euler parameters of B relative to A where the rotation is zero, default those of the given poses.
     """
 
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -73,7 +78,21 @@ class Spherical(AbstractSpatialPart, AbstractJoint):
         return ((0, ball(self.point_a, size)),)
 
 
-class Revolute(AbstractSpatialPart, AbstractJoint):
+class AbstractAxial(AbstractSpatialPart, AbstractJoint):
+    """A joint with an axis in each body, about which one turns in the other; arguments as in `Revolute`."""
+
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis_b: fields.Number = fields.axis(body=1, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
+    x_a: fields.Number = fields.axis(body=0, optional=True)
+    x_b: fields.Number = fields.axis(body=1, optional=True)
+    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    def complete(self, space, poses):
+        return measured_from_given_poses(self, space, poses)
+
+
+class Revolute(AbstractAxial):
     """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, and two of the tilt.
 
     Its coordinate is `angle` [rad], the turn of `body_b` about the axis: from `x_a` to `x_b` if they are given, else
@@ -84,16 +103,7 @@ class Revolute(AbstractSpatialPart, AbstractJoint):
     the angle is measured between them.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 5
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), _parallel(space, self, poses)])
@@ -154,7 +164,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
         return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
 
 
-class Gimbal(AbstractSpatialPart, AbstractJoint):
+class Gimbal(AbstractOriented):
     """Three hinges in succession about perpendicular axes through one point: a ball with angles. Rows 3: `d`.
 
     Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
@@ -173,7 +183,6 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
     axis_1_W: fields.Number = fields.axis(body=None, gives=("axis_1",))
     axis_2_W: fields.Number = fields.axis(body=None, gives=("axis_2",))
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 3
     angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
 
@@ -181,7 +190,7 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
         if np.max(np.abs(triad @ triad.T - np.eye(3))) > 1e-6:
             raise ValueError(f"{self.label}: the three axes must be perpendicular to each other, got {triad.tolist()}.")
-        return with_given_orientation(self, poses)
+        return super().complete(space, poses)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -201,29 +210,8 @@ class Gimbal(AbstractSpatialPart, AbstractJoint):
         }
 
 
-class Cylindrical(AbstractSpatialPart, AbstractJoint):
-    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
-
-    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
-    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
-
-    **Arguments:** as in `Revolute`.
-    """
-
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
-    rows: ClassVar[int] = 4
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
-
-    def residual(self, space, poses, t):
-        shift = offset_in_a(space, self, poses)
-        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+class AbstractSliding(AbstractAxial):
+    """A joint whose two axes stay on one line, along which one body also slides."""
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
@@ -238,7 +226,23 @@ class Cylindrical(AbstractSpatialPart, AbstractJoint):
         return ((1, sleeve(self.point_b, size, self.axis_b)),)
 
 
-class Screw(AbstractSpatialPart, AbstractJoint):
+class Cylindrical(AbstractSliding):
+    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
+
+    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
+    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+
+    **Arguments:** as in `Revolute`.
+    """
+
+    rows: ClassVar[int] = 4
+
+    def residual(self, space, poses, t):
+        shift = offset_in_a(space, self, poses)
+        return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+
+
+class Screw(AbstractSliding):
     """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
 
     With the angle θ from `x_a` to `x_b` about the axis, the shift s = a·d and ψ = θ − 2π (s − offset)/pitch, the last
@@ -254,14 +258,8 @@ class Screw(AbstractSpatialPart, AbstractJoint):
     """
 
     pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
 
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
@@ -277,20 +275,8 @@ class Screw(AbstractSpatialPart, AbstractJoint):
         thread = lead * half_sine(sine[None], cosine)
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
 
-    def coordinates(self, space, poses):
-        return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
-    def pictured(self, space):
-        return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
-    def shapes(self, space, size):
-        return ((1, sleeve(self.point_b, size, self.axis_b)),)
-
-
-class Prismatic(AbstractSpatialPart, AbstractJoint):
+class Prismatic(AbstractOriented):
     """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
 
     The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
@@ -308,11 +294,7 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 5
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
@@ -330,7 +312,7 @@ class Prismatic(AbstractSpatialPart, AbstractJoint):
         return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)
 
 
-class Planar(AbstractSpatialPart, AbstractJoint):
+class Planar(AbstractAxial):
     """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: two of the tilt, `a·d`.
 
     Its coordinates are `angle` as in `Revolute`, and `displacement` [m], shape (2,), the components of d along `x_a`
@@ -339,16 +321,7 @@ class Planar(AbstractSpatialPart, AbstractJoint):
     **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis_b: fields.Number = fields.axis(body=1, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
-    x_a: fields.Number = fields.axis(body=0, optional=True)
-    x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 3
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
-
-    def complete(self, space, poses):
-        return measured_from_given_poses(self, space, poses)
 
     def residual(self, space, poses, t):
         height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
@@ -360,17 +333,13 @@ class Planar(AbstractSpatialPart, AbstractJoint):
         return {"displacement": displacement, "angle": angle(space, self, poses)}
 
 
-class Fixed(AbstractSpatialPart, AbstractJoint):
+class Fixed(AbstractOriented):
     """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the rotation (3) as in `Prismatic`.
 
     **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
     """
 
-    orientation: fields.Number = fields.attitude(optional=True)
     rows: ClassVar[int] = 6
-
-    def complete(self, space, poses):
-        return with_given_orientation(self, poses)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])

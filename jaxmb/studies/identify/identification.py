@@ -221,7 +221,9 @@ def identification(
     dispersion = found.noise**2 * slope if problem.loss.robust else 1.0
     own = series(problem, values, readings, known_noise)
     far = outliers(own)
-    doubts, reasons, warnings = _judged(problem, z, components, ends, found, own, far, known_noise, success, dispersion)
+    doubts, reasons, warnings = _judged(
+        problem, z, components, ends, segments, found, own, far, known_noise, success, dispersion
+    )
     deviations = np.sqrt(np.diag(found.matrix))
     deviations[[name in reasons and reasons[name] != _UNDETERMINED for name in components]] = np.nan
     starts = {name: problem.start(number, z) for number, name in enumerate(problem.names)}
@@ -269,13 +271,14 @@ def identification(
     )
 
 
-def _judged(problem, z, components, ends, found, own, far, known_noise, success, dispersion):
+def _judged(problem, z, components, ends, segments, found, own, far, known_noise, success, dispersion):
     """What speaks against the estimates as a whole; why components have no deviation; and all warnings in words."""
     finite = np.isfinite(ends[0][0])
     directions = found.root.shape[1]
     doubts = [] if success else ["the iteration did not converge; try another start, or more iterations"]
     if finite:
-        doubts += verdict.of_residuals(own, far, directions, problem.loss)
+        tried = verdict.Tried(len(ends), segments)
+        doubts += verdict.of_residuals(own, far, directions, problem.loss, tried)
     reasons, warnings = {}, list(doubts)
     deviations = np.sqrt(np.diag(found.matrix))
     if np.any(np.isnan(deviations)):

@@ -74,7 +74,8 @@ def identify(
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
         system's values. Every experiment has the same value, unless the name is among its `own`: that unknown is
         called `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
-        `"encoder.bias"`; noise levels are estimated by maximum likelihood.
+        `"encoder.bias"`, and are estimated as one number or, from a start with one for each component of the quantity,
+        as many; noise levels by maximum likelihood.
 
     **The initial state**, at `t0`, is found anew for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints whatever the free parameters is therefore kept as it is.

@@ -18,13 +18,21 @@ _FAR = 5.0
 _MANY = 20
 
 
+class Bias(NamedTuple):
+    """Whether a sensor's offset is `free`, and if so, whether `components` of the sensor or `experiments` share it."""
+
+    free: bool
+    components: bool = False
+    experiments: bool = False
+
+
 class Series(NamedTuple):
     """The residuals of one component of a sensor in order of time, predicted minus measured.
 
     **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma` (one each),
     or of the range where the noise is not known; `known`: whether it is, from before the fit; `small`: the size of
-    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: the indices in what was measured.
-    Where a residual function was given, `predicted` and `ts` are empty.
+    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: the indices in what was measured;
+    `bias` of the sensor. Where a residual function was given, `predicted` and `ts` are empty.
     """
 
     label: str
@@ -38,6 +46,7 @@ class Series(NamedTuple):
     predicted: np.ndarray
     ts: np.ndarray
     samples: np.ndarray
+    bias: Bias
 
     @property
     def square(self) -> float:
@@ -73,13 +82,24 @@ def series(
         elif fitted:
             theta = problem.own(number, values)
             for channel in trial.channels:
-                level = theta.get(f"{channel.name}.sigma")
-                out += _of_channel(name, trial, channel, np.asarray(readings[name][channel.name]), level, known_noise)
+                level, bias = theta.get(f"{channel.name}.sigma"), _bias(problem, number, channel)
+                predicted = np.asarray(readings[name][channel.name])
+                out += _of_channel(name, trial, channel, predicted, level, bias, known_noise)
     return tuple(out)
 
 
+def _bias(problem: Problem, number: int, channel: Channel) -> Bias:
+    shapes, name = dict(problem.trials[number].unknowns), f"{channel.name}.bias"
+    if name not in shapes:
+        return Bias(free=False)
+    source = problem.sources[number][list(shapes).index(name)]
+    fitted = [own for own, fitted in zip(problem.sources, problem.fitted, strict=True) if fitted]
+    shared = sum(source in own for own in fitted) > 1
+    return Bias(free=True, components=not shapes[name] and channel.values.ndim > 1, experiments=shared)
+
+
 def _of_channel(
-    experiment: str, trial: ExperimentModel, channel: Channel, predicted, level, known_noise
+    experiment: str, trial: ExperimentModel, channel: Channel, predicted, level, bias, known_noise
 ) -> Iterator[Series]:
     ts, measured, present = (np.asarray(x) for x in (trial.ts, channel.values, channel.present))
     sigma = np.broadcast_to(np.asarray(channel.sigma if level is None else level), measured.shape)
@@ -106,6 +126,7 @@ def _of_channel(
             predicted=predicted[at],
             ts=ts[there],
             samples=own[there],
+            bias=bias,
         )
 
 
@@ -128,6 +149,7 @@ def _of_user(experiment: str, trial: ExperimentModel, residuals: np.ndarray) -> 
             predicted=np.zeros(0),
             ts=np.zeros(0),
             samples=np.arange(column.size),
+            bias=Bias(free=False),
         )
 
 

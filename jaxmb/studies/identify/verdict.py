@@ -11,6 +11,7 @@ Statistics 18, 1947.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,15 +33,18 @@ _SHARE = 0.2
 # their estimates contradict each other where they differ by more than so many standard deviations.
 _AS_WELL, _APART = 10.0, 5.0
 
-_CURES = (
-    "The iteration ended in a local minimum: try other starts (starts=), a range of plausible values (bounds=) and, "
-    "for a fast, unstable or chaotic motion, shorter pieces (segments=); or the model, the data (a zero, a sign, a "
-    "unit) or sigma is wrong"
-)
+
+class Tried(NamedTuple):
+    """The number of `starts` and of `segments` of a fit."""
+
+    starts: int
+    segments: int
 
 
-def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss) -> list[str]:
-    """What the residuals of a fit say against it, and what helps.
+def of_residuals(
+    found: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss, tried: Tried
+) -> list[str]:
+    """What the residuals of a fit say against it, and what helps that was not done yet.
 
     **Arguments:** `directions`: how many combinations of unknowns were fitted; `loss`: a robust one expects some
     residuals that are large.
@@ -51,7 +55,20 @@ def of_residuals(found: Sequence[Series], far: Sequence[Outlier], directions: in
         *(_explains_nothing(unknown) if unknown else ()),
         *_no_noise(found, directions, loss),
     ]
-    return [*out[:-1], f"{out[-1]}. {_CURES}"] if out else []
+    return [*out[:-1], f"{out[-1]}. {_cures(tried)}"] if out else []
+
+
+def _cures(tried: Tried) -> str:
+    ended = "the iteration" if tried.starts == 1 else f"the best of {tried.starts} starts"
+    starts = "other starts (starts=)" if tried.starts == 1 else "more starts (starts=)"
+    pieces = "shorter pieces (segments=)"
+    if tried.segments > 1:
+        # Multiple shooting has one start, that of `free`.
+        starts, pieces = "another start (free=)", f"shorter pieces than these {tried.segments} (segments=)"
+    return (
+        f"Either {ended} ended in a local minimum: try {starts}, a range of plausible values (bounds=) and, for a "
+        f"fast, unstable or chaotic motion, {pieces}; or the model, the data (a zero, a sign, a unit) or sigma is wrong"
+    )
 
 
 def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
@@ -158,15 +175,19 @@ def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[s
 
 
 def _offset(own: Series) -> str:
-    """A hint where most of the residuals is an offset."""
+    """A hint where most of the residuals is an offset: how it becomes free, as far as it is not."""
     differences = own.residuals * own.sigma
     mean = float(np.mean(differences))
     if not own.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
         return ""
-    return (
-        f" and are {mean:.3g} on average (does the sensor count from another zero? Its offset, "
-        f"'{own.sensor}.bias', can be free)"
-    )
+    text, bias = f" and are {mean:.3g} on average", f"'{own.sensor}.bias'"
+    if not own.bias.free:
+        return f"{text} (does the sensor count from another zero? Its offset, {bias}, can be free)"
+    if own.bias.components:
+        return f"{text} (its offset, {bias}, is one number for all components: start from one for each)"
+    if own.bias.experiments:
+        return f"{text} (its offset, {bias}, is one for all experiments: name it in their own=, not in free)"
+    return f"{text}, though the offset, {bias}, is free"
 
 
 def chi_squared(value: float, freedoms: int) -> float:

@@ -95,7 +95,9 @@ class Advance(AbstractCarrier):
 
 
 class BodyIndex(eqx.Module):
-    """Where the entries of bodies stand in q and u, and those of scalar coordinates; static."""
+    """Where the entries of bodies stand in q and u, and the others in q: of scalar coordinates and counts of turns;
+    static.
+    """
 
     position: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     velocity: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -103,7 +105,6 @@ class BodyIndex(eqx.Module):
     spin: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     rotates: tuple[bool, ...] = eqx.field(static=True)
     scalars: tuple[int, ...] = eqx.field(static=True)
-    scalar_rates: tuple[int, ...] = eqx.field(static=True)
 
 
 def body_index(system: AbstractSystem) -> BodyIndex:
@@ -113,23 +114,23 @@ def body_index(system: AbstractSystem) -> BodyIndex:
     spatial = [f"{name}.orientation" in q for name in names]
     rotates = tuple(s or f"{name}.angle" in q for name, s in zip(names, spatial, strict=True))
     turning = [(name, s) for name, s, r in zip(names, spatial, rotates, strict=True) if r]
-    known = set(names)
-    scalars = [name for name in q if name.split(".")[0] not in known]
+    position = tuple(tuple(q[f"{name}.position"]) for name in names)
+    attitude = tuple(tuple(q[f"{name}.orientation" if s else f"{name}.angle"]) for name, s in turning)
+    of_bodies = {k for index in (*position, *attitude) for k in index}
     return BodyIndex(
-        tuple(tuple(q[f"{name}.position"]) for name in names),
+        position,
         tuple(tuple(u[f"{name}.velocity"]) for name in names),
-        tuple(tuple(q[f"{name}.orientation" if s else f"{name}.angle"]) for name, s in turning),
+        attitude,
         tuple(tuple(u[f"{name}.angular_velocity" if s else f"{name}.angle_rate"]) for name, s in turning),
         rotates,
-        tuple(q[name][0] for name in scalars),
-        tuple(u[f"{name}_rate"][0] for name in scalars),
+        tuple(k for k in range(system.nq) if k not in of_bodies),
     )
 
 
 class Bodies(AbstractCarrier):
     """Bodies turn with `turning` Ω [rad/s] about the world's origin and travel with `travel` [m/s], both in world axes,
     (3,) and (bodies, 3), and spin in addition with `spins` [rad/s], in body axes, (bodies that rotate, 3). Scalar
-    coordinates `advance` at constant rates.
+    coordinates and counts of turns `advance` at constant rates.
 
     `ṙ = travel + Ω × r`, `ṗ = ½ (Ω p + p s)`, `v̇ = Ω × v`, `ω̇ = ω × s`.
     """
@@ -172,7 +173,7 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
     place, speed, change = (jax.vmap(_spatial)(values[np.array(where)]) for where, values in vectors)
     attitude, spin, spin_change = _attitudes(index, state, rates)
     none = jnp.zeros(3, state.q.dtype)
-    advance = state.u[np.array(index.scalar_rates, int)]
+    advance = rates.q[np.array(index.scalars, int)]
     own = Bodies(none, speed, spin, advance, index)
     # Rows of ṙ = V + Ω × r, v̇ = Ω × v and ω̇ = Ω × ω (all in world axes) for (Ω, V / length), in units of their sizes.
     fastest = jnp.maximum(jnp.max(jnp.abs(speed)) / length, jnp.max(jnp.abs(spin), initial=0.0))

@@ -192,15 +192,15 @@ def _carrier(system, unknowns, rates, advancing) -> AbstractCarrier:
     if advancing or not system.body_names:
         moves = np.isin(np.arange(system.nq), advancing)
         return Advance(jnp.where(moves, rates, 0.0))
-    return _bodies(system, unknowns)
+    return _bodies(system, unknowns, rates)
 
 
-def _bodies(system, unknowns):
+def _bodies(system, unknowns, rates):
     """Bodies that turn and travel together; their spins are what is left of their angular velocities."""
     index = body_index(system)
     travel = jnp.broadcast_to(unknowns.travel[None, :], (len(index.rotates), 3))
     still = jnp.zeros((len(index.spin), 3), travel.dtype)
-    advance = unknowns.state.u[np.array(index.scalar_rates, int)]
+    advance = rates[np.array(index.scalars, int)]
     without = Bodies(unknowns.turning, travel, still, advance, index)
     if not index.spin:
         return without

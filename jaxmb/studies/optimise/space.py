@@ -16,7 +16,7 @@ from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
 from ...system.quantities import component_names
-from ..ranges import FreeParameters, HalfLine, Interval, WholeLine
+from ..ranges import FreeParameters, range_between
 
 
 class Space(eqx.Module):
@@ -74,13 +74,7 @@ class Space(eqx.Module):
                 raise ValueError(f"This method needs bounds for all components of {name!r}, or for none.")
             if np.any(start <= low) or np.any(start >= high):
                 raise ValueError(f"This method keeps bounds by a change of variables: start {name!r} strictly within.")
-            below, above = (bool(side.all()) for side in sides)
-            if below and above:
-                ranges.append(Interval(start, low, high))
-            elif below or above:
-                ranges.append(HalfLine(start, low if below else high))
-            else:
-                ranges.append(WholeLine(start, scale))
+            ranges.append(range_between(start, low, high, scale))
         return FreeParameters(self.names, tuple(ranges))
 
     def sample(self, count: int, seed: int) -> Float[Array, "count n"]:

@@ -21,8 +21,7 @@ from .engine import Task, here, on_executor, on_processes
 from .identity import identity_of_cases, identity_of_function, identity_of_outputs
 from .labels import described
 from .load import load_sweep
-from .outputs import RESERVED, check_parameters, declared, step_limit
-from .progress import shown_progress
+from .outputs import OK, RESERVED, check_parameters, declared, step_limit
 
 # Large enough that what a chunk costs besides its members, 5 ms, does not count, small enough that little is lost.
 _CHUNK = 512
@@ -192,10 +191,32 @@ def _results(
     own = lambda index: slice(index * batch.chunk, (index + 1) * batch.chunk)
     count = -(-len(cases) // batch.chunk)
     tasks = (Task(index, cases[own(index)]) for index in range(count) if index not in done)
-    with shown_progress(progress, cases, done) as advance:
+    with _shown_progress(progress, cases, done) as advance:
         for index, values in _chunks(batch, path, tasks, processes, executor):
             yield own(index), values
             advance(values["status"])
+
+
+@contextlib.contextmanager
+def _shown_progress(
+    shown: bool, cases: Cases, done: Mapping[int, np.ndarray]
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """A line with the members that are done, the time that is left, and the number of failed members."""
+    from tqdm import tqdm
+
+    statuses = list(done.values())
+    failed = sum(int(np.sum(own != OK)) for own in statuses)
+    bar = tqdm(total=len(cases), initial=sum(own.size for own in statuses), unit="member", disable=not shown)
+
+    def advance(own: np.ndarray) -> None:
+        nonlocal failed
+        failed += int(np.sum(own != OK))
+        if failed:
+            bar.set_postfix_str(f"{failed} failed", refresh=False)
+        bar.update(own.size)
+
+    with bar:
+        yield advance
 
 
 def _chunks(batch: Batch, path: Path | None, tasks: Iterator[Task], processes: int, executor: Executor | None):

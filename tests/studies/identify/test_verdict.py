@@ -9,7 +9,7 @@ from identifying import pendulum, slider_crank, swing
 import jaxmb as mb
 from jaxmb.studies.identify import verdict
 from jaxmb.studies.identify.loss import LOSSES
-from jaxmb.studies.identify.residuals import Series, outliers
+from jaxmb.studies.identify.residuals import Bias, Series, outliers
 from jaxmb.studies.ranges import HalfLine, Interval, PositiveDefinite, WholeLine
 
 # Compiles faster than Adams, where the solver does not matter.
@@ -191,7 +191,10 @@ def test_right_fits_of_a_pendulum_are_not_accused(seed):
     assert fit.converged, fit
 
 
-def series(residuals, known=True, predicted=None, label="x"):
+FIXED = Bias(free=False)
+
+
+def series(residuals, known=True, predicted=None, label="x", bias=FIXED):
     """Residuals as of a sensor at times 0, 1, …."""
     n = len(residuals)
     return Series(
@@ -206,11 +209,68 @@ def series(residuals, known=True, predicted=None, label="x"):
         np.zeros(n) if predicted is None else predicted,
         np.arange(n, dtype=float),
         np.arange(n),
+        bias,
     )
 
 
-def said(own, loss="linear"):
-    return "; ".join(verdict.of_residuals(own, outliers(tuple(own)), 1, LOSSES[loss]))
+def said(own, loss="linear", starts=1, segments=1):
+    tried = verdict.Tried(starts, segments)
+    return "; ".join(verdict.of_residuals(own, outliers(tuple(own)), 1, LOSSES[loss], tried))
+
+
+def test_what_was_tried_already_is_not_advised():
+    shifted = 5 + np.random.default_rng(0).standard_normal(50)
+    assert "(does the sensor count from another zero? Its offset, 'x.bias', can be free)" in said([series(shifted)])
+    free = {name: said([series(shifted, bias=Bias(True, **{name: True}))]) for name in ("components", "experiments")}
+    assert "one number for all components" in free["components"] and "own=" in free["experiments"]
+    for words in (*free.values(), said([series(shifted, bias=Bias(True))])):
+        assert "can be free" not in words and "'x.bias', is" in words and "or the model" in words
+    first = said([series(shifted)])
+    assert "try other starts (starts=), a range of plausible values (bounds=)" in first and "than these" not in first
+    several = said([series(shifted)], starts=8)
+    assert "Either the best of 8 starts ended" in several and "more starts (starts=)" in several
+    pieces = said([series(shifted)], segments=16)
+    assert "shorter pieces than these 16 (segments=)" in pieces and "starts=" not in pieces and "free=" in pieces
+
+
+OFFSETS = np.array([0.1, -0.2])
+
+
+def test_an_offset_that_is_free_for_all_components_together():
+    """What is advised instead of freeing it frees it for each, and the fit is right."""
+    own, ts = pendulum(), np.linspace(0.0, 1.0, 41)[1:]
+    known = {"fix": {"rod.angle": 0.5}, "sigma": {"rod.position": 1e-3}, "solver": TSIT5}
+    motion = mb.simulate(own, mb.assemble(own, fix=known["fix"]), t1=ts[-1], saveat=ts, solver=TSIT5)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((ts.size, 2))
+    data = {"rod.position": np.asarray(motion["rod"].position) + OFFSETS + noise}
+    fits = [
+        mb.identify(own, data, ts=ts, free={"spring.stiffness": 7.0, "rod.position.bias": bias}, **known)
+        for bias in (0.0, np.zeros(2))
+    ]
+    assert not fits[0].converged and "no noise" in fits[0].message and "can be free" not in fits[0].message
+    assert "its offset, 'rod.position.bias', is one number for all components" in fits[0].message
+    assert fits[1].converged
+    np.testing.assert_allclose(fits[1].parameters["rod.position.bias"], OFFSETS, atol=2e-3)
+
+
+def test_an_offset_that_is_free_for_all_experiments_together(system, exact):
+    start = START | {"ts": TS}
+    data = [samples(exact + offset, 200, NOISE, 5) for offset in OFFSETS]
+    fits = [
+        mb.identify(
+            system,
+            [mb.Experiment(own, own=each, **start) for own in data],
+            sigma={"theta": NOISE},
+            free=[*TRUE, *shared],
+            solver=TSIT5,
+        )
+        for shared, each in ((["theta.bias"], []), ([], ["theta.bias"]))
+    ]
+    assert not fits[0].converged and "no noise" in fits[0].message and "can be free" not in fits[0].message
+    assert "its offset, 'theta.bias', is one for all experiments: name it in their own=" in fits[0].message
+    assert fits[1].converged
+    estimates = [fits[1].parameters[f"exp{k}/theta.bias"] for k in (1, 2)]
+    np.testing.assert_allclose(estimates, OFFSETS, atol=0.01)
 
 
 def test_what_does_not_matter_is_not_accused():

@@ -156,3 +156,42 @@ def test_what_is_no_steady_motion():
         mb.steady_motion(system, ignorable=["x"])
     with pytest.raises(ValueError, match="no steady motion"):
         mb.linearise(system, mb.assemble(system, fix={"rod.angle": -np.pi / 2}, rates={"rod.angle": 3.0}))
+
+
+def corded(**wheels):
+    """Balls on one skew axle, by their moments of inertia [kg m²], and a cord around them at a radius of 0.3 m."""
+    axis = (0.6, 0.0, 0.8)
+    bodies = [spatial.Body(name, mass=1.0, inertia=(J, J, J)) for name, J in wheels.items()]
+    hinges = [spatial.Revolute(f"hinge_{name}", "ground", name, point=(0.0, 0.0, 0.0), axis=axis) for name in wheels]
+    along = [f"hinge_{name}.angle" for name in wheels]
+    return bodies, [*hinges, mb.FixedTendon("cord", along, coefficients=(0.3, -0.3)[: len(wheels)])]
+
+
+def test_a_wheel_that_winds_up_a_cord():
+    """The count of its turns advances with it, however often it has turned."""
+    bodies, joints = corded(wheel=2.0)
+    system = mb.Scene(bodies, joints=joints).compile()
+    state = mb.steady_motion(system, rates={"hinge_wheel.angle_rate": 3.0})
+    np.testing.assert_allclose(system.rates(0.0, state.q, state.u)[-1], 3.0, rtol=1e-9)
+    motion = mb.simulate(system, state, t1=5.0, saveat=[5.0])
+    np.testing.assert_allclose(motion["cord"].length[-1], 0.3 * 15.0, rtol=1e-7)
+    later = jax.tree.map(lambda x: x[-1], motion.ys)
+    np.testing.assert_allclose(mb.linearise(system, later).A, [[0.0, 1.0], [0.0, 0.0]], atol=1e-9)
+
+
+def test_wheels_that_a_cord_keeps_together():
+    """They turn at one speed, the stretch of the cord between them balances a torque, and they vibrate about that."""
+    one, two, stiffness, damping, r = 2.0, 0.5, 40.0, 0.7, 0.3
+    bodies, joints = corded(one=one, two=two)
+    spring = mb.JointSpring("spring", "cord.length", stiffness=stiffness, damping=damping)
+    drag = [mb.JointForce(f"drag_{k}", f"hinge_{k}.angle", force=f) for k, f in (("one", 1.5), ("two", -1.5))]
+    system = mb.Scene(bodies, joints=joints, forces=[spring, *drag]).compile()
+    guess = mb.assemble(system, rates={"hinge_one.angle_rate": 3.0, "hinge_two.angle_rate": 3.0})
+    state = mb.steady_motion(system, guess, rates={"hinge_one.angle_rate": 3.0})
+    linear = mb.linearise(system, state)
+    mass = 1.0 / (r**2 * (1 / one + 1 / two))
+    wanted = np.roots([mass, damping, stiffness])
+    np.testing.assert_allclose(np.sort_complex(linear.eigenvalues[2:]), np.sort_complex(wanted), rtol=1e-8)
+    once = jax.tree.map(lambda x: x[None], state)
+    length = system.quantities()["cord.length"].value(jnp.zeros(1), once, None)
+    np.testing.assert_allclose(length, 1.5 / (stiffness * r), rtol=1e-9)

@@ -1,10 +1,30 @@
-"""The biconnected components of a graph of bodies and joints, and the bodies and ground where they meet.
+"""Graphs of bodies and joints: what is connected, the biconnected components with the vertices where they meet, and
+shortest loops.
 
 Source: J. Hopcroft and R. Tarjan, "Efficient algorithms for graph manipulation", Comm. ACM 16(6), 1973.
 """
 
-from collections.abc import Collection, Sequence
+import collections
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
+
+
+def connected(count: int, edges: Iterable[Sequence[int]]) -> list[int]:
+    """For each of some vertices the first one that it is connected to, perhaps itself."""
+    # A union-find forest, whose trees have their first vertex as the root.
+    parent = list(range(count))
+
+    def root(vertex):
+        while parent[vertex] != vertex:
+            parent[vertex] = parent[parent[vertex]]
+            vertex = parent[vertex]
+        return vertex
+
+    for own in edges:
+        first = min(map(root, own))
+        for vertex in own:
+            parent[root(vertex)] = first
+    return [root(vertex) for vertex in range(count)]
 
 
 class Component(NamedTuple):
@@ -78,3 +98,56 @@ def _search(root, adjacent, edges, depth, out):
                     if edge == above:
                         break
                 out.append(Component(tuple(sorted(own)), parent))
+
+
+def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
+    """The vertices that each edge waits for in an elimination: one of a spanning tree for that below it, another one
+    for those of a shortest loop through it.
+
+    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, one more than theirs.
+    """
+    at: list[list[int]] = [[] for _ in range(ground + 1)]
+    vertices = [own if len(own) > 1 else (*own, ground) for own in edges]
+    for edge, own in enumerate(vertices):
+        for vertex in own:
+            at[vertex].append(edge)
+    before: list[tuple[int, ...]] = [()] * len(edges)
+    reached = [False] * (ground + 1)
+    waits = [False] * len(edges)
+    for root in [ground, *range(ground)]:
+        if reached[root]:
+            continue
+        reached[root] = True
+        queue = collections.deque([root])
+        while queue:
+            for edge in at[queue.popleft()]:
+                below = next((vertex for vertex in vertices[edge] if not reached[vertex]), None)
+                if below is not None and not waits[edge]:
+                    reached[below] = waits[edge] = True
+                    before[edge] = (below,)
+                    queue.append(below)
+    for edge, own in enumerate(vertices):
+        if not waits[edge]:
+            before[edge] = tuple(vertex for vertex in _shortest_loop(edge, own, at, vertices) if vertex != ground)
+    return before
+
+
+def _shortest_loop(edge, own, at, vertices):
+    """The vertices of a shortest loop through an edge; those of the edge where it is on none."""
+    start, *ends = own
+    found = set(own)
+    for end in ends:
+        above = {start: start}
+        queue = collections.deque([start])
+        while queue and end not in above:
+            vertex = queue.popleft()
+            for other in at[vertex]:
+                if other != edge:
+                    for far in vertices[other]:
+                        if far not in above:
+                            above[far] = vertex
+                            queue.append(far)
+        while end in above and end != start:
+            end = above[end]
+            found.add(end)
+    return found

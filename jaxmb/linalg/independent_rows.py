@@ -1,7 +1,8 @@
-"""Independent rows of a sparse matrix, by elimination with few new entries: arithmetic on concrete numbers.
+"""Independent rows of matrices of concrete numbers.
 
-Pivots are chosen for sparsity among entries that are not much smaller than the largest of their column, so that no
-multiple of a row that is subtracted from another one is large.
+Pivots of a dense matrix are its largest entries. Those of a sparse one are chosen for few new entries, among entries
+that are not much smaller than the largest of their column, so that no multiple of a row that is subtracted from another
+one is large.
 
 Source: H. M. Markowitz, "The elimination form of the inverse and its application to linear programming", Management
 Science 3(3), 1957; I. S. Duff, A. M. Erisman and J. K. Reid, "Direct Methods for Sparse Matrices", 2017, ch. 7
@@ -10,10 +11,10 @@ Science 3(3), 1957; I. S. Duff, A. M. Erisman and J. K. Reid, "Direct Methods fo
 
 import dataclasses
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 # A pivot is at least this share of the largest entry of its column.
 _THRESHOLD = 0.1
@@ -52,7 +53,9 @@ class SparsePivots:
         return out
 
 
-def pivot_rows(rows: Sequence[dict[int, float]], level: Sequence[int], *, zero: float, rounding: float) -> SparsePivots:
+def sparse_pivots(
+    rows: Sequence[dict[int, float]], level: Sequence[int], *, zero: float, rounding: float
+) -> SparsePivots:
     """Independent rows, and how the others depend on them.
 
     **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
@@ -151,3 +154,44 @@ class _Elimination:
                     del own[c]
                     self.columns[c].discard(r)
         return changed
+
+
+def least_size(sizes: Float[np.ndarray, "*sets rows"]) -> Float[np.ndarray, "*sets 1"]:
+    """The norm of a row that counts as zero, for each set of rows."""
+    info = np.finfo(sizes.dtype)
+    return np.maximum(info.eps**0.75 * np.max(sizes, axis=-1, initial=0.0, keepdims=True), info.tiny)
+
+
+def dense_pivots(
+    A: Float[np.ndarray, "m n"], level: Int[np.ndarray, "m"], zero: float
+) -> tuple[Int[np.ndarray, "m"], int]:
+    """Rows in the order of full pivoting, independent ones first, and their number; rows of low levels become pivots
+    first, and an equilibrated pivot below this power `zero` of eps is none.
+    """
+    m, n = A.shape
+    eps = float(np.finfo(A.dtype).eps)
+    size = np.linalg.norm(A, axis=1)
+    work = A / np.maximum(size, least_size(size))[:, None]
+    left = np.ones(m, bool)
+    kept = []
+    for own in np.unique(level):
+        while n and len(kept) < min(m, n):
+            sizes = np.where((left & (level == own))[:, None], np.abs(work), 0.0)
+            r, c = np.unravel_index(np.argmax(sizes), sizes.shape)
+            if not sizes[r, c] > eps**zero:
+                break
+            left[r] = False
+            kept.append(int(r))
+            ratio = np.where(left, work[:, c] / work[r, c], 0.0)
+            work = work - ratio[:, None] * work[r]
+    return np.array([*kept, *np.flatnonzero(left)], int), len(kept)
+
+
+def independent_in_order(jacobian: Float[np.ndarray, "m n"], order: Iterable[int]) -> Int[np.ndarray, "r"]:
+    """Rows that do not depend on those before them, in an order."""
+    kept, basis = [], np.zeros((0, jacobian.shape[1]), jacobian.dtype)
+    for k in order:
+        own = jacobian[k] - basis.T @ (basis @ jacobian[k])
+        if np.linalg.norm(own) > np.finfo(jacobian.dtype).eps ** 0.5 * np.linalg.norm(jacobian[k]):
+            kept, basis = [*kept, k], np.vstack([basis, own / np.linalg.norm(own)])
+    return np.array(kept, int)
