@@ -262,7 +262,7 @@ def _saved(series: Saved, table, place, k, end, w, dense, at):
     if series.steps:
         here = (k + 1) % series.steps == 0
         table = buffer_set(table, place[0], w, here)
-        place = place + jnp.array([1, 0]) * here
+        place = place.at[0].add(here.astype(place.dtype))
     return table, place
 
 
@@ -272,7 +272,7 @@ def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
     """
     if series.steps:
         here = (k + 1) % series.steps == 0
-        place = place - jnp.array([1, 0]) * here
+        place = place.at[0].add(-here.astype(place.dtype))
         if table is not None:
             lw = lw + jnp.where(here, table[place[0]], 0.0)
     if series.times is not None:
