@@ -22,11 +22,11 @@ _SECOND_REVERSE = (
 
 class _Programs:
     """A map and its transpose on lists of arrays: `there(residuals, x)` and `back(residuals, cotangents)`, where a
-    cotangent may be None for zeros; `again`, the map in a form whose derivatives by residuals are right; and the shapes
-    of x and of the value.
+    cotangent may be None for zeros; `again`, both in a form whose derivatives by residuals are right; and the shapes of
+    x and of the value.
     """
 
-    def __init__(self, there: Callable, back: Callable, again: Callable, inputs: Sequence, outputs: Sequence):
+    def __init__(self, there: Callable, back: Callable, again: tuple[Callable, Callable], inputs, outputs):
         self.there, self.back, self.again = there, back, again
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
 
@@ -37,51 +37,61 @@ class _Programs:
             left = iter(cotangents)
             return [next(left) if here else None for here in known]
 
-        def back(residuals, cotangents):
-            cotangents = [
-                jnp.zeros(a.shape, a.dtype) if c is None else c for c, a in zip(cotangents, self.inputs, strict=True)
-            ]
-            return [x for x, here in zip(self.there(residuals, cotangents), known, strict=True) if here]
+        def turned(there, back):
+            def from_cotangents(residuals, cotangents):
+                return back(residuals, every(cotangents))
 
-        there = lambda residuals, cotangents: self.back(residuals, every(cotangents))
+            def of_these(residuals, x):
+                values = there(residuals, filled(list(self.inputs), x))
+                return [value for value, here in zip(values, known, strict=True) if here]
+
+            return from_cotangents, of_these
+
         outputs = [a for a, here in zip(self.outputs, known, strict=True) if here]
-        return _Programs(there, back, there, outputs, self.inputs)
+        return _Programs(*turned(self.there, self.back), turned(*self.again), outputs, self.inputs)
 
     def batched(self, size: int, axes: Sequence[int | None]) -> "_Programs":
         """The maps of a batch, whose residuals have these `axes`."""
         of = lambda function: jax.vmap(function, in_axes=(list(axes), 0))
         shapes = lambda avals: [ShapedArray((size, *a.shape), a.dtype) for a in avals]
-        return _Programs(of(self.there), of(self.back), of(self.again), shapes(self.inputs), shapes(self.outputs))
+        again = of(self.again[0]), of(self.again[1])
+        return _Programs(of(self.there), of(self.back), again, shapes(self.inputs), shapes(self.outputs))
 
 
-def linear_map(there: Callable, back: Callable, again: Callable, residuals: PyTree, x: PyTree, like: PyTree) -> PyTree:
+def linear_map(
+    there: Callable, back: Callable, again: tuple[Callable, Callable], residuals: PyTree, x: PyTree, like: PyTree
+) -> PyTree:
     """`there(residuals, x)`, linear in x.
 
     **Arguments:**
 
     - `there(residuals, x)`: the map.
     - `back(residuals, cotangents)`: its transpose; a cotangent that is None stands for zeros.
-    - `again`: the same as `there`, in a form that may be differentiated by the residuals.
+    - `again`: both in a form that may be differentiated by the residuals.
     - `residuals`: what the map depends on otherwise, a pytree.
     - `x`: a pytree of floating-point arrays.
     - `like`: a pytree of arrays or shapes, those of the value.
 
-    Derivatives of derivatives by the residuals exist in forward mode only: they are those of `again`, a `TypeError`
-    says it otherwise.
+    Derivatives by the residuals exist in forward mode only; a `TypeError` says it otherwise.
     """
     arrays, static = eqx.partition(residuals, eqx.is_array)
     known, structure = jax.tree.flatten(arrays)
     inputs, of_inputs = jax.tree.flatten(x)
     outputs, of_outputs = jax.tree.flatten(like)
     held = lambda leaves: eqx.combine(jax.tree.unflatten(structure, leaves), static)
-    run = lambda function: lambda r, x: jax.tree.leaves(function(held(r), jax.tree.unflatten(of_inputs, x)))
 
-    def transpose(r, cotangents):
-        out = back(held(r), jax.tree.unflatten(of_outputs, cotangents))
-        return jax.tree.leaves(filled(x, out))
+    def map_of(function):
+        return lambda r, x: jax.tree.leaves(function(held(r), jax.tree.unflatten(of_inputs, x)))
+
+    def transpose_of(function):
+        def transpose(r, cotangents):
+            return jax.tree.leaves(filled(x, function(held(r), jax.tree.unflatten(of_outputs, cotangents))))
+
+        return transpose
 
     shapes = lambda leaves: [ShapedArray(a.shape, a.dtype) for a in leaves]
-    programs = _Programs(run(there), transpose, run(again), shapes(inputs), shapes(outputs))
+    both = map_of(again[0]), transpose_of(again[1])
+    programs = _Programs(map_of(there), transpose_of(back), both, shapes(inputs), shapes(outputs))
     values = _linear_map.bind(*known, *inputs, programs=programs, known=len(known))
     return jax.tree.unflatten(of_outputs, values)
 
@@ -109,7 +119,7 @@ def _push(primals, tangents, *, programs: _Programs, known: int):
             residuals = list(primals[:known])
             for k, value in zip(moving, values, strict=True):
                 residuals[k] = value
-            return programs.again(residuals, list(primals[known:]))
+            return programs.again[0](residuals, list(primals[known:]))
 
         along = tuple(tangents[k] for k in moving)
         _, more = jax.jvp(moved, tuple(primals[k] for k in moving), along)

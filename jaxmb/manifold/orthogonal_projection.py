@@ -39,9 +39,7 @@ _MEASURED = 0.6
 _MEASURED_SPEED = 0.4
 
 
-def projector_constraints(
-    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities
-) -> "ProjectorConstraints":
+def projector_constraints(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "ProjectorConstraints":
     """The constraints by their projector at a state."""
     return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
 

@@ -7,6 +7,7 @@ rejected step and no second solution of the equations in them, all modes share o
 the rows comes with its transpose, modes can be combined and batched.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -140,10 +141,10 @@ class Mesh(eqx.Module):
         )
         return self._out(carry[1])
 
-    def push_once(self, x: PyTree) -> Tangents:
-        """`push` in a form that can be differentiated by the rows, of a run of one segment."""
-        out = self._out(self._pushed(x[0], self._first(*x[1]), self.rows, self.count))
-        return eqx.error_if(out, self.count > self.size, _TOO_LONG.format(self.size))
+    def of_one_segment(self) -> "Mesh":
+        """The same, whose maps can be differentiated by the rows; of a run that has more than them, an error."""
+        rows = eqx.error_if(self.rows, self.count > self.size, _TOO_LONG.format(self.size))
+        return dataclasses.replace(self, rows=rows, segments=None)
 
     def _rows_of(self, segment: Any) -> list[Array]:
         """The rows of a segment of the run."""
@@ -531,7 +532,8 @@ def _recorded_jvp(primals, tangents):
         segments=_segments(starts, final, init_state, fixed, max_steps),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
-    along = linear_map(Mesh.push, Mesh.pull, Mesh.push_once, mesh, x, like)
+    again = lambda mesh, x: mesh.of_one_segment().push(x), lambda mesh, x: mesh.of_one_segment().pull(x)
+    along = linear_map(Mesh.push, Mesh.pull, again, mesh, x, like)
     return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, starts))
 
 

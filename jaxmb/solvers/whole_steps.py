@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._compat import with_loops
 from .controller import MultistepController
 from .evaluation import ravel, unravel_like
 from .multistep import AbstractMultistep
@@ -85,9 +86,9 @@ def steps_of(solver: Any, controller: Any) -> AbstractSteps:
         solver = eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none)
         own = solver.linear_steps(jumps)
         return WholeSteps(solver, False, jumps) if own is None else own
-    if isinstance(solver, WithTangents):
-        return WholeSteps(solver.inner, True, jumps)
-    return WholeSteps(solver, False, jumps)
+    watched = isinstance(solver, WithTangents)
+    # Loops over stages in the form that both modes can differentiate.
+    return WholeSteps(with_loops(solver.inner if watched else solver, "bounded"), watched, jumps)
 
 
 def jump_times(controller: Any) -> Any:

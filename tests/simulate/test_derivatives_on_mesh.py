@@ -120,7 +120,10 @@ def test_runs_longer_than_the_rows_that_are_kept():
     members = POINT[None] * np.array([[1.0, 1.0], [0.5, 2.0]])
     batch = jax.jit(jax.vmap(jax.jacrev(lambda p: end(p, 16))))(members)
     np.testing.assert_allclose(batch[0], whole[1], rtol=1e-8, atol=1e-8 * np.max(np.abs(whole[1])))
-    second = jax.hessian(lambda p: jnp.sum(end(p, 16)))
+
+
+def test_second_derivatives_of_a_run_that_is_too_long():
+    second = jax.hessian(lambda p: jnp.sum(states(run(p, adjoint=MeshAdjoint(16)))))
     with pytest.raises(RuntimeError, match="Second derivatives need the rows of all steps, of which 16 are kept"):
         jax.block_until_ready(jax.jit(second)(POINT))
 

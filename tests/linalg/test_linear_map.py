@@ -1,0 +1,68 @@
+"""Linear maps with transposes of their own: all modes of derivatives, nested and batched."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmb.linalg.linear_map import linear_map
+
+RESIDUAL = np.array([[0.1, 0.7, -0.4], [1.3, 0.2, 0.5]])
+X = np.array([1.0, -2.0, 0.5])
+
+
+def there(residual, x):
+    return {"first": jnp.sin(residual) @ x["x"], "unused": None, "sum": jnp.sum(residual) * x["x"]}
+
+
+def back(residual, cotangents):
+    out = [] if cotangents["first"] is None else [jnp.sin(residual).T @ cotangents["first"]]
+    out += [] if cotangents["sum"] is None else [jnp.sum(residual) * cotangents["sum"]]
+    return {"x": sum(out[1:], start=out[0]) if out else None, "nothing": None}
+
+
+def mapped(residual, x):
+    x, like = {"x": x, "nothing": None}, {"first": jnp.zeros(2), "unused": None, "sum": jnp.zeros(3)}
+    out = linear_map(there, back, (there, back), residual, x, like)
+    return jnp.concatenate([out["first"], out["sum"]])
+
+
+def plain(residual, x):
+    out = there(residual, {"x": x})
+    return jnp.concatenate([out["first"], out["sum"]])
+
+
+def test_derivatives_are_those_of_the_map():
+    for through in (
+        lambda f: f,
+        jax.jit,
+        lambda f: jax.jacfwd(f, 1),
+        lambda f: jax.jacrev(f, 1),
+        lambda f: jax.jacfwd(f, 0),
+    ):
+        np.testing.assert_allclose(through(mapped)(RESIDUAL, X), through(plain)(RESIDUAL, X), rtol=1e-14)
+    # Only one of the outputs has a cotangent.
+    one = lambda f: jax.grad(lambda x: jnp.sum(f(RESIDUAL, x)[:2] ** 2))
+    np.testing.assert_allclose(one(mapped)(X), one(plain)(X), rtol=1e-14)
+
+
+def test_derivatives_of_derivatives_and_batches():
+    energy = lambda f: lambda r, x: jnp.sum(jnp.cos(f(r, x)))
+    second = lambda f: jax.jacfwd(lambda r, x: jnp.sum(jax.grad(energy(f), 1)(r, x) ** 2), 0)
+    np.testing.assert_allclose(second(mapped)(RESIDUAL, X), second(plain)(RESIDUAL, X), rtol=1e-12)
+    np.testing.assert_allclose(
+        jax.hessian(energy(mapped), 1)(RESIDUAL, X), jax.hessian(energy(plain), 1)(RESIDUAL, X), rtol=1e-12
+    )
+    several = np.stack([RESIDUAL, 2 * RESIDUAL])
+    for axes in ((0, None), (None, None)):
+        members = several if axes[0] == 0 else RESIDUAL
+        batch = lambda f, axes=axes: jax.jit(jax.vmap(jax.grad(energy(f), 1), (axes[0], 0)))
+        points = np.stack([X, X + 1])
+        np.testing.assert_allclose(batch(mapped)(members, points), batch(plain)(members, points), rtol=1e-12)
+
+
+def test_a_derivative_is_not_differentiated_in_reverse_mode():
+    squares = lambda r: jnp.sum(jax.grad(lambda x: jnp.sum(mapped(r, x) ** 2))(X) ** 2)
+    for through in (lambda f: f, jax.jit):
+        with pytest.raises(TypeError, match=r"differentiated in forward mode only: take jax\.hessian"):
+            through(jax.grad(squares))(RESIDUAL)
