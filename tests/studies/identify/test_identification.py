@@ -129,7 +129,7 @@ def test_the_density_includes_prior_likelihood_and_volume(three):
         out += np.log(values["encoder.sigma"]) + np.log(TS[0] - values["encoder.delay"])
         for number in range(2):
             seen = problem.trials[number].seen(
-                *problem.start(number, z), problem.own(number, problem.free(z)), problem.options, None
+                *problem.start(number, z), problem.own(number, problem.free(z)), problem.options
             )
             for sensor, data in zip(("encoder", "gyro"), problem.trials[number].channels, strict=True):
                 level = values["encoder.sigma"] if sensor == "encoder" else SIGMA["gyro"]
