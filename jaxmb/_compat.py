@@ -93,7 +93,6 @@ def define_bilinear(
     return own.bind
 
 
-
 # equinox
 
 

@@ -6,7 +6,6 @@ transpose, and batches of either are the batched programs.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,15 +33,17 @@ class _Programs:
     def transposed(self, known: tuple[bool, ...]) -> "_Programs":
         """The transpose, of the `known` ones of the cotangents."""
 
-        def filled(cotangents):
+        def every(cotangents):
             left = iter(cotangents)
             return [next(left) if here else None for here in known]
 
         def back(residuals, cotangents):
-            cotangents = [jnp.zeros(a.shape, a.dtype) if c is None else c for c, a in zip(cotangents, self.inputs, strict=True)]
+            cotangents = [
+                jnp.zeros(a.shape, a.dtype) if c is None else c for c, a in zip(cotangents, self.inputs, strict=True)
+            ]
             return [x for x, here in zip(self.there(residuals, cotangents), known, strict=True) if here]
 
-        there = lambda residuals, cotangents: self.back(residuals, filled(cotangents))
+        there = lambda residuals, cotangents: self.back(residuals, every(cotangents))
         outputs = [a for a, here in zip(self.outputs, known, strict=True) if here]
         return _Programs(there, back, there, outputs, self.inputs)
 
@@ -154,5 +155,3 @@ mlir.register_lowering(_linear_map, mlir.lower_fun(_evaluate, multiple_results=T
 ad.primitive_jvps[_linear_map] = _push
 ad.primitive_transposes[_linear_map] = _transpose
 batching.primitive_batchers[_linear_map] = _batch
-
-

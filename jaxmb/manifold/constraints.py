@@ -10,6 +10,7 @@ theorem, not from the algorithm: they are independent of the formulation, and ca
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -112,14 +113,14 @@ def _restore_jvp(primals, tangents):
     system, t, y, near, tol = primals
     dsystem, dt, dy, _, _ = tangents
     out = restore(system, t, y, near, tol)
-    return out, _push_solution(near.constraints, system, t, out, (dsystem, dt, dense(dy.q, y.q), dense(dy.u, y.u)))
+    # The factor of the other state solves the equations, but only that of this state differentiates them.
+    here = near.constraints.at(system, t, out.q, out.u)
+    return out, _push_solution(here, system, t, out, (dsystem, dt, dense(dy.q, y.q), dense(dy.u, y.u)))
 
 
-def _push_solution(constraints, system, t, out, along):
+def _push_solution(here, system, t, out, along):
     """The tangent of a restored state, from one of (system, t, q, u) before it was restored."""
     dsystem, dt, dq, du = along
-    # The factor of the other state solves the equations, but only that of this state differentiates them.
-    here = constraints.at(system, t, out.q, out.u)
     dq = here.push_positions((system, t, out.q), (dsystem, dt, dq))
     along = push_velocities(here, (system, t, out.q, out.u), (dsystem, dt, dq, du))
     return RestoredState(dq, along[3], push_accelerations(here, (system, t, out.q, out.u), along, out))
@@ -127,22 +128,22 @@ def _push_solution(constraints, system, t, out, along):
 
 @eqx.filter_custom_jvp
 def solved(
-    constraints: AbstractConstraints, system: AbstractEquation, t: Scalar, solution: RestoredState
+    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, solution: RestoredState
 ) -> RestoredState:
     """A state on the constraints with its accelerations, as they are, with the derivatives that `restore` gives them.
 
-    **Arguments:** `constraints`: of any state; `solution`: known.
+    **Arguments:** `at(system, t, q, u)`: the constraints at a state, a pytree; `solution`: known.
     """
     return solution
 
 
 @solved.def_jvp
 def _solved_jvp(primals, tangents):
-    constraints, system, t, solution = primals
+    at, system, t, solution = primals
     _, dsystem, dt, dsolution = tangents
     out = solved(*primals)
     along = dsystem, dt, dense(dsolution.q, solution.q), dense(dsolution.u, solution.u)
-    return out, _push_solution(constraints, system, t, out, along)
+    return out, _push_solution(at(system, t, out.q, out.u), system, t, out, along)
 
 
 def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -39,6 +39,13 @@ _MEASURED = 0.6
 _MEASURED_SPEED = 0.4
 
 
+def projector_constraints(
+    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities
+) -> "ProjectorConstraints":
+    """The constraints by their projector at a state."""
+    return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
+
+
 class ProjectorConstraints(AbstractConstraints):
     """Constraints that are linear in velocities, by the `projector` at coordinates `q` in the metric of the mass
     matrix.
@@ -94,7 +101,7 @@ class ProjectorConstraints(AbstractConstraints):
         return RestoredState(q, u, udot, multipliers, iterations, failed | failed_u | failed_udot)
 
     def at(self, system, t, q, u):
-        return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
+        return projector_constraints(system, t, q, u)
 
     def multipliers(self, system, t, restored):
         if restored.multipliers is not None:

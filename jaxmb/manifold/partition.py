@@ -214,6 +214,12 @@ def _push_positions(own, at, along):
     return along[2] - own.right_inverse @ push(lambda s, t, q: s.coordinate_residual(t, q), at, along)
 
 
+def _chart_constraints(split, system, t, q, u):
+    """The constraints in a chart at a state."""
+    factor = eliminate(system.jacobian(t, q, u), split.velocity, system.velocity_rank)
+    return ChartConstraints(factor, split)
+
+
 class ChartConstraints(AbstractConstraints):
     """The constraints in a chart: independent coordinates and velocities keep their values.
 
@@ -243,8 +249,7 @@ class ChartConstraints(AbstractConstraints):
         return RestoredState(q, u, udot, None, iterations, failed)
 
     def at(self, system, t, q, u):
-        factor = eliminate(system.jacobian(t, q, u), self.split.velocity, system.velocity_rank)
-        return ChartConstraints(factor, self.split)
+        return _chart_constraints(self.split, system, t, q, u)
 
     def multipliers(self, system, t, restored):
         return self.factor.right_inverse.T @ self._unbalanced(system, t, restored)
@@ -450,7 +455,7 @@ class PartitionTerm(AbstractManifoldTerm):
     def at_solution(self, t, y, f, kept, args):
         system = self.system
         if system.acceleration_rows > 0 and system.ideal_on_velocities:
-            out = solved(ChartConstraints(None, kept), system, t, RestoredState(y.q, y.u, f.u))
+            out = solved(eqx.Partial(_chart_constraints, kept), system, t, RestoredState(y.q, y.u, f.u))
             return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
         split = kept
         if system.coordinate_rank:

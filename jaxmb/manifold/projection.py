@@ -24,7 +24,13 @@ from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
-from .orthogonal_projection import ProjectorConstraints, project_in_metric, project_normalized, projected
+from .orthogonal_projection import (
+    ProjectorConstraints,
+    project_in_metric,
+    project_normalized,
+    projected,
+    projector_constraints,
+)
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
@@ -209,7 +215,7 @@ class ProjectionTerm(AbstractManifoldTerm):
         system = self.system
         if system.velocity_rows == 0 or not system.ideal_on_velocities:
             return super().at_solution(t, y, f, kept, args)
-        out = solved(ProjectorConstraints(y.q, None), system, t, RestoredState(y.q, y.u, f.u))
+        out = solved(projector_constraints, system, t, RestoredState(y.q, y.u, f.u))
         return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
 
     def jacobian(self, t, y, args):

@@ -15,10 +15,10 @@ from jax import lax
 from ..linalg.arrays import is_traced
 
 
-def is_moving(times: Any, saveat: diffrax.SaveAt) -> tuple[bool, bool]:
-    """Whether the start, and the end or a saved time, may have derivatives."""
-    saved = [sub.ts for sub in jax.tree.leaves(saveat.subs, is_leaf=_is_series)]
-    return is_traced(times["t0"]), is_traced((times["t1"], saved))
+def is_moving(options: dict[str, Any]) -> tuple[bool, bool]:
+    """Whether the start, and the end or a saved time, of a run with options of `diffeqsolve` may have derivatives."""
+    saved = [sub.ts for sub in jax.tree.leaves(options["saveat"].subs, is_leaf=_is_series)]
+    return is_traced(options["t0"]), is_traced((options["t1"], saved))
 
 
 def _is_series(x):

@@ -107,9 +107,9 @@ def simulate(
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate instead, one of diffrax's. The default serves `jax.grad`, `jvp`, `jacfwd`,
-        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 4096 steps (at most 128 MB),
-        and of longer runs finds those of each part again. Take forward mode (`jacfwd`) for one or two parameters,
-        reverse mode (`grad`, `jacrev`) for more.
+        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 4096 steps (at most
+        128 MB), and of longer runs finds those of each part again. Take forward mode (`jacfwd`) for one or two
+        parameters, reverse mode (`grad`, `jacrev`) for more.
     - `direction`: parameters by name with a change of each, for runs that are differentiated; see below.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run at a tenth of the
         tolerances; both together take two to two and a half times as long as one, and nothing more to compile.

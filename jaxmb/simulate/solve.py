@@ -74,7 +74,7 @@ class Problem(NamedTuple):
             moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in self.changes.items()})
             along = eqx.filter_jvp(lambda step: assembled(moved(step))[0], (0.0,), (1.0,))[1]
         options = self.options | {"y0": start}
-        moving = is_moving(options, options["saveat"])
+        moving = is_moving(options)
         return integrate(system, method, policy, term, prepared, options, self.interpolated, along, valid, moving)
 
 

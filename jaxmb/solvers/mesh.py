@@ -23,7 +23,6 @@ from .evaluation import freeze, ravel, unravel_like
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
-
 _TOO_LONG = (
     "Second derivatives need the rows of all steps, of which {} are kept; this run has more: simulate(..., "
     "adjoint=jaxmb.solvers.MeshAdjoint(most)) keeps others."
@@ -75,7 +74,8 @@ class Mesh(eqx.Module):
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms and their arguments;
     `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
-    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an `event`; its `segments`, None where there is one only.
+    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an
+    `event`; its `segments`, None where there is one only.
     """
 
     moved: Moving
@@ -147,10 +147,10 @@ class Mesh(eqx.Module):
 
     def _rows_of(self, segment: Any) -> list[Array]:
         """The rows of a segment of the run."""
-        assert self.segments is not None
+        segments: Any = self.segments
         terms, args = freeze(eqx.combine(self.moved.terms, self.still))
         is_last = (segment + 1) * self.size >= self.count
-        again = lambda: self.segments.rows(terms, args, segment, self.size)
+        again = lambda: segments.rows(terms, args, segment, self.size)
         rows = lax.cond(any_of_batch(~is_last), again, lambda: self.rows)
         return jax.tree.map(lambda new, last: jnp.where(is_last, last, new), rows, self.rows)
 
@@ -174,8 +174,8 @@ class Mesh(eqx.Module):
             k, before, saved, places, rows, dense, _ = carry
             row = self.row(rows_of_segment, k)
             step = self.linearised(row)
-            *after, ddense = step.push(dmoved, *before)
-            after = tuple(after)
+            w, memory, ddense = step.push(dmoved, *before)
+            after = w, memory
             own = self.steps.row_tangent(row.own, self.like, before, after)
             along = self.layout.packed_tangent(row, Row(None, None, own))
             rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
@@ -186,9 +186,7 @@ class Mesh(eqx.Module):
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
             return k + 1, after, saved, places, rows, dense, ddense if self.event else None
 
-        return while_loop(
-            lambda carry: carry[0] < count, body, carry, max_steps=None, buffers=_tables, kind="lax"
-        )
+        return while_loop(lambda carry: carry[0] < count, body, carry, max_steps=None, buffers=_tables, kind="lax")
 
     def pull(self, cotangents: Tangents) -> PyTree:
         """The transpose of `push`; cotangents that are None are zero."""
@@ -205,9 +203,7 @@ class Mesh(eqx.Module):
                 return segment, self._pulled(cotangents, inner, self._rows_of(segment), segment * self.size)
 
             carry = -(-self.count // self.size), carry
-            _, carry = while_loop(
-                lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax"
-            )
+            _, carry = while_loop(lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax")
         _, lw, lmemory, places, total = carry
         for series, table in zip(self.saved, cotangents.saved, strict=True):
             if series.start and table is not None:
@@ -266,7 +262,7 @@ def _saved(series: Saved, table, place, k, end, w, dense, at):
     if series.steps:
         here = (k + 1) % series.steps == 0
         table = buffer_set(table, place[0], w, here)
-        place = place + jnp.array([1, 0]) * here
+        place = place.at[0].add(here.astype(place.dtype))
     return table, place
 
 
@@ -276,7 +272,7 @@ def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
     """
     if series.steps:
         here = (k + 1) % series.steps == 0
-        place = place - jnp.array([1, 0]) * here
+        place = place.at[0].add(-here.astype(place.dtype))
         if table is not None:
             lw = lw + jnp.where(here, table[place[0]], 0.0)
     if series.times is not None:
@@ -390,9 +386,10 @@ def _recorded(terms, args, jumps, init_state, fixed, max_steps, most):
     size controller as well, and stand here for their tangents.
     """
     del jumps
-    steps, size = fixed[3], min(most, max_steps)
+    size = min(most, max_steps)
     segments = -(-max_steps // size)
-    return _run_recorded(terms, args, init_state, fixed, max_steps, size, segments if segments > 1 else None, None, -jnp.inf)
+    several = segments if segments > 1 else None
+    return _run_recorded(terms, args, init_state, fixed, max_steps, size, several, None, -jnp.inf)
 
 
 def _run_recorded(terms, args, init_state, fixed, max_steps, size, segments, last, since):
@@ -488,9 +485,9 @@ class Segments(eqx.Module):
         start = self.layout.unpacked([buffer[segment] for buffer in self.starts])
         since, (*given, made_jump, solver_state, controller_state, count) = start
         places = lambda s: (
-            (s.tprev, s.tnext, s.y, s.made_jump, s.solver_state, s.controller_state, s.num_accepted_steps)
-            + (s.save_state, s.dense_ts, s.dense_infos, s.dense_save_index, s.progress_meter_state)
-            + (s.event_tprev, s.event_tnext, s.event_dense_info, s.event_values, s.event_mask)
+            *(s.tprev, s.tnext, s.y, s.made_jump, s.solver_state, s.controller_state, s.num_accepted_steps),
+            *(s.save_state, s.dense_ts, s.dense_infos, s.dense_save_index, s.progress_meter_state),
+            *(s.event_tprev, s.event_tnext, s.event_dense_info, s.event_values, s.event_mask),
         )
         made_jump = False if made_jump is None else made_jump
         new = (*given, made_jump, solver_state, controller_state, count, *[None] * 10)
@@ -518,12 +515,13 @@ def _recorded_jvp(primals, tangents):
         Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)
     )
+    row = lambda a, b: Row(b.tprev, b.tprev, steps.row(terms, a, b))
     mesh = Mesh(
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
         rows=rows,
-        layout=Layout(eqx.filter_eval_shape(lambda a, b: Row(b.tprev, b.tprev, steps.row(terms, a, b)), init_state, final)),
+        layout=Layout(eqx.filter_eval_shape(row, init_state, final)),
         count=final.num_accepted_steps,
         saved=saved,
         like=y0,
@@ -541,7 +539,8 @@ def _segments(starts, final, init_state, fixed, max_steps):
     if starts is None:
         return None
     layout = Layout(eqx.filter_eval_shape(lambda state: _start_of(state.tprev, state, fixed[3].jumps), final))
-    return Segments(starts, layout, *freeze((init_state, fixed)), max_steps)
+    first, fixed = freeze((init_state, fixed))
+    return Segments(starts, layout, first, fixed, max_steps)
 
 
 def _of_loop(final, along: Tangents, like):

@@ -57,9 +57,7 @@ class WholeSteps(AbstractSteps):
         def step(moved, flat, memory):
             terms, args = of(moved.terms)
             before = eqx.combine(memory, state)
-            out = self.solver.step(
-                terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump
-            )
+            out = self.solver.step(terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump)
             dense, still = eqx.partition(out[2], eqx.is_inexact_array)
             return (ravel(out[0]), self._smooth(out[3]), dense), still
 

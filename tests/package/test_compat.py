@@ -1,7 +1,7 @@
 """Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
 
-import functools
 import ast
+import functools
 import importlib
 import importlib.metadata
 import multiprocessing
@@ -199,7 +199,9 @@ def test_loops_with_buffers(compat):
 
         carry = 0, -jnp.ones(5, int)
         own = lambda carry: carry[1]
-        return compat.while_loop(lambda carry: carry[0] < count, body, carry, buffers=own, max_steps=None, kind="lax")[1]
+        return compat.while_loop(lambda carry: carry[0] < count, body, carry, buffers=own, max_steps=None, kind="lax")[
+            1
+        ]
 
     np.testing.assert_array_equal(squares(4), [0, 1, -1, 9, -1])
     batch = jax.jit(jax.vmap(squares))(jnp.array([1, 4]))
@@ -222,7 +224,7 @@ def test_the_loop_of_diffrax(compat):
                     before, state = state, body_fun(state)
                     kept = state.num_accepted_steps - before.num_accepted_steps
                     seen.append((before.tnext, state.tprev, state.y[0], kept, state.num_steps))
-                    assert [x.save_index for x in compat.save_states(state)][0] <= 2
+                    assert next(x.save_index for x in compat.save_states(state)) <= 2
                 return state
 
             inner = functools.partial(compat.while_loop, kind="lax")
