@@ -162,8 +162,7 @@ def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
             values = {name: value * factor for (name, value), factor in zip(known.items(), scale, strict=True)}
             changed = with_parameters(system, values)
             start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
-            adjoint = diffrax.ForwardMode()
-            motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, adjoint=adjoint, throw=False)
+            motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, throw=False)
             return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
 
         return jax.jacfwd(positions)(jnp.ones(len(known)))

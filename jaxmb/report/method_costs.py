@@ -220,9 +220,7 @@ def _simulation(
     @eqx.filter_jit
     def compiled(system: AbstractSystem, state: State, rtol: Any) -> Trajectory:
         options: dict[str, Any] = {"solver": solver, "manifold": manifold, "formulation": formulation}
-        return simulate(
-            system, state, t1=t1, rtol=rtol, throw=False, adjoint=diffrax.ForwardMode(), max_steps=1_000_000, **options
-        )
+        return simulate(system, state, t1=t1, rtol=rtol, throw=False, max_steps=1_000_000, **options)
 
     def judge(trajectory: Trajectory) -> _Run:
         if not bool(trajectory.result == RESULTS.successful):

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +10,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-# The objective as a function of the unknowns z, given how to differentiate the simulation in them; infinite where it
-# fails.
-Objective = Callable[[Float[Array, "n"], diffrax.AbstractAdjoint | None], Float[Array, ""]]
+# The objective as a function of the unknowns z; infinite where it fails.
+Objective = Callable[[Float[Array, "n"]], Float[Array, ""]]
 
 # Damping of the first step of Levenberg–Marquardt, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
@@ -150,12 +148,9 @@ def descend(
 
 @eqx.filter_jit
 def _step(objective: Objective, optimiser: optax.GradientTransformation, z: Float[Array, "n"], memory: Any):
-    def loss(z):
-        return objective(z, None)
-
-    value, gradient = jax.value_and_grad(loss)(z)
+    value, gradient = jax.value_and_grad(objective)(z)
     finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
-    return value, finite, *next_step(optimiser, memory, z, value, gradient, loss)
+    return value, finite, *next_step(optimiser, memory, z, value, gradient, objective)
 
 
 def next_step(

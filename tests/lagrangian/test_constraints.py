@@ -2,7 +2,6 @@
 
 import functools
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -198,28 +197,28 @@ def test_the_limit_of_small_arcs_is_the_planar_four_bar():
 # Derivatives
 
 
-def chain(x, rtol, adjoint):
+def chain(x, rtol):
     system = library("tracking_chain", offset=0.1, gains=(10.0, 25.0)).system
     changed = mb.with_parameters(system, {"masses": jnp.array([1.0, 2.0, 1.5]) * jnp.exp(x[0]), "damping": 0.1 + x[1]})
-    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, max_steps=512, throw=False)
 
 
-def rough(x, rtol, adjoint):
+def rough(x, rtol):
     system = library("rough_ring").system
     changed = mb.with_parameters(system, {"friction": 0.3 + x[0], "gravity": 0.5 + x[1]})
-    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, max_steps=512, throw=False)
 
 
-def racer(x, rtol, adjoint):
+def racer(x, rtol):
     system = library("roller_racer").system
     changed = mb.with_parameters(system, {"pivot": 0.5 + x[0], "front_inertia": 0.05 + x[1]})
-    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+    return mb.simulate(changed, system.guess, t1=0.5, rtol=rtol, max_steps=512, throw=False)
 
 
-def quasi(x, rtol, adjoint):
+def quasi(x, rtol):
     mechanism = library("constant_speed_particle", form="quasi")
     changed = mb.with_parameters(mechanism.system, {"speed": 3.0 + x[0], "gravity": 9.81 + x[1]})
-    return mb.simulate(changed, mechanism.state, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False)
+    return mb.simulate(changed, mechanism.state, t1=0.5, rtol=rtol, max_steps=512, throw=False)
 
 
 ROADS = {
@@ -235,14 +234,14 @@ def test_forward_reverse_and_central_differences(road):
     run, name, parameters = ROADS[road]
     library(name, **parameters)
 
-    def loss(x, rtol, adjoint):
-        seen = jnp.concatenate([y[-1] for y in jax.tree.leaves(run(x, rtol, adjoint).ys)])
+    def loss(x, rtol):
+        seen = jnp.concatenate([y[-1] for y in jax.tree.leaves(run(x, rtol).ys)])
         return jnp.sum(seen / (1.0 + jnp.arange(seen.size, dtype=float)))
 
-    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    twice = lambda x, rtol: (loss(x, rtol),) * 2
     derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
     forward, _ = derivatives_and_value(np.zeros(2), 1e-10)
-    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-10, None)))(np.zeros(2))
+    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-10)))(np.zeros(2))
     assert np.all(np.abs(forward) > 1e-3)
     scale = np.max(np.abs(forward))
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)

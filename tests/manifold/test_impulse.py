@@ -61,13 +61,13 @@ def test_a_jump_of_a_driver_is_an_impulse(arm, options):
 
 @pytest.mark.long
 def test_derivatives_over_a_jump(arm):
-    def end(x, adjoint):
+    def end(x):
         values = {"drive.before": x[0], "drive.after": x[1]}
-        return run(arm, values, adjoint=adjoint, saveat=None, max_steps=512)["rod"].angle[-1]
+        return run(arm, values, saveat=None, max_steps=512)["rod"].angle[-1]
 
     x, h = jnp.array([BEFORE, AFTER]), 1e-4
-    forward = jax.jit(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode())))(x)
-    reverse = jax.jit(jax.grad(lambda x: end(x, None)))(x)
+    forward = jax.jit(jax.jacfwd(end))(x)
+    reverse = jax.jit(jax.grad(end))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
     oracle = lambda *x: angle_of_rod(*x)[1][0]
     before = (oracle(BEFORE + h, AFTER) - oracle(BEFORE - h, AFTER)) / (2 * h)
@@ -159,13 +159,13 @@ def test_states_at_a_jump_are_those_after_it(arm):
 
 @pytest.mark.long
 def test_derivatives_at_a_jump(arm):
-    def rate(x, adjoint):
+    def rate(x):
         values, dense = {"drive.before": x[0], "drive.after": x[1]}, diffrax.SaveAt(dense=True)
-        return run(arm, values, adjoint=adjoint, saveat=dense, max_steps=256).at(WHEN).u[5]
+        return run(arm, values, saveat=dense, max_steps=256).at(WHEN).u[5]
 
     x, h = jnp.array([BEFORE, AFTER]), 1e-4
-    forward = jax.jit(jax.jacfwd(lambda x: rate(x, diffrax.ForwardMode())))(x)
-    reverse = jax.jit(jax.grad(lambda x: rate(x, None)))(x)
+    forward = jax.jit(jax.jacfwd(rate))(x)
+    reverse = jax.jit(jax.grad(rate))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
     oracle = lambda *x: angle_of_rod(*x)[0][1]
     before = (oracle(BEFORE + h, AFTER) - oracle(BEFORE - h, AFTER)) / (2 * h)

@@ -181,8 +181,7 @@ def collision():
 
 def test_derivatives_of_the_largest_force_in_a_collision(collision):
     peak, numbers = collision
-    along = lambda numbers, rtol: peak(numbers, rtol, adjoint=diffrax.ForwardMode())
-    derivatives = jax.jit(jax.jacfwd(along))
+    derivatives = jax.jit(jax.jacfwd(peak))
     forward, exact = derivatives(numbers, 1e-10), derivatives(numbers, 1e-12)
     # Where a step crosses the kink of a draft gear depends on rounding, and so on the program: both agree as far as
     # the tolerance lets them.
@@ -346,7 +345,7 @@ def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
         return jnp.sum(sol["link16"].position[-1]) + 0.1 * sol["link16"].angular_velocity[-1]
 
     along = lambda h, rtol, **options: tip(jax.tree.map(lambda x, dx: x + h * dx, numbers, direction), rtol, **options)
-    forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: along(h, rtol, adjoint=diffrax.ForwardMode()), (h,), (1.0,)))
+    forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: along(h, rtol), (h,), (1.0,)))
     reverse = jax.jit(jax.grad(lambda h: along(h, 1e-10)))
     _, push = forward(0.0, 1e-10)
     np.testing.assert_allclose(reverse(0.0), push, rtol=1e-10)
@@ -436,20 +435,18 @@ def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
     push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=system.nu)))
     state = mb.assemble(system, push)
 
-    def end(u, manifold, adjoint):
+    def end(u, manifold):
         start = mb.manifold.project(system, 0.0, mb.State(state.q, state.u * u))
-        y = mb.simulate(system, start, t1=0.3, rtol=1e-10, manifold=manifold, adjoint=adjoint).ys
+        y = mb.simulate(system, start, t1=0.3, rtol=1e-10, manifold=manifold).ys
         return jnp.concatenate([y.q[0], y.u[0]])
 
-    forward = lambda manifold: jax.jit(
-        lambda u: jax.jvp(lambda u: end(u, manifold, diffrax.ForwardMode()), (u,), (1.0,))
-    )
+    forward = lambda manifold: jax.jit(lambda u: jax.jvp(lambda u: end(u, manifold), (u,), (1.0,)))
     expected, dexpected = forward(Partition())(1.0)
     found, dfound = forward(Projection())(1.0)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
     np.testing.assert_allclose(dfound, dexpected, rtol=0, atol=1e-6)
     weights = jnp.asarray(rng.normal(size=found.size))
-    reverse = jax.jit(jax.grad(lambda u: weights @ end(u, Projection(), None)))(1.0)
+    reverse = jax.jit(jax.grad(lambda u: weights @ end(u, Projection())))(1.0)
     np.testing.assert_allclose(reverse, weights @ dfound, rtol=1e-9)
 
 

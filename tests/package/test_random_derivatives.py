@@ -43,11 +43,11 @@ DOPRI8 = {"solver": diffrax.Dopri8(), "manifold": manifold.Projection()}
 FIXED = DOPRI8 | {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02}
 
 
-def run(system, state, rtol, adjoint, **options):
+def run(system, state, rtol, **options):
     options = {"t1": TIMES[-1], "saveat": TIMES, "max_steps": 512, "throw": False} | options
     if options.get("dt0") is not None:
         options["dt0"] = options["dt0"] * jnp.where(rtol < 1e-10, 0.5, 1.0)
-    return mb.simulate(system, state, rtol=rtol, adjoint=adjoint, **options)
+    return mb.simulate(system, state, rtol=rtol, **options)
 
 
 # Scenes of parts
@@ -82,8 +82,8 @@ def side_by_side(examples, start=mb.assemble, **options):
     system = scene_of(examples)
     machines = machines_of(system, examples)
 
-    def observe(system, extra, rtol, adjoint):
-        sol = run(system, start(system, throw=False), rtol, adjoint, **options)
+    def observe(system, extra, rtol):
+        sol = run(system, start(system, throw=False), rtol, **options)
         return {name: sol.quantity(name) for machine in machines for name in machine.outputs}
 
     return Case(system, machines, observe)
@@ -97,7 +97,7 @@ def at_one_instant(examples, formulation):
         machine.outputs += [f"{body.name}.acceleration" for body in example.bodies]
         machine.outputs += [name for name in (f"{example.part.name}.force",) if name in system.quantities()]
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         state, t = mb.assemble(system, throw=False), jnp.zeros(())
         udot, multipliers = formulations.accelerations(system.at(state), formulation, t, state.q, state.u)
         along = t[None], mb.State(state.q[None], state.u[None]), Solved(udot[None], multipliers[None])
@@ -207,9 +207,9 @@ def pendulum(seen, *, observe=None, scene=double_pendulum, **options):
     """A scene of `test_gradient_roads`, with its initial rate, and what is seen of its motion."""
     system, _, fix, rate = scene()
 
-    def outputs(system, extra, rtol, adjoint):
+    def outputs(system, extra, rtol):
         state = mb.assemble(system, fix=fix, rates={rate: extra["initial rate"]}, throw=False)
-        return (observe or watched)(run(system, state, rtol, adjoint, **options))
+        return (observe or watched)(run(system, state, rtol, **options))
 
     def watched(sol):
         return {name: sol.quantity(name) for name in seen if "." in name} | {
@@ -240,11 +240,11 @@ def jumps(**options):
     push = mb.Force("push", "rod", law, parameters={"on": 0.12, "push": 20.0})
     system = mb.with_parameters(driven_arm(push), {"drive.when": 0.05})
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         own = mb.parameters(system)
         times = jnp.stack([own["drive.when"], own["push.on"]])
         state = mb.assemble(system, rates={"rod.angle": 0.3}, throw=False)
-        sol = run(system, state, rtol, adjoint, jumps=times, t1=0.2, saveat=jnp.array([0.1, 0.2]), **options)
+        sol = run(system, state, rtol, jumps=times, t1=0.2, saveat=jnp.array([0.1, 0.2]), **options)
         return {name: sol.quantity(name) for name in seen} | {"energy": sol.energy}
 
     seen = ("rod.position", "rod.velocity", "rod.angle", "rod.angular_velocity")
@@ -287,7 +287,7 @@ def assembled(name):
     mechanism = mechanisms.get(name)
     bodies = [name for name, own in mechanism.system.quantities().items() if not own.of_forces]
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         state = mb.assemble(system, fix=mechanism.fix, rates=mechanism.rates, throw=False)
         return {name: placed(system, state)(name) for name in bodies}
 
@@ -312,11 +312,11 @@ def inputs(interpolation, **options):
     """A motor whose torque is a series, and what a sensor shows; the values of the series are parameters."""
     system, seen = measured_rod(), ("imu.specific_force", "imu.position", "imu.angular_velocity", "pin.angle")
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         state = mb.assemble(system, rates={"pin.angle": 0.3}, throw=False)
         torque = mb.Series(np.linspace(0.0, 0.3, 4), extra["torque"], interpolation)
         own = {"t1": 0.3, "saveat": np.array([0.14, 0.3]), "inputs": {"motor.force": torque}}
-        sol = run(system, state, rtol, adjoint, **options, **own)
+        sol = run(system, state, rtol, **options, **own)
         return {name: sol.quantity(name) for name in seen} | {"energy": sol.energy}
 
     always = ["torque", "rod.centre", "imu.position", "imu.angle"]
@@ -328,7 +328,7 @@ def linearised():
     """The matrices of small motions about an equilibrium, seen by a sensor."""
     system = measured_rod()
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         state = mb.equilibrium(system, throw=False)
         found = mb.linearise(
             system,
@@ -352,7 +352,7 @@ def equilibria():
     system = scene_of(examples)
     machines = machines_of(system, examples, ("position", "angle"))
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         value = placed(system, mb.equilibrium(system, throw=False))
         return {name: value(name) for machine in machines for name in machine.outputs}
 
@@ -363,9 +363,9 @@ def generalized(system, guess=None, **options):
     """A motion in generalized coordinates: coordinates, rates, energy, forces of constraints."""
     seen = list(system.quantities())
 
-    def observe(system, extra, rtol, adjoint):
+    def observe(system, extra, rtol):
         state = mb.assemble(system, guess, throw=False)
-        sol = run(system, state, rtol, adjoint, t1=0.3, saveat=np.array([0.15, 0.3]), **options)
+        sol = run(system, state, rtol, t1=0.3, saveat=np.array([0.15, 0.3]), **options)
         return {name: sol.quantity(name) for name in seen} | {"energy": sol.energy}
 
     return Case(

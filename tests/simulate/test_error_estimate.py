@@ -54,7 +54,7 @@ def test_quantities_batches_and_derivatives():
 
     # The estimate has no derivatives, and those of the motion stay as they are.
     angle = lambda u, **options: mb.simulate(
-        system, mb.State(mechanism.state.q, mechanism.state.u + u), t1=0.2, adjoint=diffrax.ForwardMode(), **options
+        system, mb.State(mechanism.state.q, mechanism.state.u + u), t1=0.2, **options
     )
     known = system.guess.u * 0
     with_estimate = jax.jvp(lambda u: angle(u, error=True, throw=False).error.motion.ys.q, (known,), (known,))

@@ -80,12 +80,12 @@ def build(road):
     if rate is not None:
         start["initial rate"] = jnp.array(0.4)
 
-    def loss(values, rtol, adjoint):
+    def loss(values, rtol):
         values = dict(values)
         rates = {} if rate is None else {rate: values.pop("initial rate")}
         changed = mb.with_parameters(system, values)
         state = mb.assemble(changed, fix=fix, rates=rates, throw=False)
-        sol = mb.simulate(changed, state, t1=0.5, rtol=rtol, adjoint=adjoint, max_steps=512, throw=False, **options)
+        sol = mb.simulate(changed, state, t1=0.5, rtol=rtol, max_steps=512, throw=False, **options)
         seen = observe(sol)
         return jnp.sum(jnp.cos(jnp.arange(seen.size, dtype=float)) * seen)
 
@@ -96,12 +96,12 @@ def build(road):
 def test_forward_reverse_and_central_differences(road):
     loss, start = build(road)
     flat, unravel = jax.flatten_util.ravel_pytree(start)
-    run = lambda x, rtol, adjoint: loss(unravel(x), rtol, adjoint)
-    twice = lambda x, rtol: (run(x, rtol, diffrax.ForwardMode()),) * 2
+    run = lambda x, rtol: loss(unravel(x), rtol)
+    twice = lambda x, rtol: (run(x, rtol),) * 2
     # One program for derivatives and, at a tighter tolerance, for differences.
     derivatives_and_value = jax.jit(jax.jacfwd(twice, has_aux=True))
     forward, _ = derivatives_and_value(flat, 1e-10)
-    reverse = jax.jit(jax.grad(lambda x: run(x, 1e-10, None)))(flat)
+    reverse = jax.jit(jax.grad(lambda x: run(x, 1e-10)))(flat)
     scale = np.max(np.abs(forward))
     assert np.all(np.abs(forward) > 1e-6 * scale)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * scale)

@@ -4,8 +4,10 @@ Every mechanism gets a driven anchor and a spring from the anchor to one of its 
 kind are there: mass, inertia, body-fixed point, stiffness, a driver's parameter, and an initial rate.
 """
 
-import diffrax
-import equinox as eqx
+import re
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +64,7 @@ CASES = {
 
 
 def build(name):
-    """A scalar of the motion as a function of parameters by name, at a given tolerance and adjoint."""
+    """A scalar of the motion as a function of parameters by name, at a given tolerance."""
     body, point, rate, names = CASES[name]
     mechanism = mb.mechanisms.get(name)
     space = planar_anchor if name == "four_bar" else spatial_anchor
@@ -75,7 +77,7 @@ def build(name):
     start = {k: v for k, v in mb.parameters(system).items() if k in [*names, "spring.stiffness", "drive.rate"]}
     whole = rate.rsplit(".", 1)[0] + ".angular_velocity"
 
-    def observe(parameters, rtol, adjoint):
+    def observe(parameters, rtol):
         parameters = dict(parameters)
         spin = parameters.pop("initial rate")
         own = dict(rates)
@@ -86,7 +88,7 @@ def build(name):
             own[rate] = jnp.asarray(own[rate], float) + spin
         changed = mb.with_parameters(system, parameters)
         state = mb.assemble(changed, fix=mechanism.fix, rates=own, throw=False)
-        sol = mb.simulate(changed, state, t1=TIME, rtol=rtol, adjoint=adjoint, max_steps=1024, throw=False)
+        sol = mb.simulate(changed, state, t1=TIME, rtol=rtol, max_steps=1024, throw=False)
         weights = jnp.cos(jnp.arange(system.nq + system.nu, dtype=float))
         return jnp.sum(weights * jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]))
 
@@ -97,15 +99,13 @@ def build(name):
 def test_forward_reverse_and_central_differences(name):
     observe, start = build(name)
     flat, unravel = jax.flatten_util.ravel_pytree(start)
-    loss = lambda x, rtol, adjoint: observe(unravel(x), rtol, adjoint)
+    loss = lambda x, rtol: observe(unravel(x), rtol)
     # One program, of the derivative in one direction: at a tighter tolerance it also gives the values for differences,
     # of which there are several for each parameter.
-    value_and_derivative = jax.jit(
-        lambda x, along, rtol: jax.jvp(lambda x: loss(x, rtol, diffrax.ForwardMode()), (x,), (along,))
-    )
+    value_and_derivative = jax.jit(lambda x, along, rtol: jax.jvp(lambda x: loss(x, rtol), (x,), (along,)))
     directions = np.eye(flat.size)
     forward = np.array([value_and_derivative(flat, along, 1e-9)[1] for along in directions])
-    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-9, None)))(flat)
+    reverse = jax.jit(jax.grad(lambda x: loss(x, 1e-9)))(flat)
     scale = np.max(np.abs(forward))
     # Not zeros, but for the few that symmetry makes so.
     assert np.all(np.isfinite(forward)) and np.mean(np.abs(forward) > 1e-8 * scale) > 0.5
@@ -121,7 +121,7 @@ def test_forward_reverse_and_central_differences(name):
 def test_gradients_in_a_batch():
     observe, start = build("four_bar")
     flat, unravel = jax.flatten_util.ravel_pytree(start)
-    loss = lambda x, rtol: observe(unravel(x), rtol, None)
+    loss = lambda x, rtol: observe(unravel(x), rtol)
     values_and_gradients = jax.jit(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None)))
     direction = np.cos(np.arange(flat.size)) * np.abs(flat)
     steps = 1e-4 * np.array([0.0, 1.0, -1.0, 2.0, -2.0])
@@ -136,13 +136,17 @@ def test_gradients_in_a_batch():
     np.testing.assert_allclose(slope[0], central, rtol=1e-6)
 
 
-def test_forward_mode_asks_for_its_adjoint():
-    mechanism = mb.mechanisms.four_bar()
-
-    def end(scale):
-        state = eqx.tree_at(lambda state: state.u, mechanism.state, scale * mechanism.state.u)
-        return mb.simulate(mechanism.system, state, t1=0.01).ys.q[-1]
-
-    for forward in (jax.jacfwd(end), lambda scale: jax.linearize(end, scale)[1](1.0)):
-        with pytest.raises(TypeError, match=r"^The default adjoint serves reverse mode only: for jvp, jacfwd and"):
-            forward(1.0)
+def test_the_example_of_the_readme_without_an_option():
+    """First and second derivatives of its loss, and differences of it."""
+    code = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    scope: dict[str, Any] = {}
+    exec(code.group(1).rsplit("print(", 1)[0], scope)
+    angle, mass, h = scope["angle"], 1.0, 1e-3
+    first, along, second = jax.grad(angle)(mass), jax.jacfwd(angle)(mass), jax.hessian(angle)(mass)
+    np.testing.assert_allclose(along, first, rtol=1e-11)
+    low2, low, high, high2 = (angle(mass + k * h) for k in (-2, -1, 1, 2))
+    np.testing.assert_allclose(first, (8 * (high - low) - (high2 - low2)) / (12 * h), rtol=1e-6)
+    slopes = [jax.grad(angle)(mass + k * h) for k in (-2, -1, 1, 2)]
+    central = (8 * (slopes[2] - slopes[1]) - (slopes[3] - slopes[0])) / (12 * h)
+    np.testing.assert_allclose(second, central, rtol=1e-5)

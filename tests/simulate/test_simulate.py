@@ -263,18 +263,18 @@ def test_derivatives_with_baumgarte():
     pendulum = mb.mechanisms.get("pendulum")
     start = jnp.array([9.81, 0.3])
 
-    def end(x, rtol, adjoint):
+    def end(x, rtol):
         gravity = {"gravity.acceleration": jnp.stack([jnp.zeros(()), -x[0]])}
         system = mb.with_parameters(pendulum.system, gravity)
         state = mb.State(pendulum.state.q, pendulum.state.u.at[1].add(x[1]))
-        options = {"manifold": mb.manifold.Baumgarte(5.0), "adjoint": adjoint, "max_steps": 512}
+        options = {"manifold": mb.manifold.Baumgarte(5.0), "max_steps": 512}
         return jnp.sum(mb.simulate(system, state, t1=0.5, rtol=rtol, **options).ys.q[-1, :2])
 
     batch = lambda f: jax.jit(jax.vmap(f, in_axes=(0, None)))
-    twice = lambda x, rtol: (end(x, rtol, diffrax.ForwardMode()),) * 2
+    twice = lambda x, rtol: (end(x, rtol),) * 2
     forward_and_value = batch(jax.jacfwd(twice, has_aux=True))
     forward = forward_and_value(start[None], 1e-9)[0][0]
-    reverse = batch(jax.grad(lambda x, rtol: end(x, rtol, None)))(start[None], 1e-9)[0]
+    reverse = batch(jax.grad(end))(start[None], 1e-9)[0]
     assert np.all(np.abs(forward) > 1e-3)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
     h = 1e-4
@@ -291,17 +291,17 @@ def test_derivatives_of_violations_with_baumgarte():
     scene = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
     state = mb.assemble(scene)
 
-    def violations(p, adjoint):
+    def violations(p):
         system = mb.with_parameters(scene, {"pin.point_a": p})
-        options = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(rate), "adjoint": adjoint}
+        options = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(rate)}
         y = mb.simulate(system, state, t1=t1, rtol=1e-11, throw=False, **options).ys
         q, u = y.q[-1], y.u[-1]
         return jnp.concatenate([system.position_residual(t1, q), system.velocity_residual(t1, q, u)])
 
     off = jnp.array([0.01, 0.02])
-    reverse = jax.jit(jax.vmap(jax.jacrev(lambda p: violations(p, None))))(off[None])[0]
-    forward = jax.jit(jax.jacfwd(lambda p: violations(p, diffrax.ForwardMode())))(off)
-    value = violations(off, None)
+    reverse = jax.jit(jax.vmap(jax.jacrev(violations)))(off[None])[0]
+    forward = jax.jit(jax.jacfwd(violations))(off)
+    value = violations(off)
     decay = np.exp(-rate * t1)
     sign = np.sign(value[0] / off[0])
     expected = sign * np.concatenate([(1 + rate * t1) * decay * np.eye(2), -(rate**2) * t1 * decay * np.eye(2)])

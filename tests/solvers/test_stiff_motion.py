@@ -37,7 +37,6 @@ def bushing():
             rtol=rtol,
             atol=atol,
             solver=Hermite(),
-            adjoint=diffrax.ForwardMode(),
             max_steps=30000,
             throw=False,
         )
@@ -199,19 +198,17 @@ def test_forward_reverse_and_central_differences(name):
     start = mb.parameters(mechanism.system)
     weights = jnp.cos(jnp.arange(mechanism.system.nq + mechanism.system.nu).astype(float))
 
-    def loss(x, rtol, adjoint):
+    def loss(x, rtol):
         changed = {part: start[part] * jnp.exp(x[0]) for part in stiffnesses}
         changed |= {part: start[part] * jnp.exp(x[1]) for part in dampings}
         system = mb.with_parameters(mechanism.system, changed)
-        end = mb.simulate(
-            system, mechanism.state, t1=t1, rtol=rtol, solver=Hermite(), adjoint=adjoint, max_steps=4096
-        ).ys
+        end = mb.simulate(system, mechanism.state, t1=t1, rtol=rtol, solver=Hermite(), max_steps=4096).ys
         return weights @ jnp.concatenate([end.q[-1], end.u[-1]])
 
     # One program for derivatives and, at a tighter tolerance, for differences; in a batch, as the other one is.
-    twice = lambda x, rtol: (loss(x, rtol, diffrax.ForwardMode()),) * 2
+    twice = lambda x, rtol: (loss(x, rtol),) * 2
     derivatives_and_value = jax.jit(jax.vmap(jax.jacfwd(twice, has_aux=True), in_axes=(0, None)))
-    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(x, rtol, None))))
+    reverse = jax.jit(jax.vmap(jax.grad(lambda x: loss(x, rtol))))
     forward = lambda x: derivatives_and_value(x, rtol)[0]
     softer = np.array([[np.log(1e-2), 0.0]])
     np.testing.assert_allclose(reverse(softer), forward(softer), rtol=1e-8)

@@ -32,12 +32,12 @@ def at_rest(offset):
 def test_a_fast_mode_at_rest(solver):
     system = two_masses()
 
-    def end(offset, rtol, adjoint=None):
-        sol = mb.simulate(system, at_rest(offset), t1=END, rtol=rtol, solver=SOLVERS[solver], adjoint=adjoint)
+    def end(offset, rtol):
+        sol = mb.simulate(system, at_rest(offset), t1=END, rtol=rtol, solver=SOLVERS[solver])
         return sol.ys.q[-1, 1]
 
     reverse = jax.jit(jax.grad(end))
-    forward = jax.jit(lambda x, rtol: jax.jvp(lambda x: end(x, rtol, diffrax.ForwardMode()), (x,), (1.0,))[1])
+    forward = jax.jit(lambda x, rtol: jax.jvp(lambda x: end(x, rtol), (x,), (1.0,))[1])
     for rtol, error in ((1e-6, 1e-2), (1e-8, 2e-4), (1e-10, 2e-6)):
         assert abs(reverse(0.0, rtol) - np.cos(RATE * END)) < error
         np.testing.assert_allclose(forward(0.0, rtol), reverse(0.0, rtol), rtol=0, atol=1e-9)
@@ -88,7 +88,6 @@ def test_second_derivatives():
             at_rest(jnp.array(0.1)),
             t1=0.3,
             rtol=1e-10,
-            adjoint=diffrax.ForwardMode(),
         )
         return sol.ys.q[-1, 1]
 

@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +39,7 @@ class Machine:
 class Case:
     """A system, and how its outputs by name follow from values of its parameters.
 
-    `observe(system, extra, rtol, adjoint)` returns the outputs; `extra` has the numbers that are no parameters of the
+    `observe(system, extra, rtol)` returns the outputs; `extra` has the numbers that are no parameters of the
     system, such as an initial rate, under their names.
     """
 
@@ -94,32 +93,32 @@ def programs(case: Case, seed: int) -> Programs:
         own = [str(name) for name in [*machine.always, *drawn] if name in free]
         names.append(own[: case.parameters])
 
-    def observe(changes, rtol, adjoint):
+    def observe(changes, rtol):
         values = {
             name: known[name] + changes[i, k] * directions[name]
             for i, own in enumerate(names)
             for k, name in enumerate(own)
         }
         extra = {name: values.pop(name, known[name]) for name in case.extra}
-        return case.observe(mb.with_parameters(case.system, values), extra, rtol, adjoint)
+        return case.observe(mb.with_parameters(case.system, values), extra, rtol)
 
     still = jnp.zeros((len(names), case.parameters))
-    shapes = jax.eval_shape(lambda x: observe(x, case.rtol, diffrax.ForwardMode()), still)
+    shapes = jax.eval_shape(lambda x: observe(x, case.rtol), still)
     # Single numbers of the outputs, drawn without repetition.
     chosen = []
     for machine in case.machines:
         entries = [(name, k) for name in machine.outputs for k in range(shapes[name].size)]
         chosen.append([entries[k] for k in rng.permutation(len(entries))[: case.outputs]])
 
-    def vector(changes, rtol, adjoint):
-        outputs = observe(changes, rtol, adjoint)
+    def vector(changes, rtol):
+        outputs = observe(changes, rtol)
         return jnp.stack([jnp.stack([outputs[name].ravel()[k] for name, k in own]) for own in chosen])
 
     return Programs(
         names,
         [[f"{name}{list(map(int, np.unravel_index(k, shapes[name].shape)))}" for name, k in own] for own in chosen],
-        jit_quickly(lambda x, along, rtol: jax.jvp(lambda x: vector(x, rtol, diffrax.ForwardMode()), (x,), (along,))),
-        jit_quickly(lambda x, weight, rtol: jax.vjp(lambda x: vector(x, rtol, None), x)[1](weight)[0]),
+        jit_quickly(lambda x, along, rtol: jax.jvp(lambda x: vector(x, rtol), (x,), (along,))),
+        jit_quickly(lambda x, weight, rtol: jax.vjp(lambda x: vector(x, rtol), x)[1](weight)[0]),
     )
 
 

@@ -87,9 +87,7 @@ def test_a_lagrangian_system_has_design_variables():
     rod = mb.design(
         swing, {"length": mb.Variable(0.8, (0.1, 2.0))}, lambda v: {"arm": v["length"], "inertia": v["length"] ** 2}
     )
-    period = lambda x: mb.simulate(
-        mb.with_parameters(rod, {"length": x}), rod.guess, t1=0.3, adjoint=diffrax.ForwardMode()
-    ).ys.q[-1, 0]
+    period = lambda x: mb.simulate(mb.with_parameters(rod, {"length": x}), rod.guess, t1=0.3).ys.q[-1, 0]
     by_hand = mb.with_parameters(swing, {"arm": 0.9, "inertia": 0.81})
     np.testing.assert_allclose(period(0.9), mb.simulate(by_hand, rod.guess, t1=0.3).ys.q[-1, 0], rtol=1e-12)
     assert "length" in str(rod)
@@ -152,13 +150,13 @@ def test_bad_designs_are_named(message, bad, plain, machine):
 def test_derivatives_through_design_assembly_and_motion(machine, plain):
     """The rocker's angle after a motion, by the length of the coupler: both modes, and differences of a tighter run."""
 
-    def angle(rod, adjoint=None, rtol=1e-8):
+    def angle(rod, rtol=1e-8):
         new = mb.with_parameters(machine, {"rod": rod})
         start = mb.assemble(new, plain.state, fix=plain.fix, rates=plain.rates)
-        motion = mb.simulate(new, start, t1=0.2, rtol=rtol, adjoint=adjoint, solver=diffrax.Tsit5())
+        motion = mb.simulate(new, start, t1=0.2, rtol=rtol, solver=diffrax.Tsit5())
         return motion["rocker"].angle[-1]
 
-    forward = jax.jit(jax.jacfwd(lambda rod: angle(rod, diffrax.ForwardMode())))(3.0)
+    forward = jax.jit(jax.jacfwd(angle))(3.0)
     reverse = jax.jit(jax.grad(angle))(3.0)
     tight, h = jax.jit(lambda rod: angle(rod, rtol=1e-11)), 1e-4
     central = (8 * (tight(3 + h) - tight(3 - h)) - (tight(3 + 2 * h) - tight(3 - 2 * h))) / (12 * h)
@@ -173,13 +171,13 @@ def test_derivatives_by_a_length_of_a_redundant_loop():
     ends = lambda v: {"B.point_b": -v["rod"] * jnp.eye(3)[0] / 2, "C.point_a": v["rod"] * jnp.eye(3)[0] / 2}
     machine = mb.design(loop.system, {"rod": mb.Variable(3.0, unit="m")}, ends)
 
-    def place(rod, adjoint=None, rtol=1e-8):
+    def place(rod, rtol=1e-8):
         new = mb.with_parameters(machine, {"rod": rod})
         start = mb.assemble(new, loop.state, fix={"A.angle": 0.0}, rates=loop.rates)
-        motion = mb.simulate(new, start, t1=0.2, rtol=rtol, adjoint=adjoint)
+        motion = mb.simulate(new, start, t1=0.2, rtol=rtol)
         return jnp.sum(motion["rocker"].position[-1] * jnp.array([1.0, 0.5, 0.0]))
 
-    forward = jax.jit(jax.jacfwd(lambda rod: place(rod, diffrax.ForwardMode())))(3.0)
+    forward = jax.jit(jax.jacfwd(place))(3.0)
     reverse = jax.jit(jax.grad(place))(3.0)
     tight, h = jax.jit(lambda rod: place(rod, rtol=1e-12)), 1e-3
     central = (8 * (tight(3 + h) - tight(3 - h)) - (tight(3 + 2 * h) - tight(3 - 2 * h))) / (12 * h)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -126,13 +125,10 @@ class ExperimentModel(eqx.Module):
         state: State,
         ts: Float[Array, "saved"],
         options: Mapping[str, Any],
-        adjoint: diffrax.AbstractAdjoint | None,
     ) -> Trajectory:
         """The motion from an initial state."""
         own = {} if self.inputs is None else {"inputs": self.inputs}
-        return simulate(
-            system, state, t0=self.t0, t1=ts[-1], saveat=ts, adjoint=adjoint, throw=False, **(dict(options) | own)
-        )
+        return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | own))
 
     def seen(
         self,
@@ -140,7 +136,6 @@ class ExperimentModel(eqx.Module):
         state: State,
         theta: Mapping[str, Array],
         options: Mapping[str, Any],
-        adjoint: diffrax.AbstractAdjoint | None,
     ) -> Seen:
         """What the sensors show of the motion from an initial state."""
         late = [channel for channel in self.channels if channel.delayed]
@@ -148,7 +143,7 @@ class ExperimentModel(eqx.Module):
         saved = jnp.concatenate(series) if late else self.ts
         # Sensors with a delay see the motion at other times: all of them are saved in order.
         order = jnp.argsort(saved) if late else np.arange(saved.size)
-        trajectory = self.simulated(system, state, saved[order] if late else saved, options, adjoint)
+        trajectory = self.simulated(system, state, saved[order] if late else saved, options)
         places = jnp.argsort(order).reshape(len(series), -1) if late else np.arange(saved.size)[None]
         readings, rows = {}, []
         for channel in self.channels:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -123,17 +123,14 @@ class Identification:
         """
         return predict(self.fit, quantities, ts=ts, experiment=experiment, level=level)
 
-    def logdensity(self, mode: Literal["forward", "reverse"] = "forward") -> LogDensity:
+    def logdensity(self) -> LogDensity:
         """The posterior density as a function of an unconstrained vector, for samplers.
 
         With a robust loss the likelihood is the exponential of minus that loss, of noise with long tails.
 
-        **Arguments:** `mode`: `"forward"`: gradients by forward-mode derivatives of the simulation, offered to
-        `jax.grad` as a custom rule, which is faster up to some dozens of unknowns; `"reverse"`: by reverse mode.
-
         **Raises:** `ValueError` if the noise level of a sensor is neither known nor free, and after multiple shooting.
         """
-        return logdensity(self.fit, mode)
+        return logdensity(self.fit)
 
     def report(self, path: str | Path, *, profiles: Sequence[str] = ()) -> Path:
         """Write one HTML page: the verdict, the table, each sensor's fit and residuals, correlations and profiles.

@@ -160,7 +160,7 @@ def identify(
     if isinstance(method, str):
         solutions = _least_squares(problem, points, tol, limit)
     else:
-        objective = lambda z, adjoint: problem.objective(z, adjoint) / model.data
+        objective = lambda z: problem.objective(z) / model.data
         solutions = [descend(method, objective, z, tol, limit) for z in points]
     solutions = sorted(solutions, key=lambda solution: np.inf if np.isnan(solution.value) else solution.value)
     best = solutions[0]

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -79,7 +78,7 @@ def predict(
 def _predicted(system, trial, options, names, ts, flat) -> Any:
     def fn(flat):
         changed, state = trial.start(system, trial.named(flat))
-        trajectory = trial.simulated(changed, state, ts, options, diffrax.ForwardMode())
+        trajectory = trial.simulated(changed, state, ts, options)
         values = {name: trajectory.quantity(name) for name in names}
         return values, values
 
@@ -120,4 +119,4 @@ def held_out(fit: Fit) -> dict[str, HeldOut]:
 
 @eqx.filter_jit
 def _seen(system, trial, options, theta):
-    return trial.seen(*trial.start(system, theta), theta, options, diffrax.ForwardMode())
+    return trial.seen(*trial.start(system, theta), theta, options)

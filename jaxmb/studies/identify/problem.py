@@ -4,7 +4,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -51,16 +50,14 @@ class Problem(eqx.Module):
         """The system of one experiment and its initial state."""
         return self.trials[number].start(self.system, self.own(number, self.free(z)))
 
-    def objective(self, z: Float[Array, "n"], adjoint: diffrax.AbstractAdjoint | None) -> Float[Array, ""]:
+    def objective(self, z: Float[Array, "n"]) -> Float[Array, ""]:
         """Minus the logarithm of likelihood and priors, up to a constant; infinite where a simulation fails."""
         values = self.free(z)
         total = 0.5 * jnp.sum(self.priors(values) ** 2).astype(z.dtype)
         for number, trial in enumerate(self.trials):
             if self.fitted[number]:
                 theta = self.own(number, values)
-                total = (
-                    total + trial.seen(*trial.start(self.system, theta), theta, self.options, adjoint).rows.objective
-                )
+                total = total + trial.seen(*trial.start(self.system, theta), theta, self.options).rows.objective
         return total
 
     def columns(self, number: int) -> np.ndarray:
@@ -133,7 +130,7 @@ def _linearised_batch(system, trial, options, flats):
 def _with_jacobian(system, trial, options, flat):
     def fn(flat):
         theta = trial.named(flat)
-        seen = trial.seen(*trial.start(system, theta), theta, options, diffrax.ForwardMode())
+        seen = trial.seen(*trial.start(system, theta), theta, options)
         return (seen.rows.residuals, seen.rows.scores), seen
 
     if flat.size == 0:

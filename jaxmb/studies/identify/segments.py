@@ -3,7 +3,6 @@
 import functools
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -256,7 +255,7 @@ def _linearised_lanes(system, trials, static, options, flat, states, tangents):
             theta = trial.named(flat)
             changed = trial.changed_system(system, theta)
             start = _near(changed, trial.t0, state, along, w)
-            seen = trial.seen(changed, start, theta, options, diffrax.ForwardMode())
+            seen = trial.seen(changed, start, theta, options)
             vector = lambda y: jnp.concatenate([y.q, y.u])
             out = seen.rows.residuals, seen.rows.scores, vector(start), vector(seen.end)
             return out, (seen, out)

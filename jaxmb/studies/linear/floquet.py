@@ -145,9 +145,7 @@ def _flow(system, state, basis, t, period, rtol, solver):
 
     def run(z):
         start = State(state.q + basis[:nq] @ z, state.u + basis[nq:] @ z)
-        motion = simulate(
-            system, start, t0=t, t1=t + period, rtol=rtol, solver=solver, adjoint=diffrax.ForwardMode(), throw=False
-        )
+        motion = simulate(system, start, t0=t, t1=t + period, rtol=rtol, solver=solver, throw=False)
         end = jnp.concatenate([motion.ys.q[-1], motion.ys.u[-1]])
         return end, end
 

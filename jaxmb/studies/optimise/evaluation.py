@@ -1,11 +1,9 @@
 """Objective and constraints of a design with their derivatives, from one compiled program."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,20 +25,18 @@ OBJECTIVE = "objective"
 class Program(eqx.Module):
     """Some outputs of a function of named parameters, as rows of one vector of the components of the parameters.
 
-    **Fields:** `function(values)` or `function(values, adjoint=…)`; `space`: named values of a vector; `names` of the
-    outputs that are rows; `forward`: in which mode to differentiate; `takes_adjoint`: whether the function does.
+    **Fields:** `function(values)`; `space`: named values of a vector; `names` of the outputs that are rows; `forward`:
+    in which mode to differentiate.
     """
 
     function: Callable[..., Any]
     space: Space | FreeParameters
     names: tuple[str, ...] = eqx.field(static=True)
     forward: bool = eqx.field(static=True)
-    takes_adjoint: bool = eqx.field(static=True)
 
     def outputs(self, z: Float[Array, "n"]) -> dict[str, Array]:
         """All outputs by name."""
-        options = {"adjoint": diffrax.ForwardMode() if self.forward else None} if self.takes_adjoint else {}
-        out = self.function(self.space(z), **options)
+        out = self.function(self.space(z))
         return {
             name: jnp.asarray(x, z.dtype) for name, x in (out if isinstance(out, Mapping) else {OBJECTIVE: out}).items()
         }
@@ -94,26 +90,12 @@ class Limits:
         return np.maximum(np.maximum(self.low - values, values - self.high), 0.0)
 
 
-def takes_adjoint(function: Callable[..., Any]) -> bool:
-    """Whether a function has an argument `adjoint`, to be handed on to `simulate`."""
-    try:
-        return "adjoint" in inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        return False
-
-
 def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
     """The shapes of all outputs.
 
     **Raises:** `ValueError` for outputs that are no real numbers.
     """
-    start = jnp.zeros(program.space.size)
-
-    def outputs(z):
-        options = {"adjoint": None} if program.takes_adjoint else {}
-        return program.function(program.space(z), **options)
-
-    found = eqx.filter_eval_shape(outputs, start)
+    found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
     found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
     shapes = {}
     for name, own in found.items():
@@ -185,7 +167,7 @@ def with_derivatives(program: Program, derivatives: Literal["auto", "forward", "
     modes = (cheaper, not cheaper) if derivatives == "auto" else (derivatives == "forward",)
     first: Exception | None = None
     for forward in modes:
-        trial = Program(program.function, program.space, program.names, forward, program.takes_adjoint)
+        trial = Program(program.function, program.space, program.names, forward)
         try:
             eqx.filter_eval_shape(trial.linearised, jnp.zeros(program.space.size))
         except (TypeError, ValueError) as error:
@@ -194,6 +176,6 @@ def with_derivatives(program: Program, derivatives: Literal["auto", "forward", "
         return trial
     which = "in either mode" if len(modes) == 2 else f"in {derivatives} mode"
     raise ValueError(
-        f"The function has no derivatives {which}. If it simulates, let it take `adjoint=None` and hand that on: "
-        "simulate(..., adjoint=adjoint)."
+        f"The function has no derivatives {which}. One with a jax.custom_vjp has none in forward mode, one with a loop "
+        "such as jax.lax.while_loop none in reverse mode, and a simulation with an adjoint those of that adjoint only."
     ) from first

@@ -22,7 +22,6 @@ from .evaluation import (
     limits,
     output_shapes,
     rows_of_batch,
-    takes_adjoint,
     with_derivatives,
 )
 from .space import Space, space
@@ -159,9 +158,9 @@ def optimise(
     """Find the values of named parameters that make an objective smallest, with constraints on named outputs.
 
     ```python
-    def drive(v, adjoint=None):
+    def drive(v):
         s = mb.with_parameters(vehicle, v)
-        motion = mb.simulate(s, start(s), t1=1.5, saveat=ts, adjoint=adjoint, throw=False)
+        motion = mb.simulate(s, start(s), t1=1.5, saveat=ts, throw=False)
         return {"comfort": ride.vertical_rms(motion), "travel": jnp.abs(ride.arm_travel(motion)).max(axis=0)}
 
     limits = {"travel": (None, 0.3)}
@@ -171,9 +170,8 @@ def optimise(
     **Arguments:**
 
     - `function(values)`: outputs by name, numbers or arrays, from parameters by name; or a number, which is the
-        objective. It is made of JAX functions and compiled once. One that simulates should take `adjoint=None` and hand
-        it on to `simulate`: without it there is reverse mode only. `simulate` and `assemble` need `throw=False`, so
-        that a trial that fails is NaN.
+        objective. It is made of JAX functions and compiled once. `simulate` and `assemble` need `throw=False`, so that
+        a trial that fails is NaN.
     - `start`: starting values by name, or names alone of parameters of `system`.
     - `objective`: the output to make small, a number; may be left out if there is but one without a constraint.
     - `constraints`: outputs by name with their bounds `(low, high)`, either of them None, or with the number that they
@@ -207,15 +205,12 @@ def optimise(
     number, a function without derivatives, and a start that fails if no constraint leads away from it.
     """
     where = space(start, bounds, system)
-    trial_program = Program(function, where, (), False, takes_adjoint(function))
-    shapes = output_shapes(trial_program)
+    shapes = output_shapes(Program(function, where, (), False))
     objective = chosen_objective(objective, shapes, constraints)
     limited = limits(constraints, shapes)
     _check(method, limited, starts, local, max_iterations, tol)
     names = (objective, *limited.names)
-    program = with_derivatives(
-        Program(function, where, names, False, trial_program.takes_adjoint), derivatives, 1 + len(limited.components)
-    )
+    program = with_derivatives(Program(function, where, names, False), derivatives, 1 + len(limited.components))
     box = where.box
     first = evaluate(program, np.zeros(where.size))
     before, spent = first, 0
@@ -300,7 +295,7 @@ def _run(program: Program, limited: Limits, box: Any, z: np.ndarray, method: Any
         return trials, begin, *(slsqp if method == "slsqp" else trust_constr)(trials, begin, tol, limit)
     linear: Any = program.space
     here = dataclasses.replace(linear, start=linear.start + linear.scale * jnp.asarray(z))
-    free = Program(program.function, here.unbounded(), program.names, program.forward, program.takes_adjoint)
+    free = Program(program.function, here.unbounded(), program.names, program.forward)
     begin = evaluate(free, np.zeros(here.size))
     trials = Trials(free, limited, (np.full(here.size, -np.inf), np.full(here.size, np.inf)), begin)
     ended = bfgs(trials, begin, tol, limit) if method == "bfgs" else first_order(method, trials, begin, tol, limit)
@@ -355,7 +350,7 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
         limited.low[own],
         limited.high[own],
     )
-    part = Program(program.function, program.space, tuple(finite), program.forward, program.takes_adjoint)
+    part = Program(program.function, program.space, tuple(finite), program.forward)
     start = evaluate(part, first.z)
     if not start.good or not kept.excess(start.rows).any():
         raise ValueError(f"{what}, and no constraint that is violated leads away from it. {cure}")

@@ -277,11 +277,9 @@ def test_comfort_of_a_tracked_vehicle():
     )
     ts = jnp.linspace(0.0, 1.2, 61)
 
-    def drive(v, adjoint=None):
+    def drive(v):
         s = mb.with_parameters(vehicle, v)
-        motion = mb.simulate(
-            s, m.start(s, m.state), t1=1.2, saveat=ts, rtol=1e-7, adjoint=adjoint, throw=False, max_steps=4000
-        )
+        motion = mb.simulate(s, m.start(s, m.state), t1=1.2, saveat=ts, rtol=1e-7, throw=False, max_steps=4000)
         travel = jnp.abs(ride.arm_travel(motion))
         return {"comfort": ride.vertical_rms(motion), "travel": jax.nn.logsumexp(200.0 * travel) / 200.0}
 

@@ -73,7 +73,7 @@ def test_equations_and_bounds_of_components():
 
 def test_both_modes_of_derivatives_agree():
     forward, reverse = (
-        with_derivatives(Program(valley, in_z, ("f", "x"), True, False), mode, 3).linearised(jnp.ones(2))
+        with_derivatives(Program(valley, in_z, ("f", "x"), True), mode, 3).linearised(jnp.ones(2))
         for in_z, mode in ((Plain(), "forward"), (Plain(), "reverse"))
     )
     for a, b in zip(forward, reverse, strict=True):
@@ -88,23 +88,34 @@ class Plain:
 
 
 def test_the_mode_is_the_one_that_the_function_allows():
-    """A simulation with the default adjoint has reverse mode only; one that takes `adjoint` has both."""
+    """A simulation has both; a function with a rule of its own for reverse mode, and one with a loop, have one."""
     m = mb.mechanisms.get("pendulum")
 
-    def angle(v, adjoint=None):
+    def speed(v, **options):
         new = mb.with_parameters(m.system, v)
-        motion = mb.simulate(
-            new, m.state, t1=0.1, saveat=[0.05, 0.1], solver=diffrax.Tsit5(), adjoint=adjoint, throw=False
-        )
+        motion = mb.simulate(new, m.state, t1=0.1, saveat=[0.05, 0.1], solver=diffrax.Tsit5(), throw=False, **options)
         return jnp.sum(motion.ys.u[-1] ** 2)
 
     start = {"gravity.acceleration": [0.0, -9.81]}
     bounds = {"gravity.acceleration": ([-0.1, -20.0], [0.1, -1.0])}
-    with pytest.raises(ValueError, match=r"no derivatives in forward mode.*adjoint=adjoint"):
-        mb.optimise(lambda v: angle(v), start, bounds=bounds, derivatives="forward")
-    best = [mb.optimise(f, start, bounds=bounds, max_iterations=3) for f in (angle, lambda v: angle(v))]
+    best = [
+        mb.optimise(speed, start, bounds=bounds, max_iterations=3, derivatives=mode) for mode in ("forward", "reverse")
+    ]
     assert [b.derivatives for b in best] == ["forward", "reverse"]
     np.testing.assert_allclose(best[0].objective, best[1].objective, rtol=1e-6)
+    in_reverse = lambda v: speed(v, adjoint=diffrax.RecursiveCheckpointAdjoint())
+    for function, missing, other in (
+        (in_reverse, "forward", "reverse"),
+        (lambda v: by_a_loop(v["gravity.acceleration"]), "reverse", "forward"),
+    ):
+        with pytest.raises(ValueError, match=f"no derivatives in {missing} mode.*custom_vjp.*loop.*adjoint"):
+            mb.optimise(function, start, bounds=bounds, derivatives=missing)
+        assert mb.optimise(function, start, bounds=bounds, max_iterations=2).derivatives == other
+
+
+def by_a_loop(x):
+    """A half of the sum of squares, of a loop that is not bounded."""
+    return jax.lax.while_loop(lambda y: y[0] < 1.0, lambda y: (2 * y[0], y[1] / 2), (0.5, jnp.sum(x**2)))[1]
 
 
 def edge(v):
