@@ -75,7 +75,7 @@ class Mesh(eqx.Module):
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms and their arguments;
     `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
-    `memory` of the solver at the start; whether the output is `dense`; whether the run ends at an
+    `memory` of the solver at the start; `dense`: of how many steps dense output is kept; whether the run ends at an
     `event`; its `segments`, None where there is one only.
     """
 
@@ -88,7 +88,7 @@ class Mesh(eqx.Module):
     saved: tuple[Saved, ...]
     like: PyTree
     memory: PyTree
-    dense: bool = eqx.field(static=True)
+    dense: int = eqx.field(static=True)
     event: bool = eqx.field(static=True)
     segments: "Segments | None"
 
@@ -106,7 +106,7 @@ class Mesh(eqx.Module):
     def blank(self) -> Tangents:
         """Zeros."""
         n, memory, step = ravel(self.like), self.memory, self._shapes()
-        table = lambda x: jnp.zeros((self.size, *x.shape), x.dtype)
+        table = lambda x: jnp.zeros((self.dense, *x.shape), x.dtype)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step)
         return Tangents(
             (jnp.zeros_like(n), jax.tree.map(jnp.zeros_like, memory)),
@@ -287,8 +287,8 @@ def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
             ldense, place = carry
             place = place - 1
             if table is not None:
-                (more,) = jax.linear_transpose(lambda x: at(x, times[place[1]]), ldense)(table[place[0]])
-                ldense = jax.tree.map(jnp.add, ldense, more)
+                (own,) = jax.linear_transpose(lambda x: at(x, times[place[1]]), ldense)(table[place[0]])
+                ldense = jax.tree.map(jnp.add, ldense, own)
             return ldense, place
 
         carry = ldense, place
@@ -527,7 +527,7 @@ def _recorded_jvp(primals, tangents):
         saved=saved,
         like=y0,
         memory=memory,
-        dense=bool(saveat.dense),
+        dense=max_steps if saveat.dense else 0,
         event=options["event"] is not None,
         segments=_segments(starts, final, init_state, fixed, max_steps),
     )
