@@ -453,16 +453,17 @@ def _run_recorded(terms, args, init_state, fixed, max_steps, size, segments, las
 
 def _start_of(since, state, jumps):
     """What a state of diffrax's loop is made of where a segment of a run starts: without what is saved."""
-    made_jump = jnp.asarray(state.made_jump) if jumps else None
-    return since, (
+    parts = (
         state.tprev,
         state.tnext,
         state.y,
-        made_jump,
+        state.made_jump if jumps else None,
         state.solver_state,
         state.controller_state,
         state.num_accepted_steps,
     )
+    # Flags of diffrax are no arrays before the loop begins.
+    return since, jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, bool) else x, parts)
 
 
 class Segments(eqx.Module):

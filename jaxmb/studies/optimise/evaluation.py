@@ -15,8 +15,9 @@ from ...system.quantities import component_names
 from ..ranges import FreeParameters
 from .space import Space
 
-# Reverse mode costs about as much as this many tangents in forward mode, for every row.
-_TANGENTS_A_ROW = 8
+# Reverse mode costs about as much as this many tangents in forward mode, for every row: a gradient some three to five
+# runs, and a Jacobian in forward mode some more at once, and little for each further tangent.
+_TANGENTS_A_ROW = 2
 
 # The name of the output of a function that returns a number.
 OBJECTIVE = "objective"
