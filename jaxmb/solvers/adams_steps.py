@@ -111,7 +111,7 @@ class AdamsSteps(AbstractSteps):
 
     def linearised(self, of, moved, like, row):
         def at(of_terms, flat):
-            terms, args = of(of_terms)
+            terms, args, _ = of(of_terms)
             return at_solution(terms, row.end, flat, row.f, like, row.kept, args)
 
         _, field = jax.linearize(at, moved.terms, row.y)
@@ -155,7 +155,7 @@ def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
     """The tangents after a jump, where there was one."""
 
     def restart(moved, flat, f):
-        terms, args = of(moved.terms)
+        terms, args, _ = of(moved.terms)
         if moved.jumps is None:
             late = at = None
         else:

@@ -19,8 +19,8 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._compat import any_of_batch, buffer_set, loop_of_diffrax, save_states, while_loop
-from ..linalg.linear_map import filled, linear_map
 from .evaluation import freeze, ravel, unravel_like
+from .linear_map import filled, linear_map
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
@@ -73,7 +73,8 @@ class Tangents(NamedTuple):
 class Mesh(eqx.Module):
     """The steps of a run.
 
-    **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms and their arguments;
+    **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and
+    the solver;
     `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
     `memory` of the solver at the start; `dense`: of how many steps dense output is kept; whether the run ends at an
     `event`; its `segments`, None where there is one only.
@@ -149,7 +150,7 @@ class Mesh(eqx.Module):
     def _rows_of(self, segment: Any) -> list[Array]:
         """The rows of a segment of the run."""
         segments: Any = self.segments
-        terms, args = freeze(eqx.combine(self.moved.terms, self.still))
+        terms, args, _ = freeze(eqx.combine(self.moved.terms, self.still))
         is_last = (segment + 1) * self.size >= self.count
         again = lambda: segments.rows(terms, args, segment, self.size)
         rows = lax.cond(any_of_batch(~is_last), again, lambda: self.rows)
@@ -357,10 +358,10 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         **options,
     ):
         del throw, passed_solver_state, passed_controller_state
-        steps = steps_of(solver, options["stepsize_controller"])
+        steps, own = steps_of(solver, options["stepsize_controller"])
         fixed = freeze((solver, saveat, options, steps))
         jumps = jump_times(options["stepsize_controller"])
-        final, *_ = _recorded(terms, args, jumps, init_state, fixed, max_steps, self.most)
+        final, *_ = _recorded((terms, args, own), jumps, init_state, fixed, max_steps, self.most)
         given = lambda *_, **__: final
         return _run(given, terms, args, init_state, fixed, max_steps)
 
@@ -381,12 +382,15 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
 
 
 @eqx.filter_custom_jvp
-def _recorded(terms, args, jumps, init_state, fixed, max_steps, most):
+def _recorded(equations, jumps, init_state, fixed, max_steps, most):
     """The last state of diffrax's loop, the packed rows of the last segment of its steps, and the packed starts of all
-    segments, of `most` steps each; None where there is one segment only. The times of `jumps` are known to the step
-    size controller as well, and stand here for their tangents.
+    segments, of `most` steps each; None where there is one segment only.
+
+    **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
+    step size controller knows as well, and the solver stand here for their tangents.
     """
     del jumps
+    terms, args, _ = equations
     size = min(most, max_steps)
     segments = -(-max_steps // size)
     several = segments if segments > 1 else None
@@ -501,15 +505,15 @@ class Segments(eqx.Module):
 
 @_recorded.def_jvp
 def _recorded_jvp(primals, tangents):
-    terms, args, jumps, init_state, fixed, max_steps, _ = primals
-    dterms, dargs, djumps, dinit, *_ = tangents
+    equations, jumps, init_state, fixed, max_steps, _ = primals
+    dequations, djumps, dinit, *_ = tangents
     out = _recorded(*primals)
     final, rows, starts = out
     _, saveat, options, steps = fixed
-    moved, still = eqx.partition((terms, args), jax.tree.map(_is_known, (dterms, dargs), is_leaf=_is_none))
+    moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
     of_start = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
-    x = Moving((dterms, dargs), djumps), of_start
+    x = Moving(dequations, djumps), of_start
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
@@ -517,7 +521,7 @@ def _recorded_jvp(primals, tangents):
         Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)
     )
-    row = lambda a, b: Row(b.tprev, b.tprev, steps.row(terms, a, b))
+    row = lambda a, b: Row(b.tprev, b.tprev, steps.row(equations[0], a, b))
     mesh = Mesh(
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,

@@ -14,8 +14,8 @@ else:
 
 
 class Moving(NamedTuple):
-    """The numbers of a run that have tangents, or their tangents: those of the `terms` and their arguments, and the
-    times of `jumps`, in the solver's time, None where they have none.
+    """The numbers of a run that have tangents, or their tangents: those of the `terms`, their arguments and the solver,
+    and the times of `jumps`, in the solver's time, None where they have none.
     """
 
     terms: PyTree
@@ -54,7 +54,7 @@ class AbstractSteps(eqx.Module):
     def linearised(self, of: Callable, moved: Moving, like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
         """A step at its row.
 
-        **Arguments:** `of(moved.terms)`: the solver's terms and their arguments; `like`: a state before raveling.
+        **Arguments:** `of(moved.terms)`: the terms, their arguments and the solver; `like`: a state before raveling.
         """
 
     @abc.abstractmethod

@@ -9,20 +9,21 @@ import jax.numpy as jnp
 
 from .._compat import with_loops
 from .controller import MultistepController
-from .evaluation import ravel, unravel_like
+from .evaluation import freeze, ravel, unravel_like
 from .multistep import AbstractMultistep
 from .one_step import OneStepController, WithTangents
 from .steps import AbstractSteps, LinearStep
 
 
 class WholeSteps(AbstractSteps):
-    """The steps of any solver, differentiated as they are.
+    """The steps of any solver, differentiated as they are, also by the numbers of the solver itself.
 
-    **Fields:** the `solver`, whose states are those of the run or, if they are `watched`, the first parts of them;
+    **Fields:** `multistep`: whether the solver is a multistep method, which names the numbers that a step depends on
+    smoothly; whether the solver of the run is `watched`: the first parts of its states are then those of this one;
     `jumps`: whether steps may begin after a jump.
     """
 
-    solver: Any
+    multistep: bool = eqx.field(static=True)
     watched: bool = eqx.field(static=True)
     jumps: bool = eqx.field(static=True)
 
@@ -36,38 +37,38 @@ class WholeSteps(AbstractSteps):
 
     def _own(self, solver_state):
         """A solver state without tangents."""
-        if isinstance(self.solver, AbstractMultistep):
+        if self.multistep:
             return eqx.tree_at(lambda state: state.tangents, solver_state, None, is_leaf=_is_none)
         return solver_state[0] if self.watched else solver_state
 
     def _smooth(self, state):
         """The numbers that a step depends on smoothly, with None for all others."""
-        if isinstance(self.solver, AbstractMultistep):
+        if self.multistep:
             none = jax.tree.map(lambda _: None, state)
             return eqx.tree_at(lambda state: state.memory, none, state.memory, is_leaf=_is_none)
         return eqx.filter(state, eqx.is_inexact_array)
 
     def linearised(self, of, moved, like, row):
         t0, t1, y0, state, jump = row
+        *_, solver = of(moved.terms)
         if moved.jumps is not None:
             raise ValueError(
                 "Derivatives by the times of jumps are known to jaxmb.solvers.Adams only, got "
-                f"{type(self.solver).__name__}: use that, or stop_gradient for the times."
+                f"{type(solver).__name__}: use that, or stop_gradient for the times."
             )
 
         def step(moved, flat, memory):
-            terms, args = of(moved.terms)
+            terms, args, solver = of(moved.terms)
             before = eqx.combine(memory, state)
-            out = self.solver.step(terms, t0, t1, unravel_like(y0, flat), args, before, False if jump is None else jump)
+            made_jump = False if jump is None else jump
+            out = solver.step(terms, t0, t1, unravel_like(y0, flat), args, before, made_jump)
             dense, still = eqx.partition(out[2], eqx.is_inexact_array)
             return (ravel(out[0]), self._smooth(out[3]), dense), still
 
         (_, _, dense), push, still = jax.linearize(step, moved, ravel(y0), self._smooth(state), has_aux=True)
 
         def at(ddense, t):
-            value = lambda dense: ravel(
-                self.solver.interpolation_cls(t0=t0, t1=t1, **eqx.combine(dense, still)).evaluate(t)
-            )
+            value = lambda dense: ravel(solver.interpolation_cls(t0=t0, t1=t1, **eqx.combine(dense, still)).evaluate(t))
             return jax.jvp(value, (dense,), (ddense,))[1]
 
         return LinearStep(push, at)
@@ -78,17 +79,20 @@ class WholeSteps(AbstractSteps):
         return None, None, unravel_like(like, w), memory, None
 
 
-def steps_of(solver: Any, controller: Any) -> AbstractSteps:
-    """The steps of a solver, without the tangents that it carries along."""
+def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
+    """The steps of a solver, and the solver itself, without the tangents that it carries along."""
     still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
+    # Concrete classes, since nothing else tells that a controller knows no jumps.
     jumps = not isinstance(controller, still)
     if isinstance(solver, AbstractMultistep):
-        solver = eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none)
-        own = solver.linear_steps(jumps)
-        return WholeSteps(solver, False, jumps) if own is None else own
+        # A multistep method has no numbers but its tolerances.
+        own = freeze(eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none))
+        steps = own.linear_steps(jumps)
+        return WholeSteps(True, False, jumps) if steps is None else steps, own
+    # A concrete class, which alone holds another solver beside tangents.
     watched = isinstance(solver, WithTangents)
     # Loops over stages in the form that both modes can differentiate.
-    return WholeSteps(with_loops(solver.inner if watched else solver, "bounded"), watched, jumps)
+    return WholeSteps(False, watched, jumps), with_loops(solver.inner if watched else solver, "bounded")
 
 
 def jump_times(controller: Any) -> Any:

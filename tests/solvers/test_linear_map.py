@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.linalg.linear_map import linear_map
+from jaxmb.solvers.linear_map import linear_map
 
 RESIDUAL = np.array([[0.1, 0.7, -0.4], [1.3, 0.2, 0.5]])
 X = np.array([1.0, -2.0, 0.5])
