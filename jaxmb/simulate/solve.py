@@ -166,9 +166,7 @@ def _solve_with_tangents(arguments, control):
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
     adjoint = MeshAdjoint(_rows(options)) if options["adjoint"] is None else options["adjoint"]
-    # A concrete class, which alone cannot differentiate the user's function of states.
-    solve = _solve_states if isinstance(adjoint, MeshAdjoint) else functools.partial(diffrax.diffeqsolve, throw=False)
-    solution = solve(term, solver, **options | {"adjoint": adjoint})
+    solution = _solve_states(term, solver, **options | {"adjoint": adjoint})
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 

@@ -47,9 +47,14 @@ class AbstractControllerState(eqx.Module):
 
 def intended_step(controller_state: Any) -> Float[Array, ""] | None:
     """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
-    is_known = lambda x: isinstance(x, AbstractControllerState)
-    found = [x for x in jax.tree.leaves(controller_state, is_leaf=is_known) if is_known(x)]
+    found = states_inside(controller_state, AbstractControllerState)
     return found[0].intended if found else None
+
+
+def states_inside(controller_state: Any, kind: type) -> list[Any]:
+    """The states of a kind in that of a controller, which others may be wrapped around."""
+    is_one = lambda x: isinstance(x, kind)
+    return [x for x in jax.tree.leaves(controller_state, is_leaf=is_one) if is_one(x)]
 
 
 class ControllerState(AbstractControllerState):

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -22,7 +21,7 @@ from ._interpolation import MultistepInterpolation, RateInterpolation, StateInte
 from ._neighbours import a_stable, damped_growth, ladder, responses
 from ._newton import AbstractLinearization, Newton, Solved, StepEquation
 from ._structured import unknown_structure
-from .controller import ControllerState
+from .controller import ControllerState, states_inside
 from .evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
 from .manifold_term import Chart
 from .multistep import AbstractAttempt, AbstractMultistep, AbstractMultistepState, tolerances_of
@@ -192,9 +191,7 @@ class Hermite(AbstractMultistep):
         return FAMILIES[self.family].order(self.past_points[-1])
 
     def statistics(self, solver_state: HermiteState, controller_state, stats):
-        # A concrete class, since the state may be nested in that of a `diffrax.ClipStepSizeController`.
-        is_own = lambda leaf: isinstance(leaf, ControllerState)
-        own = filter(is_own, jax.tree.leaves(controller_state, is_leaf=is_own))
+        own = states_inside(controller_state, ControllerState)
         work = solver_state.work + sum(controller.wasted for controller in own)
         return {
             "num_evaluations": solver_state.step_counts[0] + work[0],
