@@ -463,7 +463,10 @@ def test_a_second_start_that_fits_as_well():
 def test_a_prior_is_one_more_measurement():
     """With a strong one the estimate is its mean; without data on a parameter, its deviation is the prior's."""
     own = swing()
-    data = {"theta": np.asarray(TS) * 0.0 + 0.4}
+    truth = mb.with_parameters(own, {"length": 0.7, "damping": 0.3})
+    start = mb.assemble(truth, fix={"theta": 0.5})
+    motion = mb.simulate(truth, start, t1=TS[-1], saveat=TS, solver=TSIT5)
+    data = {"theta": np.asarray(motion["theta"]) + np.random.default_rng(0).normal(0.0, 1.0, TS.size)}
     common = {"ts": TS, "fix": {"theta": 0.5}, "free": ["length", "damping"], "sigma": {"theta": 1.0}, "solver": TSIT5}
     fit = mb.identify(own, data, prior={"length": (0.7, 1e-6), "damping": (0.3, 0.02)}, **common)
     np.testing.assert_allclose(fit.parameters["length"], 0.7, atol=1e-9)
