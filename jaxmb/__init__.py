@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from . import formulations as formulations, manifold as manifold, parts as parts, solvers as solvers
+from ._programs import keep_compiled as keep_compiled
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from ._version import __version__ as __version__
