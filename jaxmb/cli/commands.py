@@ -9,7 +9,7 @@ import jax
 
 from .. import mechanisms
 from .._programs import VARIABLE, keep_compiled
-from . import report, run, sweep
+from . import doctor, report, run, sweep
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     out.set_defaults(compile_anew=False)
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, report, sweep):
+    for command in (run, report, sweep, doctor):
         command.add_to(commands)
     return out
 
