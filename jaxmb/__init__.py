@@ -1,18 +1,9 @@
 """Accurate, differentiable dynamics of constrained mechanical systems in JAX."""
 
-from . import (
-    formulations as formulations,
-    importers as importers,
-    lagrangian as lagrangian,
-    manifold as manifold,
-    mechanisms as mechanisms,
-    parts as parts,
-    planar as planar,
-    report as report,
-    solvers as solvers,
-    spatial as spatial,
-    viz as viz,
-)
+from typing import TYPE_CHECKING
+
+from . import formulations as formulations, manifold as manifold, parts as parts, solvers as solvers
+from ._programs import keep_compiled as keep_compiled
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from ._version import __version__ as __version__
@@ -49,25 +40,6 @@ from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium
 from .states.gap import assembly_gap as assembly_gap
-from .studies.identify import (
-    Experiment as Experiment,
-    Identification as Identification,
-    Measurements as Measurements,
-    Sensor as Sensor,
-    identify as identify,
-    read_measurements as read_measurements,
-)
-from .studies.linear import (
-    Floquet as Floquet,
-    Linearisation as Linearisation,
-    RootLocus as RootLocus,
-    floquet as floquet,
-    linearise as linearise,
-    root_locus as root_locus,
-    steady_motion as steady_motion,
-)
-from .studies.optimise import Optimum as Optimum, optimise as optimise, robust as robust
-from .studies.sweep import cases as cases, load_sweep as load_sweep, sweep as sweep
 from .system import (
     Variable as Variable,
     design as design,
@@ -76,3 +48,61 @@ from .system import (
     with_parameters as with_parameters,
 )
 from .trajectory import Trajectory as Trajectory, load as load
+
+# What not every motion needs is imported at its first use (PEP 562). Only a type checker, which has to see the names,
+# imports them here.
+if TYPE_CHECKING:
+    from . import (
+        importers as importers,
+        lagrangian as lagrangian,
+        mechanisms as mechanisms,
+        planar as planar,
+        report as report,
+        spatial as spatial,
+        studies as studies,
+        viz as viz,
+    )
+    from .studies.identify import (
+        Experiment as Experiment,
+        Identification as Identification,
+        Measurements as Measurements,
+        Sensor as Sensor,
+        identify as identify,
+        read_measurements as read_measurements,
+    )
+    from .studies.linear import (
+        Floquet as Floquet,
+        Linearisation as Linearisation,
+        RootLocus as RootLocus,
+        floquet as floquet,
+        linearise as linearise,
+        root_locus as root_locus,
+        steady_motion as steady_motion,
+    )
+    from .studies.optimise import Optimum as Optimum, optimise as optimise, robust as robust
+    from .studies.sweep import cases as cases, load_sweep as load_sweep, sweep as sweep
+else:
+    _MODULES = ("importers", "lagrangian", "mechanisms", "planar", "report", "spatial", "studies", "viz")
+    _NAMES = {
+        "studies.identify": "Experiment Identification Measurements Sensor identify read_measurements",
+        "studies.linear": "Floquet Linearisation RootLocus floquet linearise root_locus steady_motion",
+        "studies.optimise": "Optimum optimise robust",
+        "studies.sweep": "cases load_sweep sweep",
+    }
+    _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}
+    __all__ = sorted(name for name in {*globals(), *_MODULES, *_SOURCES} if not name.startswith("_"))
+    __all__.remove("TYPE_CHECKING")
+
+    def __getattr__(name: str) -> object:
+        """A module, or a name of one, at its first use; from then on it is found without this function."""
+        import importlib
+        import sys
+
+        if name in _MODULES:
+            return importlib.import_module(f".{name}", __name__)
+        if name in _SOURCES:
+            return globals().setdefault(name, getattr(importlib.import_module(f".{_SOURCES[name]}", __name__), name))
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

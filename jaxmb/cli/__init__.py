@@ -1,3 +1,3 @@
-"""The command line: `jaxmb mechanisms | run | report | sweep`."""
+"""The command line: `jaxmb mechanisms | run | report | sweep | doctor`."""
 
 from .commands import main as main

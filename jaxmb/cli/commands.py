@@ -2,12 +2,14 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 
 import jax
 
 from .. import mechanisms
-from . import report, run, sweep
+from .._programs import VARIABLE, keep_compiled
+from . import doctor, report, run, sweep
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -20,6 +22,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser().parse_args(argv)
     jax.config.update("jax_enable_x64", True)
+    if not arguments.compile_anew:
+        _keep_compiled()
     try:
         arguments.command(arguments)
     except (ValueError, RuntimeError, OSError) as error:
@@ -34,13 +38,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     out = argparse.ArgumentParser(
-        prog="jaxmb", description="Accurate, differentiable dynamics of constrained mechanical systems."
+        prog="jaxmb",
+        description="Accurate, differentiable dynamics of constrained mechanical systems.",
+        epilog="Compiled programs are kept in the user's cache folder for later runs; the environment variable "
+        f"{VARIABLE} names another folder, or is off. `jaxmb doctor` says where they are. A report, which measures the "
+        "time to compile, neither keeps nor uses them.",
     )
+    out.set_defaults(compile_anew=False)
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, report, sweep):
+    for command in (run, report, sweep, doctor):
         command.add_to(commands)
     return out
+
+
+def _keep_compiled() -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        keep_compiled()
+    for warning in caught:
+        print(f"jaxmb: {warning.message}", file=sys.stderr)
 
 
 def _mechanisms(arguments: argparse.Namespace) -> None:

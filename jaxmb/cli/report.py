@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
     command.add_argument("--repeats", type=count, default=5, help="timed runs of each solver (default %(default)d)")
     command.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
     command.add_argument("--out", type=Path, help="folder for the table and the figure (default jaxmb-output/NAME)")
-    command.set_defaults(command=_report)
+    command.set_defaults(command=_report, compile_anew=True)
     add_parameters(command)
 
 

@@ -44,8 +44,9 @@ class Run:
 
     **Fields:** `solver`; `rtol`; `error`: the largest relative error at the end, NaN if the run failed, and None where
     it is below the accuracy of the reference, so that it is not known; `times` [s] of the warm runs; `compile_time` [s]
-    of the solver's program, which serves all its tolerances; `steps`, accepted and rejected together, and `rejected`;
-    `evaluations` of the accelerations, None if unknown; `message`: why the run failed, or empty.
+    of the solver's program, which serves all its tolerances, or to read it where it is kept on disk; `steps`, accepted
+    and rejected together, and `rejected`; `evaluations` of the accelerations, None if unknown; `message`: why the run
+    failed, or empty.
     """
 
     solver: str

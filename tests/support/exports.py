@@ -30,8 +30,10 @@ def exported(module, kinds):
     """Names of the classes of these kinds that a module exports. Those for users to derive from are called Abstract…"""
     return {
         name
-        for name, value in vars(module).items()
-        if inspect.isclass(value) and issubclass(value, kinds) and not name.startswith(("_", "Abstract"))
+        for name in dir(module)
+        if not name.startswith(("_", "Abstract"))
+        and inspect.isclass(value := getattr(module, name))
+        and issubclass(value, kinds)
     }
 
 

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from ..._compat import processes_of
+from ..._programs import SETTINGS
 from .batch import Batch
 from .dataset import packages
 from .outputs import statuses
@@ -26,7 +27,7 @@ _SETTINGS = (
     "jax_numpy_rank_promotion",
     "jax_default_matmul_precision",
     "jax_compilation_cache_dir",
-    "jax_persistent_cache_min_compile_time_secs",
+    *SETTINGS,
 )
 # A pool whose workers die this often, without a chunk done in between, is given up.
 _BREAKS = 3

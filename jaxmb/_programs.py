@@ -1,0 +1,86 @@
+"""Compiled programs that are kept on disk, so that each is compiled once a machine and not once a process."""
+
+import os
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+
+# The folder in place of that which a program names, or `off`.
+VARIABLE = "JAXMB_CACHE"
+MAX_BYTES = 2**27
+# What JAX is told besides the folder: to keep every program, as hundreds of small ones take seconds together too.
+SETTINGS = {
+    "jax_compilation_cache_max_size": MAX_BYTES,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+
+def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: int = MAX_BYTES) -> Path | None:
+    """Keep compiled programs on disk, and use those that are there: the second process does not compile again.
+
+    The name says what is kept, which "cache" alone would not. JAX's persistent compilation cache keeps it, for all of
+    JAX in this process. Importing jaxmb never switches that on; the command line does, but for reports. Call it first:
+    what was compiled before is not kept. What JAX does not recognise is compiled again: another version of it or
+    another processor, another scene or number of its bodies, another method; other numbers are the same program.
+
+    Other users of the machine who can write to the folder can make this process run what they like.
+
+    **Arguments:**
+
+    - `folder`: by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME` if that is set, in `~/.cache`, on
+        macOS `~/Library/Caches`, on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes its place:
+        another folder, or `off` to keep nothing.
+    - `max_bytes`: size of the folder beyond which programs that have not been used for longest are dropped [bytes].
+
+    **Returns:** the folder that programs are kept in; None if they are not. Where JAX has a folder already, from
+    `JAX_COMPILATION_CACHE_DIR` or from `jax.config`, that one stays, with its settings.
+
+    **Raises:** a `ValueError` for a size that is not positive. A folder that cannot be written to is a warning, and
+    programs are not kept.
+    """
+    if max_bytes <= 0:
+        raise ValueError(f"max_bytes must be positive, got {max_bytes}.")
+    told = os.environ.get(VARIABLE)
+    if kept_in() is not None or not _setting("jax_enable_compilation_cache") or told == "off":
+        return kept_in()
+    chosen = told or folder
+    try:
+        path = _default_folder() if chosen is None else Path(chosen).expanduser().absolute()
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except (OSError, RuntimeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        warnings.warn(
+            f"compiled programs are not kept: {chosen or 'the cache folder'} cannot be written to ({reason}); "
+            f"{VARIABLE} names another folder, or is off.",
+            stacklevel=2,
+        )
+        return None
+    for name, value in (SETTINGS | {"jax_compilation_cache_max_size": max_bytes}).items():
+        jax.config.update(name, value)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    return path
+
+
+def kept_in() -> Path | None:
+    """The folder that compiled programs are kept in; None if they are not."""
+    folder = _setting("jax_compilation_cache_dir")
+    return Path(folder) if folder and _setting("jax_enable_compilation_cache") else None
+
+
+def _setting(name: str) -> Any:
+    return getattr(jax.config, name)
+
+
+def _default_folder() -> Path:
+    """That of this package among the user's caches."""
+    above = os.environ.get("XDG_CACHE_HOME") or (sys.platform == "win32" and os.environ.get("LOCALAPPDATA"))
+    if above:
+        return Path(above) / "jaxmb"
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "jaxmb"

@@ -1,0 +1,189 @@
+"""`jaxmb doctor`: the machine, what is installed on it, and how long first calls and steps take there."""
+
+import argparse
+import functools
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import textwrap
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from .. import mechanisms
+from .._programs import VARIABLE, kept_in
+from .._results import RESULTS
+from .._version import __version__
+from ..report.table import aligned
+from ..report.timing import interleaved
+from ..simulate import simulate
+
+_NEEDED = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "numpy")
+# What the extras of the package install.
+_OPTIONAL = {
+    "plot": ("matplotlib",),
+    "view": ("viser",),
+    "import": ("mujoco",),
+    "studies": ("cloudpickle", "scipy", "xarray", "zarr"),
+}
+_STEPPED = ("four_bar", "andrews", "rod_chain", "tracked_vehicle")
+_RTOL, _REPEATS = 1e-8, 5
+# What a user waits for in a new process [s], with a second call after each first one.
+_FIRST_CALLS = """
+import time
+times = [time.perf_counter()]
+done = lambda: times.append(time.perf_counter())
+import diffrax, jax
+done()
+import jaxmb as mb
+done()
+jax.config.update("jax_enable_x64", True)
+mb.keep_compiled()
+machine = mb.mechanisms.get("four_bar")
+
+def end(mass):
+    system = mb.with_parameters(machine.system, {"coupler.mass": mass})
+    state = mb.assemble(system, machine.state)
+    return mb.simulate(system, state, t1=1.0, rtol=1e-8)["rocker"].angle[-1]
+
+for call in (end, jax.grad(end)):
+    for _ in range(2):
+        done()
+        call(3.0).block_until_ready()
+        done()
+import json
+print(json.dumps([after - before for before, after in zip(times, times[1:])]))
+"""
+# The durations among those that it prints, in the order of the table.
+_SHOWN = {
+    "import jax, diffrax": 0,
+    "import jaxmb": 1,
+    "four_bar: first value": 3,
+    "four_bar: first gradient": 7,
+    "four_bar: another value": 5,
+    "four_bar: another gradient": 9,
+}
+# How facts are printed: names and paths are for copying.
+_INDENT = 18
+_FILLED = textwrap.TextWrapper(80, subsequent_indent=" " * _INDENT, break_long_words=False, break_on_hyphens=False)
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to a parser's commands."""
+    command = commands.add_parser(
+        "doctor",
+        help="say what is installed, where compiled programs are kept, and how long things take on this machine",
+    )
+    command.add_argument("--quick", action="store_true", help="leave out the measurements, which take a minute or two")
+    command.set_defaults(command=_doctor)
+
+
+def _doctor(arguments: argparse.Namespace) -> None:
+    for name, text in _facts():
+        print(_FILLED.fill(f"{name:{_INDENT}}{text}"))
+    if arguments.quick:
+        return
+    print("\nCalls in a new process [s]; the second finds the programs that the first kept:\n")
+    print("\n".join(aligned(_first_calls())))
+    print(f"\nWarm steps under jit at rtol {_RTOL:g}, the shortest of {_REPEATS} runs:\n")
+    print("\n".join(aligned(_steps())))
+
+
+def _facts() -> Iterable[tuple[str, str]]:
+    """The machine, and what is installed."""
+    yield "jaxmb", f"{__version__}, Python {platform.python_version()}"
+    yield "needed", ", ".join(f"{name} {_version(name)}" for name in _NEEDED)
+    for extra, names in _OPTIONAL.items():
+        found = {name: _version(name) for name in names}
+        text = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
+        yield f"for {extra}", text if all(found.values()) else f'{text}; pip install "jaxmb[{extra}]"'
+    yield "machine", f"{platform.system()} {platform.machine()}, {_processor()}, {_cores()}"
+    devices = Counter((device.platform, device.device_kind) for device in jax.devices())
+    yield "devices", ", ".join(f"{count} {name} ({kind})" for (name, kind), count in devices.items())
+    yield "double precision", "on in commands; in Python by jax.config.update('jax_enable_x64', True)"
+    yield "kept programs", _kept()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    """Its name, which Linux has in a file."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return next(iter(names), platform.processor() or "unknown processor")
+
+
+def _cores() -> str:
+    """Those that this process may use."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("NPROC")
+    return f"{count} core{'s' * (count > 1)}" + (f", NPROC={limit}" if limit else "")
+
+
+def _kept() -> str:
+    folder = kept_in()
+    if folder is None:
+        told = os.environ.get(VARIABLE)
+        return "none" + (f", {VARIABLE}={told}" if told else "")
+    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
+    bound = jax.config.jax_compilation_cache_max_size  # pyright: ignore[reportAttributeAccessIssue]
+    used = f"{sum(sizes) / 2**20:.1f}" + (f" of {bound / 2**20:.0f}" if bound > 0 else "")
+    home = os.path.expanduser("~")
+    shown = Path("~") / folder.relative_to(home) if folder.is_relative_to(home) else folder
+    return f"{len(sizes)} in {shown}, {used} MiB"
+
+
+def _first_calls() -> list[list[str]]:
+    """What two processes wait for, the second of which finds what the first has compiled."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+        environment = own | {VARIABLE: folder}
+        both = [_durations(environment) for _ in range(2)]
+    rows = [[name, *(f"{durations[place]:.3f}" for durations in both)] for name, place in _SHOWN.items()]
+    return [["", "first", "second"], *rows]
+
+
+def _durations(environment: dict[str, str]) -> list[float]:
+    run = subprocess.run([sys.executable, "-c", _FIRST_CALLS], env=environment, capture_output=True, text=True)
+    if run.returncode:
+        raise RuntimeError(f"A new process failed: {run.stderr.strip().splitlines()[-1]}")
+    return json.loads(run.stdout)
+
+
+def _steps() -> list[list[str]]:
+    """Steps of some motions, and the time of one."""
+    motions = [mechanisms.get(name) for name in _STEPPED]
+    runs = [functools.partial(_motion, own.system, own.state, own.t1) for own in motions]
+    rows = [["", "bodies", "t1 [s]", "steps", "run [ms]", "step [µs]"]]
+    for own, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
+        stats, result, _ = run()
+        if result != RESULTS.successful:
+            raise RuntimeError(f"{own.name}: {RESULTS[result]}")
+        steps, seconds = int(stats["num_steps"]), min(times)
+        bodies = str(len(own.system.body_names))
+        rows.append(
+            [own.name, bodies, f"{own.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
+        )
+    return rows
+
+
+@eqx.filter_jit
+def _motion(system: Any, state: Any, t1: Any) -> Any:
+    motion = simulate(system, state, t1=t1, rtol=_RTOL, throw=False)
+    return motion.stats, motion.result, motion.ys

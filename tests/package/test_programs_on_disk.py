@@ -1,0 +1,172 @@
+"""Compiled programs that are kept on disk, in processes of their own, since JAX has one folder a process."""
+
+import ast
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+from compiling import QUICKLY
+
+import jaxmb as mb
+from jaxmb import _programs
+
+# Counts of the programs that JAX asked for, and of those that it found.
+COUNTING = """
+import collections, jax
+counts = collections.Counter()
+jax.monitoring.register_event_listener(lambda event, **_: counts.update([event.rsplit("/", 1)[-1]]))
+import jax.numpy as jnp, jaxmb as mb
+jax.config.update("jax_enable_x64", True)
+"""
+REPORT = """
+print(dict(asked=counts["compile_requests_use_cache"], found=counts["cache_hits"], kept=counts["cache_misses"]))
+"""
+
+
+def process(code, **environment):
+    """What a process prints: its last line as a Python value, and its warnings. JAX's own settings are left out."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXMB_", "XDG_CACHE"))}
+    command = [sys.executable, "-c", COUNTING + code]
+    run = subprocess.run(command, env=own | environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return ast.literal_eval(run.stdout.splitlines()[-1]), run.stderr
+
+
+@pytest.fixture
+def new_user(monkeypatch, tmp_path):
+    """The home of somebody who has told JAX nothing; nothing is compiled meanwhile."""
+    names = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *_programs.SETTINGS)
+    before = {name: getattr(jax.config, name) for name in names}
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in (_programs.VARIABLE, "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield tmp_path / "home"
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def kept(*arguments, **options):
+    """Where programs are kept after a call, as JAX was told; and JAX forgets it."""
+    folder = mb.keep_compiled(*arguments, **options)
+    told = jax.config.jax_compilation_cache_dir
+    assert str(folder) == str(told)
+    jax.config.update("jax_compilation_cache_dir", None)
+    return folder
+
+
+def test_the_second_process_finds_what_the_first_compiled(tmp_path):
+    code = "mb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    first, second = (process(code, JAXMB_CACHE=str(tmp_path))[0] for _ in range(2))
+    assert first["kept"] == first["asked"] > 0 == first["found"]
+    assert second == {"asked": first["asked"], "found": first["asked"], "kept": 0}
+
+
+def test_a_motion_and_its_gradient_are_compiled_once(tmp_path):
+    code = """
+mb.keep_compiled()
+machine = mb.mechanisms.get("pendulum")
+
+def height(mass):
+    system = mb.with_parameters(machine.system, {"bob.mass": mass})
+    state = mb.assemble(system, machine.state, throw=False)
+    return mb.simulate(system, state, t1=0.1, rtol=1e-6, throw=False)["bob"].position[-1, 1]
+
+found = [float(height(2.0)).hex(), float(jax.grad(height)(2.0)).hex()]
+print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts["cache_hits"]))
+"""
+    first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS=QUICKLY)[0] for _ in range(2))
+    assert second["found"] == first["found"]
+    assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
+
+
+def test_a_program_that_was_compiled_before_is_not_kept(tmp_path):
+    code = "f = jax.jit(lambda x: jnp.sin(x) + x)\nf(1.0)\nmb.keep_compiled()\nf(1.0)\nf(jnp.ones(3))" + REPORT
+    found, _ = process(code, JAXMB_CACHE=str(tmp_path))
+    assert 0 < found["kept"] < found["asked"]
+
+
+def test_the_import_switches_nothing_on(tmp_path):
+    code = "import jaxmb.cli\nprint(repr(jax.config.jax_compilation_cache_dir))"
+    assert process(code, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) == (None, "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_folder(new_user, tmp_path, monkeypatch):
+    user, other = kept(), tmp_path / "other"
+    assert user.is_relative_to(new_user) and user.name == "jaxmb" and user.stat().st_mode & 0o077 == 0
+    assert kept(other) == kept(str(other)) == other and other.is_dir()
+    assert kept("~/own") == new_user / "own"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    assert kept() == tmp_path / "caches" / "jaxmb"
+    # One variable for the user of the machine, before what a program says.
+    monkeypatch.setenv("JAXMB_CACHE", str(tmp_path / "named"))
+    assert kept() == kept(other) == tmp_path / "named"
+    monkeypatch.setenv("JAXMB_CACHE", "off")
+    assert kept() is None and kept(tmp_path / "off") is None and not (tmp_path / "off").exists()
+
+
+@pytest.mark.parametrize("system, folder", [("linux", ".cache"), ("darwin", "Library/Caches"), ("win32", "Local")])
+def test_the_folder_of_a_system(system, folder, new_user, monkeypatch):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setenv("LOCALAPPDATA", str(new_user / "Local"))
+    assert kept() == new_user / folder / "jaxmb"
+
+
+def test_settings_of_jax_stay(new_user, tmp_path, monkeypatch):
+    size = jax.config.jax_compilation_cache_max_size
+    monkeypatch.setenv("JAXMB_CACHE", str(tmp_path / "not"))
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of_jax"))
+    assert kept(max_bytes=size + 1) == tmp_path / "of_jax"
+    assert jax.config.jax_compilation_cache_max_size == size
+    jax.config.update("jax_enable_compilation_cache", False)
+    assert kept() is None and not (tmp_path / "not").exists()
+    # From the environment, which JAX reads when it is imported.
+    own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "of_jax"), "JAXMB_CACHE": str(tmp_path / "not")}
+    assert process("print(repr(str(mb.keep_compiled())))", **own)[0] == str(tmp_path / "of_jax")
+
+
+def test_the_size_is_bounded(tmp_path):
+    code = "mb.keep_compiled(max_bytes=20_000)\nfor n in range(2, 20): jnp.cumsum(jnp.ones(n)).block_until_ready()"
+    counts, _ = process(code + REPORT, JAXMB_CACHE=str(tmp_path))
+    sizes = [path.stat().st_size for path in tmp_path.glob("*-cache")]
+    assert sum(sizes) <= 20_000 and 0 < len(sizes) < counts["kept"]
+    with pytest.raises(ValueError, match="max_bytes must be positive, got 0"):
+        mb.keep_compiled(max_bytes=0)
+
+
+def test_a_folder_that_cannot_be_written_to(new_user, tmp_path, monkeypatch):
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    for folder in (taken, taken / "deeper"):
+        with pytest.warns(UserWarning, match=f"not kept: {folder} cannot be written to .*JAXMB_CACHE names another"):
+            assert kept(folder) is None
+    monkeypatch.setenv("HOME", str(taken))
+    with pytest.warns(UserWarning, match="not kept: the cache folder cannot be written to"):
+        assert kept() is None
+
+
+def test_the_command_line_keeps_programs(tmp_path):
+    """Where it cannot, one line says so."""
+    code = """
+from jaxmb.cli import main
+assert main(["mechanisms"]) == 0
+print(repr(jax.config.jax_compilation_cache_dir))
+"""
+    assert process(code, JAXMB_CACHE=str(tmp_path)) == (str(tmp_path), "")
+    (tmp_path / "taken").write_text("")
+    folder, said = process(code, JAXMB_CACHE=str(tmp_path / "taken"))
+    assert folder is None and said.startswith("jaxmb: compiled programs are not kept: ") and said.count("\n") == 1
+    assert process(code, JAXMB_CACHE="off") == (None, "")
+
+
+def test_a_report_compiles_anew(tmp_path):
+    """What it prints of compiling is not the time to read from a disk."""
+    code = """
+from jaxmb.cli import main
+assert main(["report", "nothing_of_this_name"]) == 2
+print(repr(jax.config.jax_compilation_cache_dir))
+"""
+    assert process(code, JAXMB_CACHE=str(tmp_path))[0] is None
