@@ -20,12 +20,12 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend import core
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.interpreters.ad import Zero
 from jaxtyping import Array
 
 # The makers of new operations of JAX. (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.)
-__all__ = ["Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir"]
+__all__ = ["Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir", "partial_eval"]
 
 T = TypeVar("T")
 

@@ -29,7 +29,7 @@ from .moving_times import at_frozen_start, at_moving_times, is_moving, saved_tim
 from .outcome import Outcome, has_failed
 
 # Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
-_MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 4096, 64, 2**27
+_MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 
 
 class Problem(NamedTuple):

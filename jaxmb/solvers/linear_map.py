@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir
+from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
 
 _SECOND_REVERSE = (
     "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
@@ -21,9 +21,9 @@ _SECOND_REVERSE = (
 
 
 class _Programs:
-    """A map and its transpose on lists of arrays: `there(residuals, x)` and `back(residuals, cotangents)`, where a
-    cotangent may be None for zeros; `again`, both in a form whose derivatives by residuals are right; and the shapes of
-    x and of the value.
+    """A map and its transpose on lists of arrays: `there(residuals, x, used)`, where values that are not `used` may be
+    anything, and `back(residuals, cotangents)`, where a cotangent may be None for zeros; `again`, both in a form whose
+    derivatives by residuals are right; and the shapes of x and of the value.
     """
 
     def __init__(self, there: Callable, back: Callable, again: tuple[Callable, Callable], inputs, outputs):
@@ -38,11 +38,11 @@ class _Programs:
             return [next(left) if here else None for here in known]
 
         def turned(there, back):
-            def from_cotangents(residuals, cotangents):
+            def from_cotangents(residuals, cotangents, _):
                 return back(residuals, every(cotangents))
 
             def of_these(residuals, x):
-                values = there(residuals, filled(list(self.inputs), x))
+                values = there(residuals, filled(list(self.inputs), x), known)
                 return [value for value, here in zip(values, known, strict=True) if here]
 
             return from_cotangents, of_these
@@ -50,22 +50,44 @@ class _Programs:
         outputs = [a for a, here in zip(self.outputs, known, strict=True) if here]
         return _Programs(*turned(self.there, self.back), turned(*self.again), outputs, self.inputs)
 
+    def only(self, used: Sequence[bool]) -> "_Programs":
+        """The maps to those of the values that are used."""
+
+        def narrowed(there, back):
+            def to_these(residuals, x, among):
+                among = iter(among)
+                values = there(residuals, x, [here and next(among) for here in used])
+                return [value for value, here in zip(values, used, strict=True) if here]
+
+            def from_these(residuals, cotangents):
+                left = iter(cotangents)
+                return back(residuals, [next(left) if here else None for here in used])
+
+            return to_these, from_these
+
+        outputs = [a for a, here in zip(self.outputs, used, strict=True) if here]
+        return _Programs(*narrowed(self.there, self.back), narrowed(*self.again), self.inputs, outputs)
+
     def batched(self, size: int, axes: Sequence[int | None]) -> "_Programs":
         """The maps of a batch, whose residuals have these `axes`."""
-        of = lambda function: jax.vmap(function, in_axes=(list(axes), 0))
+        back_of = lambda back: jax.vmap(back, in_axes=(list(axes), 0))
+
+        def there_of(there):
+            return lambda r, x, used: jax.vmap(lambda r, x: there(r, x, used), in_axes=(list(axes), 0))(r, x)
+
         shapes = lambda avals: [ShapedArray((size, *a.shape), a.dtype) for a in avals]
-        again = of(self.again[0]), of(self.again[1])
-        return _Programs(of(self.there), of(self.back), again, shapes(self.inputs), shapes(self.outputs))
+        again = there_of(self.again[0]), back_of(self.again[1])
+        return _Programs(there_of(self.there), back_of(self.back), again, shapes(self.inputs), shapes(self.outputs))
 
 
 def linear_map(
     there: Callable, back: Callable, again: tuple[Callable, Callable], residuals: PyTree, x: PyTree, like: PyTree
 ) -> PyTree:
-    """`there(residuals, x)`, linear in x.
+    """`there(residuals, x, used)`, linear in x.
 
     **Arguments:**
 
-    - `there(residuals, x)`: the map.
+    - `there(residuals, x, used)`: the map; `used`: of each of its values, whether it matters what it is.
     - `back(residuals, cotangents)`: its transpose; a cotangent that is None stands for zeros.
     - `again`: both in a form that may be differentiated by the residuals.
     - `residuals`: what the map depends on otherwise, a pytree.
@@ -81,7 +103,8 @@ def linear_map(
     held = lambda leaves: eqx.combine(jax.tree.unflatten(structure, leaves), static)
 
     def map_of(function):
-        return lambda r, x: jax.tree.leaves(function(held(r), jax.tree.unflatten(of_inputs, x)))
+        given = lambda x, used: (jax.tree.unflatten(of_inputs, x), jax.tree.unflatten(of_outputs, used))
+        return lambda r, x, used: jax.tree.leaves(function(held(r), *given(x, used)))
 
     def transpose_of(function):
         def transpose(r, cotangents):
@@ -103,7 +126,7 @@ def filled(x: PyTree, tangent: PyTree) -> PyTree:
 
 
 def _evaluate(*operands: Array, programs: _Programs, known: int) -> list[Array]:
-    return programs.there(list(operands[:known]), list(operands[known:]))
+    return programs.there(list(operands[:known]), list(operands[known:]), [True] * len(programs.outputs))
 
 
 def _push(primals, tangents, *, programs: _Programs, known: int):
@@ -119,7 +142,7 @@ def _push(primals, tangents, *, programs: _Programs, known: int):
             residuals = list(primals[:known])
             for k, value in zip(moving, values, strict=True):
                 residuals[k] = value
-            return programs.again[0](residuals, list(primals[known:]))
+            return programs.again[0](residuals, list(primals[known:]), [True] * len(programs.outputs))
 
         along = tuple(tangents[k] for k in moving)
         _, more = jax.jvp(moved, tuple(primals[k] for k in moving), along)
@@ -145,6 +168,16 @@ def _batch(operands, axes, *, programs: _Programs, known: int):
     return out, [0] * len(out)
 
 
+def _without_unused(used, equation):
+    """The operation without the values that nothing uses, and which of its operands it needs."""
+    operands = len(equation.invars)
+    if not any(used):
+        return [False] * operands, None
+    left = [value for value, here in zip(equation.outvars, used, strict=True) if here]
+    params = equation.params | {"programs": equation.params["programs"].only(used)}
+    return [True] * operands, equation.replace(outvars=left, params=params)
+
+
 def _not_in_reverse(cotangent, x):
     raise TypeError(_SECOND_REVERSE)
 
@@ -165,3 +198,4 @@ mlir.register_lowering(_linear_map, mlir.lower_fun(_evaluate, multiple_results=T
 ad.primitive_jvps[_linear_map] = _push
 ad.primitive_transposes[_linear_map] = _transpose
 batching.primitive_batchers[_linear_map] = _batch
+partial_eval.dce_rules[_linear_map] = _without_unused

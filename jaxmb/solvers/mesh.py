@@ -122,52 +122,53 @@ class Mesh(eqx.Module):
         run = lambda moved, memory: self.linearised(self.row(self.rows, 0)).push(moved, ravel(self.like), memory)[2]
         return eqx.filter_eval_shape(run, self.moved, self.memory)
 
-    def push(self, x: PyTree) -> Tangents:
-        """The tangents that one of the terms, one of the first state and one of its memory cause."""
+    def push(self, x: PyTree, used: Tangents) -> Tangents:
+        """The tangents that one of the terms, one of the first state and one of its memory cause; those of the rows are
+        zeros unless they are `used`.
+        """
+        blank = self.blank()
+        first = self._first(*x[1], blank if any(used.rows) else blank._replace(rows=[]))
         if self.segments is None:
-            return self._out(self._pushed(x[0], self._first(*x[1]), self.rows, self.count))
+            return self._out(self._pushed(x[0], first, self.rows, self.count), blank)
 
         def body(carry):
-            segment, inner = carry
+            segment, inner, rows = carry
+            rows = self._rows_again(segment, rows, self.count > self.size)
             last = jnp.minimum((segment + 1) * self.size, self.count)
-            return segment + 1, self._pushed(x[0], inner, self._rows_of(segment), last)
+            return segment + 1, self._pushed(x[0], inner, rows, last), rows
 
         carry = while_loop(
             lambda carry: carry[0] * self.size < self.count,
             body,
-            (0, self._first(*x[1])),
+            (0, first, self.rows),
             max_steps=None,
-            buffers=lambda carry: _tables(carry[1]),
+            buffers=lambda carry: (_tables(carry[1]), carry[2]),
             kind="lax",
         )
-        return self._out(carry[1])
+        return self._out(carry[1], blank)
 
     def of_one_segment(self) -> "Mesh":
         """The same, whose maps can be differentiated by the rows; of a run that has more than them, an error."""
         rows = eqx.error_if(self.rows, self.count > self.size, _TOO_LONG.format(self.size))
         return dataclasses.replace(self, rows=rows, segments=None)
 
-    def _rows_of(self, segment: Any) -> list[Array]:
-        """The rows of a segment of the run."""
+    def _rows_again(self, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
+        """The rows of a segment of the run, found again in these buffers where they are `lost`."""
         segments: Any = self.segments
         terms, args, _ = freeze(eqx.combine(self.moved.terms, self.still))
-        is_last = (segment + 1) * self.size >= self.count
-        again = lambda: segments.rows(terms, args, segment, self.size)
-        rows = lax.cond(any_of_batch(~is_last), again, lambda: self.rows)
-        return jax.tree.map(lambda new, last: jnp.where(is_last, last, new), rows, self.rows)
+        return segments.rows(terms, args, segment, rows, lost)
 
-    def _first(self, w, memory):
-        """The carry of the loop over steps at its start."""
-        out = self.blank()
+    def _first(self, w, memory, out: Tangents):
+        """The carry of the loop over steps at its start, with tables for its results."""
         saved = tuple(
             table.at[0].set(w) if series.start else table for series, table in zip(self.saved, out.saved, strict=True)
         )
         places = tuple(jnp.array([int(series.start), 0]) for series in self.saved)
         return jnp.zeros_like(self.count), (w, memory), saved, places, out.rows, out.dense, out.last
 
-    def _out(self, carry) -> Tangents:
+    def _out(self, carry, blank: Tangents) -> Tangents:
         _, end, saved, _, rows, dense, last = carry
-        return Tangents(end, saved, rows, dense, last)
+        return Tangents(end, saved, rows or blank.rows, dense, last)
 
     def _pushed(self, dmoved, carry, rows_of_segment, count):
         """The carry after the steps before `count`."""
@@ -178,9 +179,10 @@ class Mesh(eqx.Module):
             step = self.linearised(row)
             w, memory, ddense = step.push(dmoved, *before)
             after = w, memory
-            own = self.steps.row_tangent(row.own, self.like, before, after)
-            along = self.layout.packed_tangent(row, Row(None, None, own))
-            rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
+            if rows:
+                own = self.steps.row_tangent(row.own, self.like, before, after)
+                along = self.layout.packed_tangent(row, Row(None, None, own))
+                rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
@@ -200,12 +202,14 @@ class Mesh(eqx.Module):
         else:
 
             def body(carry):
-                segment, inner = carry
-                segment = segment - 1
-                return segment, self._pulled(cotangents, inner, self._rows_of(segment), segment * self.size)
+                segment, inner, rows = carry
+                rows = self._rows_again(segment, rows, segment < last)
+                return segment - 1, self._pulled(cotangents, inner, rows, segment * self.size), rows
 
-            carry = -(-self.count // self.size), carry
-            _, carry = while_loop(lambda carry: carry[0] > 0, body, carry, max_steps=None, buffers=None, kind="lax")
+            last = (self.count - 1) // self.size
+            carry = last, carry, self.rows
+            kept = lambda carry: carry[2]
+            _, carry, _ = while_loop(lambda c: c[0] >= 0, body, carry, max_steps=None, buffers=kept, kind="lax")
         _, lw, lmemory, places, total = carry
         for series, table in zip(self.saved, cotangents.saved, strict=True):
             if series.start and table is not None:
@@ -306,10 +310,10 @@ class Layout:
         self.leaves = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
         self.types = sorted({x.dtype for x in self.leaves}, key=str)
 
-    @property
-    def vectors(self) -> list[jax.ShapeDtypeStruct]:
+    def blank(self, length: int) -> list[Array]:
+        """Buffers of this many rows of zeros."""
         size = lambda dtype: sum(x.size for x in self.leaves if x.dtype == dtype)
-        return [jax.ShapeDtypeStruct((size(dtype),), dtype) for dtype in self.types]
+        return [jnp.zeros((length, size(dtype)), dtype) for dtype in self.types]
 
     def packed(self, row: PyTree[Array]) -> list[Array]:
         """A row as vectors."""
@@ -393,66 +397,57 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
     terms, args, _ = equations
     size = min(most, max_steps)
     segments = -(-max_steps // size)
-    several = segments if segments > 1 else None
-    return _run_recorded(terms, args, init_state, fixed, max_steps, size, several, None, -jnp.inf)
-
-
-def _run_recorded(terms, args, init_state, fixed, max_steps, size, segments, last, since):
-    """The same, of the steps until `last` of them are accepted; `since`: the end of the last step before them."""
-    since = jnp.asarray(since, init_state.tprev.dtype)
     steps, found = fixed[3], []
-    row = lambda since, old, new: Row(since, old.tnext, steps.row(terms, old, new))
 
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
-        layout = Layout(eqx.filter_eval_shape(lambda init: row(since, init, body_fun(init)), init))
+        since = jnp.asarray(-jnp.inf, init.tprev.dtype)
+        layout = Layout(eqx.filter_eval_shape(lambda init: _row(steps, terms, since, init, body_fun(init)), init))
         of_starts = Layout(eqx.filter_eval_shape(lambda init: _start_of(since, body_fun(init), steps.jumps), init))
-
-        table = lambda length, layout: [jnp.zeros((length, *x.shape), x.dtype) for x in layout.vectors]
+        step = _step_with_row(body_fun, steps, terms, layout)
 
         def body(carry):
-            old, since, rows = carry
-            new = body_fun(old)
-            kept = new.num_accepted_steps > old.num_accepted_steps
-            packed = layout.packed(row(since, old, new))
-            index = old.num_accepted_steps % size
-            rows = [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
-            return new, jnp.where(kept, old.tnext, since), rows
+            old, since, rows, starts = carry
+            if starts is not None:
+                # In the middle of a segment what is written comes to lie behind the last start.
+                k = old.num_accepted_steps
+                place = jnp.where(k % size == 0, k // size, segments)
+                start = of_starts.packed(_start_of(since, old, steps.jumps))
+                starts = [buffer_set(buffer, place, x) for buffer, x in zip(starts, start, strict=True)]
+            return *step(old, since, rows), starts
 
-        def until(last, carry):
-            """The carry after the steps until `last` of them are accepted."""
-
-            def proceed(carry):
-                state, running = carry[0], cond_fun(carry[0])
-                running = running & (state.num_steps < max_steps)
-                return running if last is None else running & (state.num_accepted_steps < last)
-
-            own = lambda carry: (buffers(carry[0]), carry[2])
-            return while_loop(proceed, body, carry, max_steps=None, buffers=own, kind="lax")
-
-        carry, starts = (init, since, table(size, layout)), None
-        if segments is None:
-            carry = until(last, carry)
-        else:
-
-            def segment(carry):
-                k, inner, starts = carry
-                packed = of_starts.packed(_start_of(inner[1], inner[0], steps.jumps))
-                starts = [buffer_set(buffer, k, x) for buffer, x in zip(starts, packed, strict=True)]
-                return k + 1, until((k + 1) * size, inner), starts
-
-            _, carry, starts = while_loop(
-                lambda carry: cond_fun(carry[1][0]) & (carry[1][0].num_steps < max_steps),
-                segment,
-                (0, carry, table(segments, of_starts)),
-                max_steps=None,
-                buffers=lambda carry: (buffers(carry[1][0]), carry[1][2], carry[2]),
-                kind="lax",
-            )
-        found.append((carry[0], carry[2], starts))
-        return carry[0]
+        starts = None if segments == 1 else of_starts.blank(segments + 1)
+        last, _, rows, starts = while_loop(
+            lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < max_steps),
+            body,
+            (init, since, layout.blank(size), starts),
+            max_steps=None,
+            buffers=lambda carry: (buffers(carry[0]), carry[2], carry[3]),
+            kind="lax",
+        )
+        found.append((last, rows, starts))
+        return last
 
     _run(outer, terms, args, init_state, fixed, max_steps)
     return found[0]
+
+
+def _row(steps, terms, since, old, new) -> Row:
+    """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
+    return Row(since, old.tnext, steps.row(terms, old, new))
+
+
+def _step_with_row(body_fun, steps, terms, layout):
+    """A step of diffrax's loop that writes its row, if it is accepted."""
+
+    def step(old, since, rows):
+        new = body_fun(old)
+        kept = new.num_accepted_steps > old.num_accepted_steps
+        packed = layout.packed(_row(steps, terms, since, old, new))
+        index = old.num_accepted_steps % rows[0].shape[0]
+        rows = [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
+        return new, jnp.where(kept, old.tnext, since), rows
+
+    return step
 
 
 def _start_of(since, state, jumps):
@@ -473,22 +468,23 @@ def _start_of(since, state, jumps):
 class Segments(eqx.Module):
     """The segments of a run that has more steps than rows are kept of, whose rows are found again from their starts.
 
-    **Fields:** the packed `starts`; the `layout` of a start; `first`: the state of diffrax's loop at the start of the
-    run; what is `fixed` in it.
+    **Fields:** the packed `starts`; the layouts `of_starts` and `of_rows`; `first`: the state of diffrax's loop at the
+    start of the run; what is `fixed` in it.
     """
 
     starts: list[Array]
-    layout: "Layout" = eqx.field(static=True)
+    of_starts: "Layout" = eqx.field(static=True)
+    of_rows: "Layout" = eqx.field(static=True)
     first: Any
     fixed: Any
     max_steps: int = eqx.field(static=True)
 
-    def rows(self, terms: PyTree, args: PyTree, segment: Any, size: int) -> list[Array]:
-        """The rows of a segment."""
+    def rows(self, terms: PyTree, args: PyTree, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
+        """The rows of a segment, in these buffers; where they are not `lost`, the same."""
         solver, saveat, options, steps = self.fixed
         saveat = eqx.tree_at(lambda saveat: (saveat.subs, saveat.dense), saveat, (None, False), is_leaf=_is_none)
         options = options | {"event": None, "progress_meter": diffrax.NoProgressMeter()}
-        start = self.layout.unpacked([buffer[segment] for buffer in self.starts])
+        start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])
         since, (*given, made_jump, solver_state, controller_state, count) = start
         places = lambda s: (
             *(s.tprev, s.tnext, s.y, s.made_jump, s.solver_state, s.controller_state, s.num_accepted_steps),
@@ -498,9 +494,21 @@ class Segments(eqx.Module):
         made_jump = False if made_jump is None else made_jump
         new = (*given, made_jump, solver_state, controller_state, count, *[None] * 10)
         init_state = eqx.tree_at(places, self.first, new, is_leaf=_is_none)
-        fixed = solver, saveat, options, steps
-        last = (segment + 1) * size
-        return _run_recorded(terms, args, init_state, fixed, self.max_steps, size, None, last, since)[1]
+        last, found = jnp.where(lost, (segment + 1) * rows[0].shape[0], 0), []
+
+        def outer(cond_fun, body_fun, init, *, max_steps, buffers):
+            del max_steps
+            step = _step_with_row(body_fun, steps, terms, self.of_rows)
+            proceed = lambda carry: cond_fun(carry[0]) & (carry[0].num_accepted_steps < last)
+            own = lambda carry: (buffers(carry[0]), carry[2])
+            carry = while_loop(
+                proceed, lambda carry: step(*carry), (init, since, rows), max_steps=None, buffers=own, kind="lax"
+            )
+            found.append(carry[2])
+            return carry[0]
+
+        _run(outer, terms, args, init_state, (solver, saveat, options, steps), self.max_steps)
+        return found[0]
 
 
 @_recorded.def_jvp
@@ -521,33 +529,34 @@ def _recorded_jvp(primals, tangents):
         Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)
     )
-    row = lambda a, b: Row(b.tprev, b.tprev, steps.row(equations[0], a, b))
+    row = lambda a, b: _row(steps, equations[0], b.tprev, a, b)
+    layout = Layout(eqx.filter_eval_shape(row, init_state, final))
     mesh = Mesh(
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
         rows=rows,
-        layout=Layout(eqx.filter_eval_shape(row, init_state, final)),
+        layout=layout,
         count=final.num_accepted_steps,
         saved=saved,
         like=y0,
         memory=memory,
         dense=max_steps if saveat.dense else 0,
         event=options["event"] is not None,
-        segments=_segments(starts, final, init_state, fixed, max_steps),
+        segments=_segments(starts, layout, final, init_state, fixed, max_steps),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
-    again = lambda mesh, x: mesh.of_one_segment().push(x), lambda mesh, x: mesh.of_one_segment().pull(x)
+    again = lambda mesh, *x: mesh.of_one_segment().push(*x), lambda mesh, x: mesh.of_one_segment().pull(x)
     along = linear_map(Mesh.push, Mesh.pull, again, mesh, x, like)
     return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, starts))
 
 
-def _segments(starts, final, init_state, fixed, max_steps):
+def _segments(starts, of_rows, final, init_state, fixed, max_steps):
     if starts is None:
         return None
-    layout = Layout(eqx.filter_eval_shape(lambda state: _start_of(state.tprev, state, fixed[3].jumps), final))
+    of_starts = Layout(eqx.filter_eval_shape(lambda state: _start_of(state.tprev, state, fixed[3].jumps), final))
     first, fixed = freeze((init_state, fixed))
-    return Segments(starts, layout, first, fixed, max_steps)
+    return Segments(starts, of_starts, of_rows, first, fixed, max_steps)
 
 
 def _of_loop(final, along: Tangents, like):

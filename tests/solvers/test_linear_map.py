@@ -11,8 +11,10 @@ RESIDUAL = np.array([[0.1, 0.7, -0.4], [1.3, 0.2, 0.5]])
 X = np.array([1.0, -2.0, 0.5])
 
 
-def there(residual, x):
-    return {"first": jnp.sin(residual) @ x["x"], "unused": None, "sum": jnp.sum(residual) * x["x"]}
+def there(residual, x, used):
+    # What is not used may be anything.
+    first = jnp.sin(residual) @ x["x"] if used["first"] else jnp.full(2, jnp.nan)
+    return {"first": first, "unused": None, "sum": jnp.sum(residual) * x["x"] if used["sum"] else jnp.full(3, jnp.nan)}
 
 
 def back(residual, cotangents):
@@ -28,7 +30,7 @@ def mapped(residual, x):
 
 
 def plain(residual, x):
-    out = there(residual, {"x": x})
+    out = there(residual, {"x": x}, {"first": True, "sum": True})
     return jnp.concatenate([out["first"], out["sum"]])
 
 
@@ -44,6 +46,24 @@ def test_derivatives_are_those_of_the_map():
     # Only one of the outputs has a cotangent.
     one = lambda f: jax.grad(lambda x: jnp.sum(f(RESIDUAL, x)[:2] ** 2))
     np.testing.assert_allclose(one(mapped)(X), one(plain)(X), rtol=1e-14)
+
+
+def test_values_that_are_not_used_are_not_asked_for():
+    asked = []
+
+    def watched(residual, x, used):
+        asked.append(used)
+        return there(residual, x, used)
+
+    def sum_only(x):
+        x, like = {"x": x, "nothing": None}, {"first": jnp.zeros(2), "unused": None, "sum": jnp.zeros(3)}
+        return linear_map(watched, back, (watched, back), RESIDUAL, x, like)["sum"]
+
+    for function, shape in ((sum_only, ()), (jax.vmap(sum_only), (2,)), (jax.vmap(jax.vmap(sum_only)), (2, 2))):
+        asked.clear()
+        x = np.broadcast_to(X, (*shape, 3))
+        np.testing.assert_allclose(jax.jit(function)(x), np.sum(RESIDUAL) * x, rtol=1e-14)
+        assert asked and all(used["sum"] and not used["first"] for used in asked)
 
 
 def test_derivatives_of_derivatives_and_batches():
