@@ -107,7 +107,7 @@ def simulate(
     - `dt0`: first step [s], default chosen from the motion.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate instead, one of diffrax's. The default serves `jax.grad`, `jvp`, `jacfwd`,
-        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 4096 steps (at most
+        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 2048 steps (at most
         128 MB with `Adams`, about eight times as much with solvers whose steps are differentiated as they are), and of
         longer runs finds those of each part again. With `Adams` a gradient costs about three runs, whatever the number
         of parameters; forward mode costs as much for one parameter and somewhat less than half a run for each further

@@ -15,10 +15,9 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, PyTree
 
-from .._compat import any_of_batch, buffer_set, loop_of_diffrax, save_states, while_loop
+from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
 from .evaluation import freeze, ravel, unravel_like
 from .linear_map import filled, linear_map
 from .steps import AbstractSteps, LinearStep, Moving
