@@ -269,8 +269,9 @@ class Trajectory(eqx.Module):
         finite = np.isfinite(np.asarray(self.ts))
         if finite.all():
             return self
-        where = lambda t: (t.ts, t.ys)
-        return eqx.tree_at(where, self, (self.ts[finite], jax.tree.map(lambda y: y[finite], self.ys)))
+        # By NumPy, since each number of times would be a program.
+        kept = lambda x: jax.device_put(np.asarray(x)[finite])
+        return eqx.tree_at(lambda t: (t.ts, t.ys), self, jax.tree.map(kept, (self.ts, self.ys)))
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""

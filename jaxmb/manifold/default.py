@@ -31,15 +31,19 @@ class Unconstrained(AbstractManifold):
         return project_normalized
 
 
+# Defaults, made once: their construction takes as long as all the rest of a call.
+_UNCONSTRAINED, _PROJECTION, _PARTITION = Unconstrained(), Projection(), Partition()
+
+
 def default_manifold(
     system: AbstractEquation, solver: diffrax.AbstractSolver, formulation: AbstractFormulation | None
 ) -> AbstractManifold:
     """The policy that suits a system, a solver, and a formulation if one is given."""
     implicit = isinstance(solver, AbstractMultistep) and solver.solves_implicitly
     if system.acceleration_rows == 0:
-        return Projection() if implicit and system.implicit_in_blocks else Unconstrained()
+        return _PROJECTION if implicit and system.implicit_in_blocks else _UNCONSTRAINED
     if not isinstance(solver, AbstractMultistep):
-        return Projection()
+        return _PROJECTION
     # Block elimination serves multipliers only: it singles out no independent columns.
     in_blocks = system.elimination is not None and (formulation is None or formulation.takes_blocks)
-    return Projection() if in_blocks and (system.implicit_in_blocks or not implicit) else Partition()
+    return _PROJECTION if in_blocks and (system.implicit_in_blocks or not implicit) else _PARTITION

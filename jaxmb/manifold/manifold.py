@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, PyTree
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, accelerations
@@ -21,6 +21,10 @@ else:
     from equinox import AbstractVar
 
 Correction = Callable[[AbstractEquation, Scalar, State], State]
+
+
+# Defaults, made once.
+_MULTIPLIERS, _NULL_SPACE = Multipliers(), NullSpace()
 
 
 class AbstractManifold(eqx.Module):
@@ -47,7 +51,7 @@ class AbstractManifold(eqx.Module):
         """The formulation of a simulation that names none: the cheapest one that the mass matrix allows, of those that
         need no partition of the velocities.
         """
-        return Multipliers() if system.positive_definite_mass else NullSpace()
+        return _MULTIPLIERS if system.positive_definite_mass else _NULL_SPACE
 
     @abc.abstractmethod
     def correction(self, interpolated: bool) -> Correction | None:
@@ -61,15 +65,27 @@ class AbstractManifold(eqx.Module):
         del solver_state
         return {}
 
-    def diagnose(
-        self, system: AbstractEquation, t: Scalar, y: State, solver_state: Any, result: Any, failed: Bool[Array, ""]
-    ) -> Any:
-        """The outcome of a simulation, made precise where the policy knows why it failed.
-
-        **Arguments:** `t`, `y`: the last state; `result`: a `RESULTS`; `failed`: whether it is a failure that starts
-        from finite numbers.
+    def violated(self, system: AbstractEquation, t: Scalar, y: State) -> Any:
+        """Whether the end of a simulation violates rows of the constraints that the policy leaves out; False if it
+        leaves out none.
         """
-        del system, t, y, solver_state, failed
+        del system, t, y
+        return False
+
+    def evidence(self, solver_state: Any) -> PyTree[Array]:
+        """What `diagnose` needs of the final state of the solver."""
+        del solver_state
+        return None
+
+    def diagnose(
+        self, system: AbstractEquation, t: Scalar, y: State, evidence: PyTree[Array], result: Any, failed: Any
+    ) -> Any:
+        """The outcome of a simulation that failed, made precise where the policy knows why.
+
+        **Arguments:** `t`, `y`: the last state; `evidence` of the solver there; `result`: a `RESULTS`; `failed`:
+        whether it is a failure that starts from finite numbers.
+        """
+        del system, t, y, evidence, failed
         return result
 
 

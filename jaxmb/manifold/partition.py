@@ -275,6 +275,10 @@ class ChartConstraints(AbstractConstraints):
         return particular - factor.null_space @ solve_positive(reduced, load)
 
 
+# The default, made once.
+_PARTITIONED = Partitioned()
+
+
 class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
@@ -312,7 +316,7 @@ class Partition(AbstractManifold):
         return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
 
     def default_formulation(self, system):
-        return Partitioned()
+        return _PARTITIONED
 
     def correction(self, interpolated):
         return project_normalized if interpolated else None
@@ -320,14 +324,17 @@ class Partition(AbstractManifold):
     def statistics(self, solver_state):
         return {"newton_iterations": solver_state.chart.newton, "charts": solver_state.chart.charts}
 
-    def diagnose(self, system, t, y, solver_state, result, failed):
+    def evidence(self, solver_state):
         chart = solver_state.chart
-        result = diagnose(system, t, y, chart.singular, result, failed)
-        if chart.redundant is None:
+        return chart.singular, None if chart.redundant is None else chart.redundant.violation
+
+    def diagnose(self, system, t, y, evidence, result, failed):
+        singular, violation = evidence
+        result = diagnose(system, t, y, singular, result, failed)
+        if violation is None:
             return result
         # Steps were refused until they led up to the violation that is allowed.
-        violated = failed & (chart.redundant.violation > 0.5)
-        return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
+        return RESULTS.where(failed & (violation > 0.5), RESULTS.inconsistent_constraints, result)
 
 
 class RedundantRows(eqx.Module):

@@ -10,7 +10,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._compat import WrappedSolver, cond_of_any_lane, direction_of
-from .._results import RESULTS
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass, solve_constrained
@@ -95,16 +94,14 @@ class Projection(AbstractManifold):
     def correction(self, interpolated):
         return _returned if interpolated else None
 
-    def diagnose(self, system, t, y, solver_state, result, failed):
+    def violated(self, system, t, y):
+        return _violated(*lax.stop_gradient((system, t, y))) if drops_rows(system) else False
+
+    def diagnose(self, system, t, y, evidence, result, failed):
         if system.elimination is None:
-            result = diagnose(system, t, y, jnp.array(False), result, failed)
-        elif system.velocity_rows:
-            # The rank of constraints that are eliminated along the graph of joints is not looked at.
-            result = diagnose_newton(result, failed)
-        if not drops_rows(system):
-            return result
-        violated = _violated(*lax.stop_gradient((system, t, y)))
-        return RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
+            return diagnose(system, t, y, jnp.array(False), result, failed)
+        # The rank of constraints that are eliminated along the graph of joints is not looked at.
+        return diagnose_newton(result, failed) if system.velocity_rows else result
 
 
 def _inertia(system, t, y):

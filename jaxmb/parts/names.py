@@ -66,10 +66,13 @@ def check_arguments(what: str, signature: inspect.Signature, positional: int, na
 def names_arguments(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """A function whose error for an unknown argument names the nearest one, or all that it takes."""
     signature = inspect.signature(function)
+    taken = signature.parameters
+    by_place = sum(own.kind is not inspect.Parameter.KEYWORD_ONLY for own in taken.values())
 
     @functools.wraps(function)
     def checked(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        check_arguments(function.__name__, signature, len(args), kwargs)
+        if len(args) > by_place or not kwargs.keys() <= taken.keys():
+            check_arguments(function.__name__, signature, len(args), kwargs)
         return function(*args, **kwargs)
 
     return checked

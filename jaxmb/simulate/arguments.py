@@ -1,15 +1,18 @@
 """Checks of the arguments of `simulate`, and their defaults."""
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import check_kind, real_array
+from .._compat import default_float
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import as_array, is_traced
@@ -21,6 +24,8 @@ from ..system import AbstractSystem
 from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
+# A program saves at this number of times, or at a power of 2 of them.
+_FEWEST_TIMES = 16
 
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
@@ -96,6 +101,7 @@ def named_solver(name: str, state: State) -> Adams:
 
 
 def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
+    """`rtol`, and `atol` or None."""
     dtype = state.q.dtype
     least = 10 * float(jnp.finfo(dtype).eps)
     relative = real_array("rtol", rtol, dtype)
@@ -114,19 +120,19 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
             stacklevel=3,
         )
         relative = as_array(least, dtype)
-    return relative, relative / 100 if absolute is None else absolute
+    return relative, absolute
 
 
 def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
     if saveat is None:
-        return diffrax.SaveAt(t1=True)
+        return _END
     if isinstance(saveat, diffrax.SaveAt):
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
         if saveat.subs is not None and saveat.subs.ts is not None:
             _check_saved_times(saveat.subs.ts, start, end)
         return saveat
-    return diffrax.SaveAt(ts=jax.device_put(_check_saved_times(saveat, start, end)))
+    return diffrax.SaveAt(ts=_check_saved_times(saveat, start, end))
 
 
 def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
@@ -154,12 +160,39 @@ def checked_jumps(jumps: Any, of_inputs: np.ndarray) -> Any:
     return jnp.sort(jnp.concatenate([jnp.asarray(times), jnp.asarray(of_inputs, times.dtype)]))
 
 
+# The state at the end, and what `with_end` makes of that.
+_END = diffrax.SaveAt(t1=True)
+_ENDS = diffrax.SaveAt(subs=(_END.subs, diffrax.SubSaveAt(t1=True)), solver_state=True, controller_state=True)
+
+
 def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     """The user's series and, for statistics and diagnosis, the end state."""
+    if saveat is _END:
+        return _ENDS
     first = saveat.subs if saveat.subs is not None else diffrax.SubSaveAt(t1=True)
     return diffrax.SaveAt(
         subs=(first, diffrax.SubSaveAt(t1=True)), dense=saveat.dense, solver_state=True, controller_state=True
     )
+
+
+def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
+    """The same with times behind the end of the run, which are not saved: one program serves several numbers of them."""
+    first = saveat.subs[0]
+    if first.ts is None or first.ts.shape[0] == 0:
+        return saveat
+    more = max(_FEWEST_TIMES, 2 ** math.ceil(math.log2(first.ts.shape[0]))) - first.ts.shape[0]
+    never = np.full(more, np.inf if end >= start else -np.inf, first.ts.dtype)
+    times = np.concatenate([np.asarray(first.ts), never])
+    return eqx.tree_at(lambda saveat: saveat.subs[0].ts, saveat, times)
+
+
+def room_for(max_steps: int, saveat: diffrax.SaveAt) -> int:
+    """How many steps a program has room for: `max_steps` if it keeps something of each, otherwise the next power of 4,
+    so that one program serves several numbers.
+    """
+    if saveat.dense or saveat.subs[0].steps:
+        return max_steps
+    return 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9)
 
 
 def checked_state(system: AbstractSystem, state: Any) -> State:
@@ -180,7 +213,10 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
                 f"{f' and {system.nz} internal states' if system.nz else ''}, got state.{name} of shape "
                 f"{np.shape(value)}."
             )
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float)), state)
+    dtype = default_float()
+    if all(isinstance(x, jax.Array) and x.dtype == dtype for x in jax.tree.leaves(state)):
+        return state
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), state)
 
 
 def checked_times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:

@@ -21,16 +21,19 @@ _ENOUGH, _LOOKED = 200, 256
 class Outcome(NamedTuple):
     """How a simulation ended, beside its `Trajectory`.
 
-    **Fields:** whether it `failed`; the last time `t` and state `y`; `step`: the length of the next step, None where
-    the controller does not tell; `coupling` of friction with its own reactions where that is the reason of a failure,
-    None without friction.
+    **Fields:** `flags`: whether it failed, whether it started from a state that violates the constraints, whether it
+    got stuck on its way, and whether nothing of what was to be saved is missing; the last time `t` and state `y`;
+    `step`: the length of the next step, None where the controller does not tell; `coupling` of friction with its own
+    reactions where that is the reason of a failure, None without friction; `evidence` by which the manifold diagnoses a
+    failure.
     """
 
-    failed: Any
+    flags: Any
     t: Any
     y: Any
     step: Any
     coupling: Any
+    evidence: Any
 
 
 def about_friction(system, coupling) -> str:

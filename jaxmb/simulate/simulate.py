@@ -6,20 +6,20 @@ from typing import Literal
 
 import diffrax
 import equinox as eqx
+import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import ArrayLike
 
 from .._arguments import check_kind
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
-from ..linalg.failure import nan_where
 from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
+from ..states.consistency import consistent
 from ..system import AbstractSystem
-from ..system.inputs import Signals, check_inputs, input_break_times, with_inputs
+from ..system.inputs import Signals, input_break_times, with_inputs
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
@@ -31,14 +31,18 @@ from .arguments import (
     checked_state,
     checked_times,
     checked_tolerances,
-    default_controller,
     named_solver,
+    padded,
     parameter_changes,
+    room_for,
     with_end,
-    with_restarts,
 )
+from .compiling import told_of_compiling
 from .outcome import message_of_failure, warn_of_jumps, warn_of_stiffness
-from .solve import Problem, running_scales
+from .solve import Problem, made_precise, solved
+
+# Defaults, made once: their construction would take as long as the rest of a call.
+_ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
 
 
 @names_arguments
@@ -63,7 +67,7 @@ def simulate(
     direction: Mapping[str, VectorLike] | None = None,
     error: bool = False,
     max_steps: int = 65536,
-    throw: bool = True,
+    throw: bool | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Trajectory:
     """Integrate the motion of a system.
@@ -120,7 +124,10 @@ def simulate(
         then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
         does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
         A warning tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
-    - `event`, `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
+    - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
+        motion is NaN instead, with a `result` that says why; with `True` it is an error there as well, by a call of
+        Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`).
+    - `event`, `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
         some more steps are simulated; not under `jit`, `vmap` or a derivative.
 
@@ -129,7 +136,7 @@ def simulate(
     **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
     a state that violates the constraints (of other parameters, another system, another time), unless the manifold lets
     states drift; under a trace such a run fails instead, with `RESULTS.assembly_failed`;
-    `RuntimeError`, if `throw`, when the integration fails: the text of its `RESULTS` says how. With `throw=False` the
+    `RuntimeError`, unless `throw=False`, when the integration fails: the text of its `RESULTS` says how. Without it the
     trajectory up to there is kept, with times and states of infinity after it. Under `jit`, `vmap` or a derivative,
     where nothing can be kept for some members of a batch only, a motion that fails is NaN as a whole, and so
     are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
@@ -159,74 +166,94 @@ def simulate(
     relative, absolute = checked_tolerances(rtol, atol, state)
     times = checked_times(t0, t1, dt0, state.q.dtype)
     check_steps(max_steps)
-    method = named_solver(solver, state) if isinstance(solver, str) else Adams() if solver is None else solver
+    method = named_solver(solver, state) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     if error:
         check_error_estimate(saveat, stepsize_controller, event)
-    check_inputs(system, times["t0"], times["t1"])
-    restarts = checked_jumps(jumps, input_break_times(system))
-    saved = checked_saveat(saveat, times["t0"], times["t1"])
-    if stepsize_controller is None:
-        scales = running_scales(system, state, times) if atol is None else None
-        stepsize_controller = default_controller(method, relative, absolute, scales)
-    options = times | {
-        "y0": state,
-        "saveat": with_end(saved),
-        "stepsize_controller": with_restarts(stepsize_controller, restarts),
-        "adjoint": adjoint,
-        "event": event,
-        "max_steps": max_steps,
-        "progress_meter": diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+    restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
+    saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
+    first = saved.subs[0]
+    numbers = {
+        "system": system,
+        "state": state,
+        "formulation": formulation,
+        "manifold": manifold,
+        "solver": method,
+        "controller": stepsize_controller,
+        "rtol": relative,
+        "atol": absolute,
+        "times": times,
+        "saveat": saved,
+        "restarts": restarts,
+        "changes": {} if direction is None else parameter_changes(system, direction),
     }
+    traced = is_traced(numbers)
+    if not traced:
+        numbers["saveat"] = padded(saved, times["t0"], times["t1"])
     problem = Problem(
-        system=system,
-        formulation=formulation,
-        manifold=manifold,
-        rtol=relative,
-        options=options,
-        restarts=restarts,
-        interpolated=event is not None or (saved.subs is not None and saved.subs.ts is not None),
-        changes={} if direction is None else parameter_changes(system, direction),
+        **numbers,
+        adjoint=adjoint,
+        event=event,
+        limit=np.asarray(max_steps),
+        room=max_steps if adjoint is not None else room_for(max_steps, saved),
+        progress_meter=_NO_METER if progress_meter is None else progress_meter,
+        interpolated=event is not None or first.ts is not None,
+        traced=traced,
+        moving=(is_traced(times["t0"]), is_traced((times["t1"], first.ts))),
     )
+    problem.check_jumps()
 
-    used = method
-    trajectory, outcome = problem.solved(used)
+    def run(problem):
+        if traced:
+            return *solved(problem), None
+        with told_of_compiling(system):
+            trajectory, outcome = solved(problem)
+            return trajectory, outcome, np.asarray(outcome.flags)
+
+    trajectory, outcome, flags = run(problem)
     if solver == "switch" and trajectory.stats["stiff"]:
         found = {name: trajectory.stats[name] for name in ("stiff", "stiff_steps")}
-        used = Hermite()
-        trajectory, outcome = problem.solved(used)
+        problem = problem._replace(solver=Hermite())
+        trajectory, outcome, flags = run(problem)
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if solver == "auto":
         warn_of_stiffness(trajectory.stats)
-    if system.acceleration_rows > 0 and not system.drift_free:
-        warn_of_jumps(system, outcome, times, restarts, jumps)
-
-    # Other runs of the same motion.
     again = functools.partial(simulate, t1=t1, formulation=formulation, manifold=manifold, jumps=jumps, throw=False)
-    if throw and not isinstance(outcome.failed, Tracer) and outcome.failed:
-        outcome, stats = lax.stop_gradient((outcome, trajectory.stats))
-        on = functools.partial(again, lax.stop_gradient(system), outcome.y, t0=outcome.t, rtol=relative)
-        probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=None if atol is None else absolute)
-        raise RuntimeError(message_of_failure(system, trajectory.result, times["t1"], outcome, stats, used, probe))
-    if is_traced((outcome.failed, trajectory.ys)):
-        # A derivative would be that of the part before the failure. The error goes with the value, and not with a
-        # derivative that is taken alone.
-        motion_of = lambda trajectory: [trajectory.ys, trajectory.interpolation]
-        spoiled = nan_where(outcome.failed, motion_of(trajectory), (system, state, options, formulation, manifold))
-        trajectory = eqx.tree_at(motion_of, trajectory, spoiled, is_leaf=lambda leaf: leaf is None)
+    if flags is not None:
+        failed, inconsistent, stuck, whole = flags
+        if inconsistent:
+            consistent(system, times["t0"], state)
+        if stuck:
+            result, coupling = made_precise(problem, trajectory.result, outcome)
+            trajectory = eqx.tree_at(lambda trajectory: trajectory.result, trajectory, result)
+            outcome = outcome._replace(coupling=coupling)
+        if system.acceleration_rows > 0 and not system.drift_free:
+            warn_of_jumps(system, outcome, times, restarts, jumps)
+        if failed and throw is not False:
+            # Other runs of the same motion.
+            on = functools.partial(again, system, outcome.y, t0=outcome.t, rtol=relative)
+            probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=absolute)
+            text = message_of_failure(
+                system, trajectory.result, times["t1"], outcome, trajectory.stats, problem.solver, probe
+            )
+            raise RuntimeError(text)
+        if not whole:
+            trajectory = trajectory.trimmed()
+    else:
+        trajectory = trajectory.trimmed()
         if throw:
-            trajectory = trajectory.result.error_if(trajectory, outcome.failed)
+            trajectory = trajectory.result.error_if(trajectory, outcome.flags[0])
     if error:
         closer = again(
-            *lax.stop_gradient((system, state)),
+            *(lax.stop_gradient((system, state)) if traced else (system, state)),
             t0=t0,
             dt0=dt0,
             saveat=saveat,
-            solver=used,
+            solver=problem.solver,
             rtol=relative / 10,
-            atol=None if atol is None else absolute / 10,
+            atol=None if absolute is None else absolute / 10,
             adjoint=adjoint,
             max_steps=max_steps,
         )
         trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)
-    return trajectory.trimmed()
+    return trajectory

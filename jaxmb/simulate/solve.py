@@ -10,7 +10,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._results import RESULTS
+from .._types import State
 from ..formulations import AbstractFormulation
+from ..linalg.failure import nan_where
+from ..linalg.jitted import jitted
 from ..manifold import (
     AbstractManifold,
     after_jumps,
@@ -21,11 +24,14 @@ from ..manifold import (
 )
 from ..manifold.diagnosis import diagnose_friction
 from ..solvers import AbstractMultistep, MeshAdjoint, RunningScales, TangentControl, intended_step, with_tangents
-from ..states.consistency import consistent
+from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
-from .moving_times import at_frozen_start, at_moving_times, is_moving, saved_times
+from .arguments import default_controller, with_restarts
+from .compiling import tracing_begins
+from .loop import Loop
+from .moving_times import at_frozen_start, at_moving_times, saved_times
 from .outcome import Outcome, has_failed
 
 # Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
@@ -35,148 +41,214 @@ _MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
-    **Fields:** the `system`; `formulation` and `manifold`, None for those that suit the solver; `rtol`; `options` of
-    `diffrax.diffeqsolve`; times of `restarts`, or None; whether states are `interpolated`; `changes`: values of
-    parameters with changes whose tangent is watched, by name.
+    **Fields:** `system` and `state` at the start; `formulation` and `manifold`, None for those that suit the `solver`;
+    `controller`, None for that of `rtol` and `atol`, and atol None for running scales; `times`: t0, t1, dt0; `saveat`;
+    `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and `room`: that which
+    the program has room for; `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with
+    changes whose tangent is watched, by name; whether states are `interpolated`; whether anything is `traced`; whether
+    the start, and the end or a saved time, are `moving`.
     """
 
     system: AbstractSystem
+    state: State
     formulation: AbstractFormulation | None
     manifold: AbstractManifold | None
+    solver: diffrax.AbstractSolver
+    controller: Any
     rtol: Any
-    options: dict[str, Any]
+    atol: Any
+    times: dict[str, Any]
+    saveat: diffrax.SaveAt
+    adjoint: Any
+    event: Any
+    limit: Any
+    room: int
+    progress_meter: Any
     restarts: Any
-    interpolated: bool
     changes: dict[str, tuple[Any, Any]]
+    interpolated: bool
+    traced: bool
+    moving: tuple[bool, bool]
 
-    def solved(self, solver: diffrax.AbstractSolver) -> tuple[Trajectory, Outcome]:
-        """The motion by a solver, and how it ended."""
-        system, state = self.system, self.options["y0"]
-        valid = system.parameters_in_range()
-        policy = default_manifold(system, solver, self.formulation) if self.manifold is None else self.manifold
-        jumping = self.restarts is not None and system.velocity_rows > 0
-        if jumping and not (policy.takes_impulses and system.positive_definite_mass):
+    @property
+    def policy(self) -> AbstractManifold:
+        given = self.manifold
+        return default_manifold(self.system, self.solver, self.formulation) if given is None else given
+
+    @property
+    def method(self) -> AbstractFormulation:
+        given = self.formulation
+        return self.policy.default_formulation(self.system) if given is None else given
+
+    def check_jumps(self) -> None:
+        """Raise a `ValueError` where the velocities after an impulse would not be known."""
+        if self.restarts is None or self.system.velocity_rows == 0:
+            return
+        system, policy = self.system, self.policy
+        if not (policy.takes_impulses and system.positive_definite_mass):
             raise ValueError(
                 "With jumps, or inputs that jump, a constrained system needs manifold=Partition() or Projection(), and "
                 f"a mass matrix that has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
                 f"{system.positive_definite_mass}."
             )
-        method = policy.default_formulation(system) if self.formulation is None else self.formulation
 
-        def assembled(system):
-            term, prepared = policy.prepare(system, method, solver, self.rtol)
-            return with_internal_states(term), prepared
+    def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
+        """The term of a system, and the solver, prepared for it."""
+        term, prepared = self.policy.prepare(system, self.method, self.solver, self.rtol)
+        return with_internal_states(term), prepared
 
-        term, prepared = assembled(system)
-        start = consistent(system, self.options["t0"], state) if policy.restores else state
-        along = None
-        if self.changes:
-            moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in self.changes.items()})
-            along = eqx.filter_jvp(lambda step: assembled(moved(step))[0], (0.0,), (1.0,))[1]
-        options = self.options | {"y0": start}
-        moving = is_moving(options)
-        return integrate(system, method, policy, term, prepared, options, self.interpolated, along, valid, moving)
+    def options(self, start: State) -> dict[str, Any]:
+        """Those of `diffrax.diffeqsolve` from a start."""
+        controller, absolute = self.controller, self.rtol / 100 if self.atol is None else self.atol
+        if controller is None:
+            scales = running_scales(self.system, self.state, self.times) if self.atol is None else None
+            controller = default_controller(self.solver, self.rtol, absolute, scales)
+        return self.times | {
+            "y0": start,
+            "saveat": self.saveat,
+            "stepsize_controller": with_restarts(controller, self.restarts),
+            "event": self.event,
+            "max_steps": self.room,
+            "progress_meter": self.progress_meter,
+        }
 
 
-@eqx.filter_jit
-def integrate(system, formulation, manifold, term, solver, options, interpolated, direction, valid, moving):
-    start, first = options["y0"], options["saveat"].subs[0]
-    finite = jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)) & valid
-    if start.z is not None:
-        finite = finite & jnp.all(jnp.isfinite(start.z))
+def solved(problem: Problem) -> tuple[Trajectory, Outcome]:
+    """The motion, and how it ended; where anything is traced, a motion that failed is NaN."""
+    motion, outcome = _solved(problem)
+    return Trajectory(problem.system, problem.method, *motion), outcome
+
+
+@jitted
+def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
+    """What the program returns: fields of the `Trajectory` but the system, which comes in already."""
+    tracing_begins()
+    system, policy, times = problem.system, problem.policy, problem.times
+    valid = system.parameters_in_range() if problem.traced else True
+    term, solver = problem.assembled(system)
+    consistent = is_consistent(system, times["t0"], problem.state) if policy.restores else True
+    start = problem.state
+    if consistent is not True:
+        start = jax.tree.map(lambda x: jnp.where(consistent, x, jnp.nan), start)
+    direction = None
+    if problem.changes:
+        moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in problem.changes.items()})
+        direction = eqx.filter_jvp(lambda step: problem.assembled(moved(step))[0], (0.0,), (1.0,))[1]
+    finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(start)]) & valid
+
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
-    ends = options["t0"], options["t1"]
-    options = options | lax.stop_gradient({name: options[name] for name in ("t0", "t1", "dt0")})
-    if moving[0]:
-        start = at_frozen_start(term, ends[0], start)
-        options["y0"] = start
-    at_once, times = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
-    options = options | {"t1": at_once(options["t1"])}
-    controller, after = options["stepsize_controller"], times
+    first = problem.saveat.subs[0]
+    options = problem.options(start) | lax.stop_gradient(times)
+    if problem.moving[0]:
+        options["y0"] = start = at_frozen_start(term, times["t0"], start)
+    at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
+    options["t1"] = at_once(options["t1"])
+    controller, after = options["stepsize_controller"], saved_at
     jumps = controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
-    if times is not None:
+    if saved_at is not None:
         if jumps is not None:
             # States that are saved at a jump are those after it, also in a run that comes to it from there.
-            after = after_jumps(times, jumps, options["t0"], options["t1"])
+            after = after_jumps(saved_at, jumps, options["t0"], options["t1"])
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
-    solution: Any = _solve(term, solver, options, _tangent_control(system, options, direction))
+    control = _tangent_control(system, options, direction)
+    solution: Any = _solve_on_mesh((term, solver, options), control, problem.adjoint, problem.limit)
     ts, saved = solution.ts[0], solution.ys[0]
-    if times is not None:
+    if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
-    correction, lost = manifold.correction(interpolated), None
+    correction, lost = policy.correction(problem.interpolated), None
     # `SaveAt(fn=...)` may save something else than states.
-    are_states = jax.tree.structure(saved) == jax.tree.structure(options["y0"])
+    are_states = jax.tree.structure(saved) == jax.tree.structure(start)
     if are_states and correction is not None:
         saved, lost = _corrected(system, options, ts, saved, correction)
-    if after is not times:
-        ts = _replaced(ts, after, times)
-    if any(moving):
-        ts = saved_times(first, ts, *ends)
-        if are_states and moving[1]:
+    if after is not saved_at:
+        ts = _replaced(ts, after, saved_at)
+    if any(problem.moving):
+        ts = saved_times(first, ts, times["t0"], times["t1"])
+        if are_states and problem.moving[1]:
             saved = at_moving_times(term, ts, saved)
+
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
-    stuck = has_failed(result) & finite
-    result = manifold.diagnose(system, *end, solution.solver_state, result, stuck)
+    stuck, coupling = has_failed(result) & finite, None
+    evidence = policy.evidence(solution.solver_state)
+    if problem.traced:
+        result, coupling = diagnosed(problem, *end, evidence, result, stuck)
+    violated = policy.violated(system, *end)
+    if violated is not False:
+        result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
     if lost is not None:
         result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
-    coupling = None
-    if system.friction_parts:
-        result, coupling = diagnose_friction(system, formulation, *end, result, stuck)
-    stats = dict(solution.stats)
+    stats = dict(solution.stats) | {"max_steps": problem.limit}
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
-    trajectory = Trajectory(
-        system=system,
-        formulation=formulation,
-        ts=ts,
-        ys=saved,
-        stats=stats | manifold.statistics(solution.solver_state),
-        result=result,
-        interpolation=solution.interpolation,
-        event_mask=solution.event_mask,
-    )
-    return trajectory, Outcome(has_failed(result), *end, intended_step(solution.controller_state), coupling)
+    stats |= policy.statistics(solution.solver_state)
+    motion = saved, solution.interpolation
+    failed = has_failed(result)
+    if problem.traced:
+        # A derivative would be that of the part before the failure. The error goes with the value, and not with a
+        # derivative that is taken alone.
+        inputs = system, problem.state, times, problem.formulation, problem.manifold
+        motion = nan_where(failed, motion, inputs)
+    flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts))])
+    outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)
+    return (ts, motion[0], stats, result, motion[1], solution.event_mask), outcome
 
 
-def _solve(term, solver, options, control):
-    """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
-    return _solve_on_mesh((term, solver, options), control)
+@eqx.filter_jit
+def made_precise(problem: Problem, result: Any, outcome: Outcome) -> tuple[Any, Any]:
+    """As `diagnosed`, of a run that got stuck: a program of its own, which only such runs need."""
+    stuck = result != RESULTS.inconsistent_constraints
+    return diagnosed(problem, outcome.t, outcome.y, outcome.evidence, result, stuck)
+
+
+def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any]:
+    """The result of a run that ended at a state, made precise where it got stuck, and the coupling of friction with its
+    own reactions there, None without friction.
+    """
+    system = problem.system
+    result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
+    if not system.friction_parts:
+        return result, None
+    return diagnose_friction(system, problem.method, t, y, result, stuck)
 
 
 @eqx.filter_custom_jvp
-def _solve_on_mesh(arguments, control):
+def _solve_on_mesh(arguments, control, adjoint, limit):
+    """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
     del control
     term, solver, options = arguments
-    adjoint = diffrax.ForwardMode() if options["adjoint"] is None else options["adjoint"]
-    return diffrax.diffeqsolve(term, solver, throw=False, **options | {"adjoint": adjoint})
+    return _solve_states(term, solver, options, adjoint, limit, None)
 
 
 @_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
-    arguments, control = primals
-    return eqx.filter_jvp(lambda arguments: _solve_with_tangents(arguments, control), (arguments,), (tangents[0],))
+    arguments, *fixed = primals
+    return eqx.filter_jvp(lambda arguments: _solve_with_tangents(arguments, *fixed), (arguments,), (tangents[0],))
 
 
-def _solve_with_tangents(arguments, control):
+def _solve_with_tangents(arguments, control, adjoint, limit):
     term, solver, options = arguments
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
-    adjoint = MeshAdjoint(_rows(options)) if options["adjoint"] is None else options["adjoint"]
-    solution = _solve_states(term, solver, **options | {"adjoint": adjoint})
+    solution = _solve_states(term, solver, options, adjoint, limit, MeshAdjoint(_rows(options)))
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 
-def _solve_states(term, solver, **options):
+def _solve_states(term, solver, options, adjoint, limit, derivatives):
     """The solution with states saved first, and then what the user's function makes of them."""
     function, states = options["saveat"].subs[0].fn, diffrax.SubSaveAt(t1=True).fn
-    if function is states:
-        return diffrax.diffeqsolve(term, solver, throw=False, **options)
-    saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], states)
-    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options | {"saveat": saveat})
+    saveat = options["saveat"]
+    if function is not states and derivatives is not None:
+        saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, saveat, states)
+    if adjoint is None:
+        adjoint, saveat = Loop.around(saveat, limit, derivatives)
+    options = options | {"adjoint": adjoint, "saveat": saveat}
+    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
+    if function is states or derivatives is None:
+        return solution
     ts, finite = solution.ts[0], jnp.isfinite(solution.ts[0])
 
     def saved(t, y, finite):

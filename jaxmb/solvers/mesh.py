@@ -118,15 +118,17 @@ class Mesh(eqx.Module):
 
     def _shapes(self) -> PyTree:
         """The shapes of the tangent of a step's dense output."""
-        run = lambda moved, memory: self.linearised(self.row(self.rows, 0)).push(moved, ravel(self.like), memory)[2]
+        run: Any = lambda moved, memory: self.linearised(self.row(self.rows, 0)).push(moved, ravel(self.like), memory)[
+            2
+        ]
         return eqx.filter_eval_shape(run, self.moved, self.memory)
 
     def push(self, x: PyTree, used: Tangents) -> Tangents:
         """The tangents that one of the terms, one of the first state and one of its memory cause; those of the rows are
         zeros unless they are `used`.
         """
-        blank = self.blank()
-        first = self._first(*x[1], blank if any(used.rows) else blank._replace(rows=[]))
+        blank, (w, memory) = self.blank(), x[1]
+        first = self._first(w, memory, blank if any(used.rows) else blank._replace(rows=[]))
         if self.segments is None:
             return self._out(self._pushed(x[0], first, self.rows, self.count), blank)
 
@@ -346,23 +348,28 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
     most: int = eqx.field(static=True)
 
-    def loop(
+    def loop(self, *, max_steps, **options):
+        return self.run(max_steps, max_steps, **options)
+
+    def run(
         self,
+        max_steps: int,
+        limit: Any,
         *,
         terms,
         args,
         solver,
         saveat,
         init_state,
-        max_steps,
         throw,
         passed_solver_state,
         passed_controller_state,
         **options,
     ):
+        """diffrax's loop with room for `max_steps` steps, of which `limit` are taken at most."""
         del throw, passed_solver_state, passed_controller_state
         steps, own = steps_of(solver, options["stepsize_controller"])
-        fixed = freeze((solver, saveat, options, steps))
+        fixed = freeze((solver, saveat, options, steps, limit))
         jumps = jump_times(options["stepsize_controller"])
         final, *_ = _recorded((terms, args, own), jumps, init_state, fixed, max_steps, self.most)
         given = lambda *_, **__: final
@@ -370,7 +377,7 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _run(outer, terms, args, init_state, fixed, max_steps):
-    solver, saveat, options, _ = fixed
+    solver, saveat, options, *_ = fixed
     return loop_of_diffrax(
         args=args,
         terms=terms,
@@ -396,9 +403,11 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
     terms, args, _ = equations
     size = min(most, max_steps)
     segments = -(-max_steps // size)
-    steps, found = fixed[3], []
+    *_, steps, limit = fixed
+    found = []
 
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
+        del max_steps
         since = jnp.asarray(-jnp.inf, init.tprev.dtype)
         layout = Layout(eqx.filter_eval_shape(lambda init: _row(steps, terms, since, init, body_fun(init)), init))
         of_starts = Layout(eqx.filter_eval_shape(lambda init: _start_of(since, body_fun(init), steps.jumps), init))
@@ -416,7 +425,7 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
 
         starts = None if segments == 1 else of_starts.blank(segments + 1)
         last, _, rows, starts = while_loop(
-            lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < max_steps),
+            lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
             (init, since, layout.blank(size), starts),
             max_steps=None,
@@ -480,7 +489,7 @@ class Segments(eqx.Module):
 
     def rows(self, terms: PyTree, args: PyTree, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
         """The rows of a segment, in these buffers; where they are not `lost`, the same."""
-        solver, saveat, options, steps = self.fixed
+        solver, saveat, options, steps, limit = self.fixed
         saveat = eqx.tree_at(lambda saveat: (saveat.subs, saveat.dense), saveat, (None, False), is_leaf=_is_none)
         options = options | {"event": None, "progress_meter": diffrax.NoProgressMeter()}
         start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])
@@ -506,7 +515,7 @@ class Segments(eqx.Module):
             found.append(carry[2])
             return carry[0]
 
-        _run(outer, terms, args, init_state, (solver, saveat, options, steps), self.max_steps)
+        _run(outer, terms, args, init_state, (solver, saveat, options, steps, limit), self.max_steps)
         return found[0]
 
 
@@ -516,7 +525,7 @@ def _recorded_jvp(primals, tangents):
     dequations, djumps, dinit, *_ = tangents
     out = _recorded(*primals)
     final, rows, starts = out
-    _, saveat, options, steps = fixed
+    _, saveat, options, steps, _ = fixed
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
     of_start = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))

@@ -45,7 +45,7 @@ def assemble(
     fix: Mapping[str, VectorLike] | None = None,
     rates: Mapping[str, VectorLike] | None = None,
     t: Scalar = 0.0,
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> State:
     """Find a consistent state near a guess.
 
@@ -61,14 +61,16 @@ def assemble(
         `"body.angular_velocity"` (body frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the
         quasi-velocities `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
-    - `throw`: whether a mechanism that cannot be assembled is an error. With `False` the state is NaN instead, so
-        that one member of a batch does not spoil the others; `assembly_gap` says how far it is from closing.
+    - `throw`: whether a mechanism that cannot be assembled is an error. By default it is, but under `jit`, `vmap` or
+        a derivative the state is NaN instead, so that one member of a batch does not spoil the others, as it is with
+        `False` everywhere; `assembly_gap` says how far it is from closing. With `True` it is an error under `jit` as
+        well, by a call of Python from the program, which JAX then does not keep on disk.
 
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
 
     **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
     coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the
-    degrees of freedom. Under `jit`, a run-time error without the names.
+    degrees of freedom. With `throw=True` under `jit`, a run-time error without the names.
     """
     check_system("assemble", system)
     guess = checked_guess("assemble", system, guess)
@@ -79,7 +81,8 @@ def assemble(
     u, fixed_rates = prescribe("rate", rates_of(system.rate_names()), rates, guess.u)
     if not is_traced(u):
         _check_finite(u, "rates")
-    q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, throw)
+    raises = throw is not False
+    q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, raises)
     if rates_of_joints:
         known = system.joint_coordinates()
         here = {name: system.joint_coordinate(known[name], t, q) for name in rates_of_joints}
@@ -89,7 +92,7 @@ def assemble(
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else closest_velocities(system, t, q, u, tuple(fixed_rates.tolist()))
     # Under a trace, results of concrete numbers are traced as well.
-    if throw and not is_traced((ok, ok_rates)):
+    if raises and not is_traced((ok, ok_rates)):
         if not ok_rates:
             raise ValueError(_cannot_move(system, t, q, u, fixed_rates))
         return State(q, u, z)

@@ -57,6 +57,14 @@ def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
     )
 
 
+def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
+    """Whether a state satisfies the constraints; True without any."""
+    if system.velocity_rows == 0:
+        return True
+    positions, velocities = _violated(*lax.stop_gradient((system, t, state)))
+    return ~(jnp.any(positions) | jnp.any(velocities))
+
+
 @eqx.filter_jit
 def _violated(system, t, y) -> Any:
     y = dataclasses.replace(y, q=system.normalize(y.q))

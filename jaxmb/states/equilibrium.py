@@ -52,7 +52,7 @@ def equilibrium(
     fix: Mapping[str, VectorLike] | None = None,
     t: Scalar = 0.0,
     stable: bool = True,
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> State:
     """Find a static equilibrium near a guess, by default one that is stable: a pendulum hangs.
 
@@ -74,15 +74,17 @@ def equilibrium(
     - `t`: the time, for forces and drivers that depend on it [s].
     - `stable`: with `False` the search is Newton's method on the balance of forces, which goes to an equilibrium near
         the guess whether it is stable or not, such as that of a pendulum upright.
-    - `throw`: whether a failed search is an error. With `False` the state is NaN instead, so that one member of a
-        batch does not spoil the others.
+    - `throw`: whether a failed search is an error. By default it is, but under `jit`, `vmap` or a derivative the state
+        is NaN instead, so that one member of a batch does not spoil the others, as it is with `False` everywhere. With
+        `True` it is an error under `jit` as well, by a call of Python from the program, which JAX then does not keep
+        on disk.
 
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
     **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
     internal states change, if there is no equilibrium, or only one that is not stable; the message names the
-    coordinates that are unbalanced, or along which the equilibrium falls. Under `jit` a run-time error without the
-    names.
+    coordinates that are unbalanced, or along which the equilibrium falls. With `throw=True` under `jit`, a run-time
+    error without the names.
     """
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
@@ -94,22 +96,23 @@ def equilibrium(
     z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
     system = holding(system if z is None else system.with_states(z), of_joints, {}, time)
-    start, fixed, assembled = configuration(system, guess.q, fix, time, throw)
+    raises = throw is not False
+    start, fixed, assembled = configuration(system, guess.q, fix, time, raises)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
     still = _still(system, time, start, u)
     concrete = not is_traced(still)
-    if concrete and throw and not bool(still):
+    if concrete and raises and not bool(still):
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
     q, unbalanced, falling, ok = _balanced(system, time, start, held, bool(stable))
-    if concrete and throw and not bool(ok):
+    if concrete and raises and not bool(ok):
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, unbalanced))
     steady = True if z is None else _steady(system, time, q, u)
-    if concrete and throw and not np.all(steady):
+    if concrete and raises and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
-    if throw and concrete:
+    if raises and concrete:
         return State(q, u, z)
     ok = ok & still & assembled & jnp.all(jnp.asarray(steady))
     if throw:

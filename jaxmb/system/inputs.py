@@ -50,13 +50,13 @@ def with_inputs(system: System, inputs: Signals) -> System:
     return system.with_signals(signals)
 
 
-def input_break_times(system: AbstractSystem) -> np.ndarray:
-    """Times [s] at which inputs jump, or their rates where constraints depend on them."""
-    own = [signal.break_times(of_rates=binding) for signal, binding in system.signals().values()]
-    return np.unique(np.concatenate([np.zeros(0), *own]))
+def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndarray:
+    """Times [s] at which inputs jump, or their rates where constraints depend on them.
 
-
-def check_inputs(system: AbstractSystem, t0: Scalar, t1: Scalar) -> None:
-    """Raise a `ValueError` that names an input which is not known from `t0` to `t1`."""
-    for name, (signal, _) in system.signals().items():
+    **Raises:** `ValueError` that names an input which is not known from `t0` to `t1`.
+    """
+    signals = system.signals()
+    for name, (signal, _) in signals.items():
         signal.check_interval(name, t0, t1)
+    own = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]
+    return np.unique(np.concatenate([np.zeros(0), *own])) if own else np.zeros(0)
