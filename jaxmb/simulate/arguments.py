@@ -176,7 +176,7 @@ def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
-    """The same with times behind the end of the run, which are not saved: one program serves several numbers of them."""
+    """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
     first = saveat.subs[0]
     if first.ts is None or first.ts.shape[0] == 0:
         return saveat

@@ -188,7 +188,7 @@ def simulate(
         "changes": {} if direction is None else parameter_changes(system, direction),
     }
     traced = is_traced(numbers)
-    if not traced:
+    if not traced and adjoint is None:
         numbers["saveat"] = padded(saved, times["t0"], times["t1"])
     problem = Problem(
         **numbers,

@@ -1,0 +1,101 @@
+"""Programs that a user's calls need, and what is told while one compiles."""
+
+import importlib
+import re
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb.simulate import compiling
+from jaxmb.simulate.loop import Loop
+
+# `jaxmb.simulate` is the function.
+solve = importlib.import_module("jaxmb.simulate.solve")
+
+
+@pytest.fixture
+def programs(monkeypatch):
+    """The solver's programs that are traced."""
+    traced = []
+    monkeypatch.setattr(solve, "tracing_begins", lambda: traced.append(None))
+    return traced
+
+
+def test_twenty_calls_of_a_user(programs):
+    """Times, tolerances, numbers of steps and of saved times, errors, other parameters: three programs."""
+    machine = mb.mechanisms.pendulum()
+    system, state = machine.system, machine.state
+    other = mb.with_parameters(system, {"bob.mass": 2.0})
+    run = lambda system=system, state=state, t1=0.1, **options: mb.simulate(system, state, t1=t1, **options)
+    run()
+    run(t1=0.2)
+    run(t0=0.05)
+    run(rtol=1e-6)
+    run(rtol=1e-6, atol=1e-9)
+    run(rtol=1e-6, atol=1e-8, max_steps=20_000)
+    run(max_steps=40_000)
+    run(throw=False)
+    run(other)
+    run(t1=-0.1)
+    run(state=mb.State(state.q, 0.5 * state.u))
+    motions = [run(saveat=np.linspace(0.0, 0.1, n)) for n in (3, 11, 16)]
+    motions += [run(saveat=np.linspace(0.0, 0.1, n), error=True) for n in (4, 12)]
+    run(t1=-0.1, saveat=-np.linspace(0.0, 0.1, 5))
+    for count in (17, 25, 32):
+        motions.append(run(saveat=np.linspace(0.0, 0.1, count)))
+    assert len(programs) == 4
+    for motion, count in zip(motions, (3, 11, 16, 4, 12, 17, 25, 32), strict=True):
+        np.testing.assert_array_equal(motion.ts, np.linspace(0.0, 0.1, count))
+        assert motion.ys.q.shape == (count, system.nq)
+        np.testing.assert_allclose(motion.ys.q[-1], motions[0].ys.q[-1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("end", [0.3, -0.3])
+def test_saved_states_are_those_of_diffrax(end):
+    """Whatever is saved beside the times."""
+    machine, ts = mb.mechanisms.pendulum(), jnp.linspace(0.0, end, 4)
+
+    def run(saveat, adjoint):
+        return mb.simulate(machine.system, machine.state, t1=end, saveat=saveat, max_steps=512, adjoint=adjoint)
+
+    for options in ({"t0": True}, {"t1": True}, {"t0": True, "t1": True}, {"steps": 3}, {}):
+        saveat = diffrax.SaveAt(ts=ts[1:3], **options)
+        own, theirs = run(saveat, None), run(saveat, diffrax.ForwardMode())
+        np.testing.assert_array_equal(own.ts, theirs.ts)
+        np.testing.assert_array_equal(own.ys.q, theirs.ys.q)
+    assert Loop.around(diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts),)), 1, None)[1].subs[0].ts is None
+
+
+def test_a_motion_that_fails_under_jit(programs):
+    """It is NaN, and an error where that is asked for."""
+    machine = mb.mechanisms.pendulum()
+
+    def end(t1, **options):
+        return mb.simulate(machine.system, machine.state, t1=t1, max_steps=4, **options).ys.q[-1]
+
+    with pytest.raises(RuntimeError, match="max_steps = 4 steps"):
+        end(1.0)
+    assert np.all(np.isnan(jax.jit(end)(1.0))) and np.all(np.isnan(jax.jacfwd(end)(1.0)))
+    with pytest.raises(Exception, match="maximum number of"):
+        jax.block_until_ready(jax.jit(lambda t1: end(t1, throw=True))(1.0))
+
+
+def test_a_user_is_told(monkeypatch, capsys):
+    machine = mb.mechanisms.pendulum()
+    # Each of these numbers of saved times is a program.
+    run = lambda count: mb.simulate(machine.system, machine.state, t1=0.1, saveat=np.linspace(0.0, 0.1, count))
+    monkeypatch.setattr(compiling, "_PATIENCE", 0.01)
+    run(128)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(compiling.sys.stderr, "isatty", lambda: True, raising=False)
+    run(128)
+    assert capsys.readouterr().err == ""
+    run(256)
+    text = capsys.readouterr().err
+    assert re.fullmatch(r"jaxmb: compiling a motion of bob \.\.\. \d+\.\d s; a later call takes [\d.]+ m?s\n", text)
+    jax.jit(lambda t1: mb.simulate(machine.system, machine.state, t1=t1, saveat=np.zeros(512)).ys.q)(0.1)
+    assert capsys.readouterr().err == ""
