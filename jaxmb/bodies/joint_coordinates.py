@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._compat import default_float
 from .._types import Scalar
 from ..parts.coordinate_parts import JointDriver
 from ..system.catalogue import AbstractSystem
@@ -38,12 +39,14 @@ def joint_coordinates(
     groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout, batch: int = 0
 ) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
-    space, out = layout.space, {}
-    ground: Any = np.asarray(space.ground, jnp.result_type(float))
-    poses = jnp.tile(space.prepare(ground), (layout.ground + 1, 1))
+    space, out, dtype = layout.space, {}, default_float()
+    ground = np.asarray(space.ground, dtype)
+    # Shapes only: nothing is computed.
+    poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)
+    time = jax.ShapeDtypeStruct((), dtype)
     for g, own in enumerate(groups):
         single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[batch:], x.dtype), own)
-        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), single, jnp.zeros(()), poses)
+        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), single, time, poses)
         for field, values in found.items():
             for k, name in enumerate(own.group.names):
                 coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._types import State
 from ..system.catalogue import AbstractSystem
@@ -54,13 +55,19 @@ def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
     """The motion of one body."""
     d = layout.space.dimension
     # The entries of a body are contiguous.
-    i, j = int(layout.pose_index[body][0]), int(layout.velocity_index[body][0])
-    position, velocity = ys.q[:, i : i + d], ys.u[:, j : j + d]
-    if not layout.rotates[body]:
+    return _cut(
+        int(layout.pose_index[body][0]), int(layout.velocity_index[body][0]), d, layout.rotates[body], ys.q, ys.u
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _cut(i: int, j: int, d: int, rotates: bool, q: Array, u: Array) -> BodyMotion:
+    position, velocity = q[:, i : i + d], u[:, j : j + d]
+    if not rotates:
         return BodyMotion(position, velocity, None, None, None)
     if d == 2:
-        return BodyMotion(position, velocity, ys.q[:, i + 2], None, ys.u[:, j + 2])
-    return BodyMotion(position, velocity, None, ys.q[:, i + 3 : i + 7], ys.u[:, j + 3 : j + 6])
+        return BodyMotion(position, velocity, q[:, i + 2], None, u[:, j + 2])
+    return BodyMotion(position, velocity, None, q[:, i + 3 : i + 7], u[:, j + 3 : j + 6])
 
 
 def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]:

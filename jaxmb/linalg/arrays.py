@@ -39,10 +39,16 @@ def as_array(value: Any, dtype: Any) -> Any:
 def replaced(array: Array, index: Any, value: Any) -> Array:
     """A copy of the array with new entries at an index."""
     if is_traced((array, value)):
-        return array.at[index].set(value)
+        return _set(array, tuple(index.tolist()) if isinstance(index, np.ndarray) else index, value)
     new = np.array(array)
     new[index] = value
     return jax.device_put(new)
+
+
+# One program: outside of `jit`, under a derivative, this would be a dozen of them.
+@functools.partial(jax.jit, static_argnums=1)
+def _set(array, index, value):
+    return array.at[np.array(index)].set(value)
 
 
 def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:

@@ -117,6 +117,8 @@ def split_rates(
 
     **Raises:** `ValueError` for a rate that is named twice, and as `split_names`.
     """
+    if values is None:
+        return {}, {}
     joints = system.joint_coordinates()
     if isinstance(values, Mapping):
         twice = [name for name in values if f"{name}_rate" in values]
