@@ -2,18 +2,18 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
 
-_Argument = TypeVar("_Argument")
+_Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-def jitted(function: Callable[[_Argument], _Result]) -> Callable[[_Argument], _Result]:
-    """`jax.jit` of a function of one pytree, whose leaves that are no arrays belong to the program; all leaves of the
-    result are arrays.
+def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """`jax.jit` of a function of pytrees, given by position, whose leaves that are no arrays belong to the program; all
+    leaves of the result are arrays.
 
     `equinox.filter_jit` does the same for any function, and takes twice as long to call one of many numbers.
     """
@@ -21,15 +21,16 @@ def jitted(function: Callable[[_Argument], _Result]) -> Callable[[_Argument], _R
     def of_arrays(arrays, program):
         structure, rest = program
         left = iter(arrays)
-        return function(jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest]))
+        return function(*jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest]))
 
     # The name that profiles and logs of compilations show.
     of_arrays.__name__ = function.__name__.lstrip("_")
     compiled = jax.jit(of_arrays, static_argnums=1)
 
     @functools.wraps(function)
-    def called(argument: _Argument) -> Any:
-        leaves, structure = jax.tree.flatten(argument)
+    def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
+        assert not named
+        leaves, structure = jax.tree.flatten(arguments)
         # A pytree has no leaves that are None.
         rest = tuple(None if isinstance(x, _ARRAYS) else x for x in leaves)
         arrays = [x for x, own in zip(leaves, rest, strict=True) if own is None]

@@ -25,7 +25,7 @@ from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
 # A program saves at this number of times, or at a power of 2 of them.
-_FEWEST_TIMES = 16
+_FEWEST_TIMES = 4
 
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),

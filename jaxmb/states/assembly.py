@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
+from ..linalg.jitted import jitted
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions, rates_of
@@ -125,7 +126,7 @@ def configuration(
     return q, fixed, ok
 
 
-@eqx.filter_jit
+@jitted
 def _is_met(system, t, q):
     """Whether the constraints hold up to the rounding errors of their terms."""
     size = jnp.max(jnp.abs(q), initial=0.0) + jnp.max(system.coordinate_scale(), initial=0.0)

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jax import lax
 
 from .._types import State
 from ..linalg.arrays import is_traced
+from ..linalg.jitted import jitted
 from ..system import AbstractSystem
 from ..system.residuals import row_sizes, violations
 
@@ -65,7 +65,7 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
     return ~(jnp.any(positions) | jnp.any(velocities))
 
 
-@eqx.filter_jit
+@jitted
 def _violated(system, t, y) -> Any:
     y = dataclasses.replace(y, q=system.normalize(y.q))
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
