@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compat import cond_of_any_lane
+from .._compat import cond_of_lanes
 from .._results import RESULTS
 from .._types import Coordinates, Scalar, State, Velocities
 from ..formulations import AbstractFormulation, Partitioned
@@ -519,7 +519,7 @@ def _updated(system, t, y, chart, max_influence):
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
             return Chart(split, fresh, fresh, counters, chart.redundant)
 
-        return cond_of_any_lane(worse(chart), renew, lambda chart: chart, chart)
+        return cond_of_lanes(worse(chart), renew, lambda chart: chart, chart)
 
     if chart.split.coordinate is None or system.coordinate_rank == 0:
         return renewed(chart, _of_coordinates(system, t, y))
@@ -536,7 +536,7 @@ def _updated(system, t, y, chart, max_influence):
     def keep(chart):
         return Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1), chart.redundant)
 
-    return cond_of_any_lane(stale, refresh, keep, chart)
+    return cond_of_lanes(stale, refresh, keep, chart)
 
 
 @eqx.filter_jit

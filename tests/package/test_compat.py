@@ -162,6 +162,34 @@ def test_conditions_of_a_batch(compat):
     assert "cond" in names, "equinox.internal.unvmap_any no longer makes one condition of those of a batch"
 
 
+@pytest.mark.parametrize("lanes", [1, 5])
+def test_conditions_of_lanes(compat, lanes):
+    """A branch that only the lanes that take it go through, with the values and derivatives of any other."""
+
+    def branched(cond, x, a):
+        return cond(x[0] > 1, lambda x: jnp.sin(a) * x, lambda x: x, x)
+
+    own = lambda x, a: branched(compat.cond_of_lanes, x, a)
+    plain = lambda x, a: branched(lambda pred, *of: jax.lax.cond(pred, *of), x, a)
+    x, a = jnp.arange(2.0 * lanes).reshape(lanes, 2) / 2, jnp.asarray(0.7)
+    several = jnp.linspace(0.5, 1.0, lanes)
+    for axes, of in (((0, None), (x, a)), ((0, 0), (x, several)), ((None, 0), (x[-1], several))):
+        batches = [jax.vmap(function, axes) for function in (own, plain)]
+        found, expected = (batch(*of) for batch in batches)
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
+        # Derivatives of a batch, and a batch of derivatives.
+        totals = [lambda *of, batch=batch: jnp.sum(batch(*of) ** 2) for batch in batches]
+        for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+            found, expected = (derivative(total, 1)(*of) for total in totals)
+            np.testing.assert_allclose(found, expected, rtol=1e-14)
+        for derivative in (jax.jacrev, jax.jacfwd):
+            found, expected = (jax.vmap(derivative(function, 1), axes)(*of) for function in (own, plain))
+            np.testing.assert_allclose(found, expected, rtol=1e-14)
+    text = jax.jit(jax.vmap(own, (0, None))).lower(x, a).as_text()
+    kind = "stablehlo.case" if lanes == 1 else "stablehlo.while"
+    assert kind in text, "a branch is computed for lanes that do not take it"
+
+
 def test_enumerations(compat):
     about = "items of equinox.Enumeration no longer hold their class, their code or all names"
 
