@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         studies as studies,
         viz as viz,
     )
+    from .studies.batch import batch as batch
     from .studies.identify import (
         Experiment as Experiment,
         Identification as Identification,
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
 else:
     _MODULES = ("importers", "lagrangian", "mechanisms", "planar", "report", "spatial", "studies", "viz")
     _NAMES = {
+        "studies.batch": "batch",
         "studies.identify": "Experiment Identification Measurements Sensor identify read_measurements",
         "studies.linear": "Floquet Linearisation RootLocus floquet linearise root_locus steady_motion",
         "studies.optimise": "Optimum optimise robust",

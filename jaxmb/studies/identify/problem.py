@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..._results import RESULTS
 from ..._types import State
 from ...system import AbstractSystem
+from ..batch import batch
 from ..minimise import Linearised
 from ..ranges import FreeParameters
 from .experiment import ExperimentModel, Seen
@@ -124,7 +125,7 @@ def _linearised(system, trial, options, flat):
 
 @eqx.filter_jit
 def _linearised_batch(system, trial, options, flats):
-    return eqx.filter_vmap(functools.partial(_with_jacobian, system, trial, options))(flats)
+    return batch(functools.partial(_with_jacobian, system, trial, options))(flats)
 
 
 def _with_jacobian(system, trial, options, flat):

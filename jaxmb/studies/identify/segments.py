@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ..._types import State
 from ...states.assembly import assemble
 from ...system import AbstractSystem
+from ..batch import batch
 from ..minimise import Linearised
 from .experiment import ExperimentModel
 from .problem import Problem, numbers, values_and_derivatives, weighted
@@ -264,4 +265,4 @@ def _linearised_lanes(system, trials, static, options, flat, states, tangents):
         jacobians, (seen, out) = jax.jacfwd(fn, argnums=(0, 1), has_aux=True)(flat, w)
         return seen, [(value, *both) for value, both in zip(out, jacobians, strict=True)]
 
-    return eqx.filter_vmap(lane)(trials, states, tangents)
+    return batch(lane)(trials, states, tangents)

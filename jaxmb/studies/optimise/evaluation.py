@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...parts.names import unknown
 from ...system.quantities import component_names
+from ..batch import batch
 from ..ranges import FreeParameters
 from .space import Space
 
@@ -70,7 +71,7 @@ def linearised(program: Program, z: Float[Array, "n"]):
 @eqx.filter_jit
 def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array, "starts rows"]:
     """Rows of several vectors at once."""
-    return jax.vmap(lambda z: program.rows(z)[0])(z)
+    return batch(lambda z: program.rows(z)[0])(z)
 
 
 @dataclasses.dataclass(frozen=True)

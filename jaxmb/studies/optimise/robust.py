@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -12,6 +11,7 @@ from jaxtyping import Array
 from ..._arguments import real_array
 from ..._types import VectorLike
 from ...parts.names import UnknownNameError, names_arguments, unknown
+from ..batch import batch
 
 
 @names_arguments
@@ -34,8 +34,8 @@ def robust(
     - `weight`: if given, each output also has its own name: its mean plus `weight` times its spread.
 
     **Returns:** a function of the same parameters, with outputs `"comfort.mean"` and `"comfort.spread"`, the standard
-    deviation of the samples, for an output `"comfort"`. All samples are evaluated in one batch; where one of them
-    fails, the outputs are not numbers.
+    deviation of the samples, for an output `"comfort"`. All samples are evaluated in one program, in blocks as by
+    `jaxmb.batch`; where one of them fails, the outputs are not numbers.
 
     **Raises:** `ValueError` for samples of different number, or fewer than two.
     """
@@ -66,7 +66,7 @@ def robust(
                 raise unknown("parameter", str(error.args[0]), [*values, *arrays]) from None
             return out if isinstance(out, Mapping) else {"objective": out}
 
-        found = jax.vmap(of_sample)({name: jnp.asarray(x) for name, x in arrays.items()})
+        found = batch(of_sample)({name: jnp.asarray(x) for name, x in arrays.items()})
         out: dict[str, Array] = {}
         for name, own in found.items():
             mean, spread = jnp.mean(own, axis=0), _deviation(own)

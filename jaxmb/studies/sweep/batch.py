@@ -1,117 +1,175 @@
-"""One chunk of a sweep: all members at once, those that take long once more in small batches."""
+"""One chunk of a sweep: its members in blocks, those that take long once more in blocks of their own."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from .cases import Cases
-from .outputs import OK, Outputs, Returned, check_same, outputs_of, returned, statuses
+from ..batch import Member, batch
+from .outputs import Outputs, Returned, check_same, outputs_of, returned, statuses
 
-# The members that a budget of steps is chosen from, and by how much it exceeds the steps of those that it is to suit.
-_PROBES, _MARGIN = 16, 1.1
+# By how much a budget exceeds the steps of those that it is to suit, and how often it has to save the time in which
+# its program is compiled.
+_MARGIN, _PAYS = 1.1, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
     """How to compute a chunk; the same wherever it is computed, so that it gives the same bits.
 
-    `budget` is the number of steps that members of a whole chunk may take. Those that are cut off are computed anew
-    with `max_steps`, in batches of `small`: all lanes of a batch run as long as its slowest, and so a few members that
-    take ten times as long would hold up all others. Without a budget all have `max_steps`, or what the function says.
+    `budget` is the number of steps that members may take at first. Those that are cut off are computed anew with
+    `max_steps`, in blocks of their own: all lanes of a block run as long as its slowest, and so a few members that take
+    ten times as long would hold up many others. With `"auto"` a budget is chosen once it pays; members have the same
+    bits with any budget and without.
     """
 
     function: Callable[..., Any]
     outputs: Outputs
     chunk: int
     max_steps: int | None = None
-    budget: int | None = None
+    budget: int | Literal["auto"] | None = None
     devices: tuple[Any, ...] = ()
 
-    @property
-    def small(self) -> int:
-        """The size of the batches of members that take long; a sixty-fourth of a chunk."""
-        return _multiple(max(4, self.chunk // 64), len(self.devices))
-
-    def compiled(self) -> Callable[[Mapping[str, np.ndarray]], Returned]:
+    def compiled(self) -> "Chunks":
         """A function that computes one chunk, and compiles at its first call."""
-        programs = {steps: _program(self, steps) for steps in {self.budget, self.max_steps}}
+        return Chunks(self)
 
-        def run(columns: Mapping[str, np.ndarray]) -> Returned:
-            if self.budget is None:
-                return _padded(programs[self.max_steps], columns, self.chunk)
-            found = jax.tree.map(np.array, _padded(programs[self.budget], columns, self.chunk))
-            cut_off = np.flatnonzero(self._cut_off(found))
-            for start in range(0, cut_off.size, self.small):
-                own = cut_off[start : start + self.small]
-                again = _padded(programs[self.max_steps], {k: v[own] for k, v in columns.items()}, self.small)
+
+class Chunks:
+    """A function that computes chunks of a sweep in one process, and its compiled programs."""
+
+    def __init__(self, batch: Batch):
+        self._batch = batch
+        self._programs: dict[int | None, _Program] = {}
+        self._budget = batch.budget if isinstance(batch.budget, int) else None
+        self._lost: list[float] = []
+
+    def __call__(
+        self, columns: Mapping[str, np.ndarray], left: int = 0, tell: Callable[[int], object] = lambda members: None
+    ) -> Returned:
+        """The outputs of a chunk's members.
+
+        **Arguments:** `left`: the number of chunks that this process is expected to compute after this one, by which a
+        budget is judged; `tell` is called with the number of members of each block that is done, and with 0 after
+        compiling.
+        """
+        full = self._batch.max_steps
+        first = self._program(full if self._budget is None else self._budget, columns)
+        last = self._program(full, columns)
+        tell(0)
+        begin = time.perf_counter()
+        found = first(columns, tell)
+        if first is not last:
+            own = np.flatnonzero(self._cut_off(found))
+            if own.size:
+                again = last({name: column[own] for name, column in columns.items()})
+                found = jax.tree.map(np.array, found)
                 for old, new in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
                     old[own] = new
-            return found
+        elif self._batch.budget == "auto" and self._budget is None and left > 0:
+            budget, share = cheapest_budget(np.asarray(found.steps), last.size)
+            self._lost.append(share * (time.perf_counter() - begin))
+            if left * float(np.mean(self._lost)) > _PAYS * last.seconds:
+                self._budget = min(budget, full or budget)
+        return found
 
-        return run
+    @property
+    def programs(self) -> int:
+        """The number of programs that were compiled."""
+        return len(self._programs)
+
+    def _program(self, steps: int | None, columns: Mapping[str, np.ndarray]) -> "_Program":
+        if steps not in self._programs:
+            self._programs[steps] = _Program(self._batch, steps, columns)
+        return self._programs[steps]
 
     def _cut_off(self, found: Returned) -> np.ndarray:
-        names = [name for name, _ in self.outputs.statuses]
+        names = [name for name, _ in self._batch.outputs.statuses]
         return statuses(found) == names.index("max_steps_reached")
 
-    def with_budget(self, cases: Cases) -> "Batch":
-        """The same with the budget that is expected to cost least, from the steps of members all over the cases.
 
-        A member costs the budget, as all lanes of its chunk run on to it, and one beyond it its own steps once more.
-        """
-        members = (np.arange(_PROBES) + 0.5) * ((np.sqrt(5) - 1) / 2) % 1 * len(cases)
-        columns, run = cases[np.unique(members.astype(int))], _program(self, self.max_steps)
-        count = next(iter(columns.values())).shape[0]
-        steps = np.zeros(0, int)
-        for start in range(0, count, self.small):
-            some = {name: column[start : start + self.small] for name, column in columns.items()}
-            found = _padded(run, some, self.small)
-            steps = np.append(steps, np.asarray(found.steps)[statuses(found) == OK])
-        if steps.size == 0:
-            return self
-        budgets = np.ceil(_MARGIN * np.unique(steps)).astype(int)
-        costs = [budget + np.sum(steps, where=steps > budget) / steps.size for budget in budgets]
-        return self.limited(int(budgets[np.argmin(costs)]))
+def cheapest_budget(steps: np.ndarray, size: int) -> tuple[int, float]:
+    """The budget with which members in blocks cost least, and the share of the time without one that it saves.
 
-    def limited(self, budget: int) -> "Batch":
-        """The same with a budget."""
-        return dataclasses.replace(self, budget=min(budget, self.max_steps or budget))
+    A block costs the steps of its slowest member, and those that are cut off cost as much once more as their own
+    blocks.
+    """
+    slowest = lambda steps: np.array([np.max(steps[k : k + size]) for k in range(0, steps.size, size)])
+    of_blocks = slowest(steps)
+    budgets = np.ceil(_MARGIN * np.unique(np.quantile(steps, np.linspace(0.0, 1.0, 65), method="higher"))).astype(int)
+    costs = [np.sum(np.minimum(of_blocks, b)) + np.sum(slowest(steps[steps >= b])) for b in budgets]
+    return int(budgets[np.argmin(costs)]), max(1.0 - float(np.min(costs) / max(np.sum(of_blocks), 1)), 0.0)
 
 
 def whole_chunk(chunk: int, devices: tuple[Any, ...]) -> int:
     """The next number of members that divides evenly among the devices."""
-    return _multiple(chunk, len(devices))
+    each = max(len(devices), 1)
+    return -(-chunk // each) * each
 
 
-def _multiple(size: int, devices: int) -> int:
-    each = max(devices, 1)
-    return -(-size // each) * each
+class _Program:
+    """The compiled program of a block with a limit of steps, `size` its members; of a whole chunk on several devices.
 
+    Threads compute blocks side by side, one on each core.
+    """
 
-def _program(batch: Batch, steps: int | None) -> Callable[[Mapping[str, Any]], Returned]:
-    fixed = {} if steps is None else {"max_steps": steps}
+    def __init__(self, own: Batch, steps: int | None, columns: Mapping[str, np.ndarray]):
+        fixed = {} if steps is None else {"max_steps": steps}
 
-    def member(parameters):
-        found = returned(batch.function, parameters, **fixed)
-        check_same(batch.outputs, outputs_of(found))
-        return found
+        def of_parameters(parameters):
+            found = returned(own.function, parameters, **fixed)
+            check_same(own.outputs, outputs_of(found))
+            return found
 
-    members = jax.vmap(member)
-    if batch.devices:
-        mesh, along = Mesh(np.array(batch.devices), ("member",)), PartitionSpec("member")
-        # Each device leaves its loops when its own members have ended; the check would ask diffrax's loops for values
-        # that are the same on all devices.
-        members = jax.shard_map(members, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
-    return jax.jit(members)
+        begin = time.perf_counter()
+        if own.devices:
+            self.size = own.chunk
+            mesh, along = Mesh(np.array(own.devices), ("member",)), PartitionSpec("member")
+            # Each device leaves its loops when its own members have ended; the check would ask diffrax's loops for
+            # values that are the same on all devices.
+            members = jax.shard_map(batch(of_parameters), mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
+        else:
+            member = Member(of_parameters, {name: jax.numpy.asarray(column[0]) for name, column in columns.items()})
+            number = -(-own.chunk // min(member.block_size(own.chunk), own.chunk))
+            self.size = -(-own.chunk // number)
+            members = member.block(self.size)
+        self._run = jax.jit(members).lower(self._block(columns, 0)).compile()
+        self.seconds = time.perf_counter() - begin
+        on_cores = not own.devices and jax.default_backend() == "cpu"
+        self._threads = int(os.environ.get("NPROC") or os.cpu_count() or 1) if on_cores else 1
 
+    def __call__(
+        self, columns: Mapping[str, np.ndarray], tell: Callable[[int], object] = lambda members: None
+    ) -> Returned:
+        """The outputs of some members, in blocks."""
+        count = next(iter(columns.values())).shape[0]
+        starts = range(0, count, self.size)
+        blocks = []
+        for start, found in zip(starts, self._computed(columns, starts), strict=True):
+            blocks.append(found)
+            tell(min(self.size, count - start))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
 
-def _padded(program: Callable[..., Returned], columns: Mapping[str, np.ndarray], size: int) -> Returned:
-    """The program's outputs for some members, filled up to its size with the last of them."""
-    count = next(iter(columns.values())).shape[0]
-    places = np.minimum(np.arange(size), count - 1)
-    found = program({name: column[places] for name, column in columns.items()})
-    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
+    def _computed(self, columns: Mapping[str, np.ndarray], starts: Sequence[int]):
+        compute = lambda start: jax.tree.map(np.asarray, self._run(self._block(columns, start)))
+        threads = min(self._threads, len(starts))
+        if threads == 1:
+            yield from map(compute, starts)
+            return
+        pool = ThreadPoolExecutor(threads)
+        try:
+            yield from pool.map(compute, starts)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _block(self, columns: Mapping[str, np.ndarray], start: int) -> dict[str, Any]:
+        """The parameters of a block, filled up to its size with the last member."""
+        count = next(iter(columns.values())).shape[0]
+        places = np.minimum(np.arange(start, start + self.size), count - 1)
+        return {name: jax.numpy.asarray(column[places]) for name, column in columns.items()}

@@ -36,10 +36,11 @@ _IN_FLIGHT, _PER_WORKER = 256, 2
 
 
 class Task(NamedTuple):
-    """One chunk: its place, and the parameters of its members."""
+    """One chunk: its place, the parameters of its members, and the number of chunks after it."""
 
     place: int
     columns: dict[str, np.ndarray]
+    left: int
 
 
 class Work:
@@ -49,9 +50,14 @@ class Work:
         self._run, self._batch = batch.compiled(), batch
         self._store = None if store is None else Store(store, batch.chunk)
 
-    def __call__(self, task: Task) -> tuple[int, dict[str, np.ndarray]]:
-        """Compute a chunk: its place, and its outputs, or only its status if they are in the store."""
-        found = self._run(task.columns)
+    def __call__(
+        self, task: Task, tell: Callable[[int], object] = lambda members: None
+    ) -> tuple[int, dict[str, np.ndarray]]:
+        """Compute a chunk: its place, and its outputs, or only its status if they are in the store.
+
+        `tell` is called with the number of members of each block that is done, and with 0 after compiling.
+        """
+        found = self._run(task.columns, task.left, tell)
         values = {**found.values, "status": statuses(found)}
         if found.steps is not None:
             values["num_steps"] = np.asarray(found.steps, np.int64)
@@ -61,15 +67,21 @@ class Work:
         return task.place, {"status": values["status"]}
 
 
-def here(batch: Batch, store: Path | None, tasks: Iterable[Task]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Compute chunks one after another in this process."""
-    yield from map(Work(batch, store), tasks)
+def here(
+    batch: Batch, store: Path | None, tasks: Iterable[Task], tell: Callable[[int], object]
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Compute chunks one after another in this process, and tell of the members that are done."""
+    work = Work(batch, store)
+    for task in tasks:
+        yield work(task, tell)
 
 
 def on_executor(
     batch: Batch, store: Path | None, tasks: Iterable[Task], executor: futures.Executor, in_flight: int = _IN_FLIGHT
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Compute chunks on an executor, in the order in which they are done."""
+    # A worker computes its share of the chunks that are left; of an executor, whose size is not known, at least this.
+    tasks = (task._replace(left=task.left // in_flight) for task in tasks)
     submitted = _submitter(batch, store, executor)
     left, pending = iter(tasks), set()
     try:

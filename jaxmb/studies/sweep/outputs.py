@@ -12,16 +12,10 @@ from jax.core import Tracer
 
 from ..._compat import ClosedJaxpr, Jaxpr, Literal, canonical, codes_of, is_enumerated, messages_of
 from ...parts.names import unknown
+from ..batch import NEED_NUMBERS
 from .identity import is_installed
 
 PENDING, OK, NOT_FINITE = 0, 1, 2
-# What JAX raises where a number is asked for that is not known in tracing.
-_NEED_NUMBERS = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-    jax.errors.NonConcreteBooleanIndexError,
-)
 RESERVED = ("member", "status", "message", "num_steps", "result")
 
 
@@ -52,7 +46,7 @@ def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixe
     """Call the function for one member, and sort what it returns."""
     try:
         given = function(**parameters, **fixed)
-    except _NEED_NUMBERS as error:
+    except NEED_NUMBERS as error:
         raise ValueError(_explained(error)) from error
     if not isinstance(given, Mapping):
         raise ValueError(

@@ -1,6 +1,7 @@
 """A function of named parameters over many cases."""
 
 import contextlib
+import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,8 +26,6 @@ from .outputs import OK, RESERVED, check_parameters, declared, step_limit
 
 # Large enough that what a chunk costs besides its members, 5 ms, does not count, small enough that little is lost.
 _CHUNK = 512
-# With fewer members it takes longer to compile a second program than any of them can hold up the others.
-_FEWEST_FOR_BUDGET = 64
 # What a sweep is known by, where the name of the attribute does not say it.
 _WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
 
@@ -80,12 +79,13 @@ def sweep(
 
     **Other arguments:**
 
-    - `chunk`: members that are computed together, default 512 or fewer; what is lost when a process is killed, and what
-        takes memory. The store keeps it.
-    - `budget`: most steps of a member in a chunk. Members that run together take as long as the slowest of them. So if
-        the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`, members that
-        use up the budget are computed anew with the default of `max_steps`, a few together. Default `"auto"`: chosen
-        from the steps of 16 members all over the cases; None: no budget.
+    - `chunk`: members that are written together, default 512 or fewer; what is lost when a process is killed, and what
+        takes memory. The store keeps it. They are computed in blocks as by `jaxmb.batch`, on all cores.
+    - `budget`: most steps of a member at first. Members of a block run together and take as long as the slowest of
+        them. So if the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`,
+        members that use up the budget are computed anew with the default of `max_steps`, in blocks of their own, by a
+        second program. Default `"auto"`: none, until the chunks so far show by their steps that the rest of the sweep
+        will save twice the time in which that program is compiled. None: no budget.
     - `processes`: on this machine, each with its share of the cores. A process that dies is replaced.
     - `executor`: any `concurrent.futures.Executor` instead: Dask's `client.get_executor()`,
         `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves.
@@ -146,17 +146,15 @@ def sweep(
     before = None if path is None or overwrite else stores.study_of(path)
     if before is not None:
         _check_same_study(path, before, known, chunk, budget)
-        chunk, budget = before["chunk"], before["budget"]
+        chunk, budget = before["chunk"], budget if before["budget"] is None else before["budget"]
     size = _chunk(chunk, len(cases), processes)
     batch = Batch(function, outputs, whole_chunk(size, found), limit, None, found)
     if before is not None and batch.chunk != chunk:
         raise ValueError(f"The chunk of {chunk} of the store {path} cannot be divided among {len(found)} devices.")
-    if budget == "auto":
-        uses = limit is not None and outputs.can_be_cut_off and len(cases) >= _FEWEST_FOR_BUDGET
-        batch = batch.with_budget(cases) if uses else batch
-    elif budget is not None:
-        batch = batch.limited(_checked_budget(batch, budget))
-    attrs = dataset.attributes(cases, {**known, "chunk": batch.chunk, "budget": batch.budget})
+    batch = dataclasses.replace(batch, budget=_checked_budget(batch, budget))
+    # One that is chosen on the way changes no results, and is not kept.
+    kept = None if batch.budget == "auto" else batch.budget
+    attrs = dataset.attributes(cases, {**known, "chunk": batch.chunk, "budget": kept})
     if path is None:
         computed = _empty(variables)
         for members, values in _results(batch, None, cases, {}, progress, processes, executor):
@@ -190,39 +188,54 @@ def _results(
     """The members and outputs of each chunk that is not done, as they are computed."""
     own = lambda index: slice(index * batch.chunk, (index + 1) * batch.chunk)
     count = -(-len(cases) // batch.chunk)
-    tasks = (Task(index, cases[own(index)]) for index in range(count) if index not in done)
-    with _shown_progress(progress, cases, done) as advance:
-        for index, values in _chunks(batch, path, tasks, processes, executor):
+    indices = [index for index in range(count) if index not in done]
+    tasks = (Task(index, cases[own(index)], len(indices) - 1 - k) for k, index in enumerate(indices))
+    shown = _Progress(progress, cases, done)
+    with shown.bar:
+        for index, values in _chunks(batch, path, tasks, processes, executor, shown):
             yield own(index), values
-            advance(values["status"])
+            shown.count(values["status"])
 
 
-@contextlib.contextmanager
-def _shown_progress(
-    shown: bool, cases: Cases, done: Mapping[int, np.ndarray]
-) -> Iterator[Callable[[np.ndarray], None]]:
+class _Progress:
     """A line with the members that are done, the time that is left, and the number of failed members."""
-    from tqdm import tqdm
 
-    statuses = list(done.values())
-    failed = sum(int(np.sum(own != OK)) for own in statuses)
-    bar = tqdm(total=len(cases), initial=sum(own.size for own in statuses), unit="member", disable=not shown)
+    def __init__(self, shown: bool, cases: Cases, done: Mapping[int, np.ndarray]):
+        from tqdm import tqdm
 
-    def advance(own: np.ndarray) -> None:
-        nonlocal failed
-        failed += int(np.sum(own != OK))
-        if failed:
-            bar.set_postfix_str(f"{failed} failed", refresh=False)
-        bar.update(own.size)
+        statuses = list(done.values())
+        self._failed = sum(int(np.sum(own != OK)) for own in statuses)
+        self.bar = tqdm(total=len(cases), initial=sum(own.size for own in statuses), unit="member", disable=not shown)
 
-    with bar:
-        yield advance
+    def advance(self, members: int) -> None:
+        """Some members more are done; none after compiling, whose time is left out of the rate."""
+        if members == 0:
+            self.bar.unpause()
+        self.bar.update(members)
+
+    def count(self, own: np.ndarray) -> None:
+        """Count those of a chunk that failed."""
+        self._failed += int(np.sum(own != OK))
+        if self._failed:
+            self.bar.set_postfix_str(f"{self._failed} failed", refresh=False)
 
 
-def _chunks(batch: Batch, path: Path | None, tasks: Iterator[Task], processes: int, executor: Executor | None):
-    if executor is not None:
-        return on_executor(batch, path, tasks, executor)
-    return here(batch, path, tasks) if processes == 1 else on_processes(batch, path, tasks, processes)
+def _chunks(
+    batch: Batch,
+    path: Path | None,
+    tasks: Iterator[Task],
+    processes: int,
+    executor: Executor | None,
+    progress: _Progress,
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Each chunk, as it is computed: its place and values."""
+    if executor is None and processes == 1:
+        yield from here(batch, path, tasks, progress.advance)
+        return
+    run = on_processes(batch, path, tasks, processes) if executor is None else on_executor(batch, path, tasks, executor)
+    for index, values in run:
+        yield index, values
+        progress.advance(values["status"].size)
 
 
 def _check_engine(processes: Any, executor: Any, devices: Any) -> None:
@@ -271,15 +284,19 @@ def _chunk(given: Any, members: int, processes: int) -> int:
     return min(int(given), members)
 
 
-def _checked_budget(batch: Batch, budget: Any) -> int:
+def _checked_budget(batch: Batch, budget: Any) -> int | Literal["auto"] | None:
+    """The budget, at most `max_steps`; none where it is automatic and members cannot be cut off."""
+    can_be_cut_off = batch.max_steps is not None and batch.outputs.can_be_cut_off
+    if budget is None or budget == "auto":
+        return budget if can_be_cut_off else None
     if not isinstance(budget, int | np.integer) or budget < 1:
         raise ValueError(f"budget must be 'auto', None or an integer of at least 1, got {budget!r}.")
-    if batch.max_steps is None or not batch.outputs.can_be_cut_off:
+    if not can_be_cut_off:
         raise ValueError(
             "A budget needs a function with an argument max_steps that hands it to simulate(..., max_steps=max_steps) "
             "and that returns the trajectory as 'result'."
         )
-    return int(budget)
+    return min(int(budget), batch.max_steps or int(budget))
 
 
 def _check_version(version: Any, unknown: Mapping[str, str]) -> None:

@@ -81,7 +81,9 @@ def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_damaged_only_what
     computed = []
     engine = sys.modules["jaxmb.studies.sweep.engine"]
     own = engine.Work.__call__
-    monkeypatch.setattr(engine.Work, "__call__", lambda work, task: (computed.append(task.place), own(work, task))[1])
+    monkeypatch.setattr(
+        engine.Work, "__call__", lambda work, task, tell: (computed.append(task.place), own(work, task, tell))[1]
+    )
     xr.testing.assert_identical(run(store).load(), undisturbed[1].load())
     assert computed == []
     # A flipped bit, an empty file, a file that is gone, a mark that is gone, a leftover of a killed writer.
@@ -291,14 +293,14 @@ def test_members_beyond_the_budget_are_computed_anew():
     n = np.full(200, 10)
     n[[5, 50, 120]], n[[7, 9]], n[77] = 90, 300, 3
     function = lambda n, max_steps=100: _steps(n, None, max_steps)
-    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=64)
+    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=64, budget=11)
     assert found.attrs["budget"] == 11
     np.testing.assert_array_equal(found["n2"], np.where(n <= 100, n * n, -1))
     np.testing.assert_array_equal(found["num_steps"], np.minimum(n, 100))
     words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
     assert list(np.flatnonzero(words == "max_steps_reached")) == [7, 9] and words[77] == "singular"
     assert np.sum(words == "ok") == 197 and "maximum number of solver steps" in str(found["message"][7].item())
-    for budget in (None, 50, 1000):
+    for budget in ("auto", None, 50, 1000):
         other = mb.sweep(function, mb.cases.table(n=n), progress=False, budget=budget)
         assert other.drop_attrs().identical(found.drop_attrs()), budget
 
@@ -330,10 +332,10 @@ def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
     engine, store = sys.modules["jaxmb.studies.sweep.engine"], tmp_path / "runs.zarr"
     own = engine.Work.__call__
 
-    def interrupted(work, task):
+    def interrupted(work, task, tell):
         if task.place == 5:
             raise KeyboardInterrupt
-        return own(work, task)
+        return own(work, task, tell)
 
     with monkeypatch.context() as patch:
         patch.setattr(engine.Work, "__call__", interrupted)

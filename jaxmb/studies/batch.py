@@ -1,0 +1,160 @@
+"""Batches in blocks: functions of many members, as many at once as the cache of a core holds."""
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import lax
+from jaxtyping import PyTree
+
+from .._compat import ClosedJaxpr, Jaxpr
+from ..parts.names import names_arguments
+
+# What JAX raises where a number is asked for that is not known in tracing.
+NEED_NUMBERS = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.NonConcreteBooleanIndexError,
+)
+# What the loops of the members of a block may carry [bytes], and the most members of a block.
+_CARRIED, _MOST = 2**20, 64
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+
+
+@names_arguments
+def batch(function: Callable[..., Any], size: int | None = None) -> Callable[..., Any]:
+    """`jax.vmap` of a function, in blocks that are computed one after the other in one program.
+
+    ```python
+    angles = mb.batch(angle_at_end)(lengths, masses)  # As jax.vmap(angle_at_end)(lengths, masses).
+    slopes = mb.batch(jax.grad(angle_at_end))(lengths, masses)
+    ```
+
+    The members of a block go through the loop of a simulation together, as long as its slowest member needs, and each
+    operation is one of all their numbers. For a few hundred simulations at once these are more than the caches hold,
+    except of small machines, and members wait for the slowest of all: `jax.vmap` then takes longer than blocks, or even
+    than one run after the other. Use `jax.vmap` itself for functions without loops, and on a GPU.
+
+    **Arguments:**
+
+    - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
+    - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
+        which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
+        all members, where it has no loop, and on other devices than a CPU.
+
+    **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
+    whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and
+    so is what the function refers to. The last block is filled up with the last member, which takes time and changes
+    nothing. The function has its derivatives in all modes; reverse mode keeps what it needs of all blocks at once.
+
+    **Raises:** `ValueError` for a size that is no integer of at least 1, for arguments without members or of different
+    numbers of them, and for a function that cannot be batched: one that needs numbers where there are only traced
+    arrays, or with an operation that has no rule for batches, which `size=1` does not need.
+    """
+    if not callable(function):
+        raise ValueError(f"batch needs a function, got {function!r}.")
+    if size is not None and (not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1):
+        raise ValueError(f"size must be an integer of at least 1, or None, got {size!r}.")
+
+    @eqx.filter_jit
+    def in_blocks(members, count):
+        arrays, shared = eqx.partition(members, lambda x: isinstance(x, _ARRAYS))
+        member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
+        number = -(-count // min(size or member.block_size(count), count))
+        together = -(-count // number)
+        if number == 1:
+            return member.block(together)(arrays)
+        # What fills the last block up fails only where the last member does.
+        places = np.minimum(np.arange(number * together), count - 1)
+        blocks = jax.tree.map(lambda x: x[places].reshape(number, together, *x.shape[1:]), arrays)
+        found = lax.map(member.block(together), blocks)
+        return jax.tree.map(lambda x: x.reshape(number * together, *x.shape[2:])[:count], found)
+
+    @functools.wraps(function)
+    def batched(*members: Any) -> Any:
+        return in_blocks(members, _count(members))
+
+    return batched
+
+
+class Member:
+    """A function of one member, traced once, for an example of its arguments, which may be traced itself.
+
+    **Raises:** `ValueError` for a function that needs the number of an argument.
+    """
+
+    def __init__(self, function: Callable[..., Any], example: PyTree):
+        self._function = jax.jit(function)
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), example)
+        try:
+            self._program = self._function.trace(like).jaxpr
+        except NEED_NUMBERS as error:
+            raise ValueError(
+                f"The function cannot be batched: it needs the number of an argument, of which there is one for each "
+                f"member. Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
+            ) from error
+
+    def block_size(self, members: int) -> int:
+        """The number of members, a power of two or all, that are computed at once on the default device."""
+        carried = max(_carried(self._program), default=0)
+        if carried == 0 or jax.default_backend() != "cpu":
+            return members
+        return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
+
+    def block(self, size: int) -> Callable[..., Any]:
+        """The function of several members at once; of one, without `vmap`."""
+        if size == 1:
+            alone = lambda x: jax.tree.map(lambda x: x[0], x)
+            return lambda own: jax.tree.map(lambda x: x[None], self._function(alone(own)))
+
+        def together(own):
+            try:
+                return jax.vmap(self._function)(own)
+            except NotImplementedError as error:
+                raise ValueError(
+                    f"The function cannot be batched ({error}); size=1 computes one member after the other."
+                ) from error
+
+        return together
+
+
+def _carried(program: Any) -> Iterator[int]:
+    """The bytes that each loop of a program carries from step to step."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        inner = [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
+        if equation.primitive.name in ("while", "scan"):
+            yield sum(math.prod(x.aval.shape) * x.aval.dtype.itemsize for x in equation.outvars)
+        for own in inner:
+            yield from _carried(own)
+
+
+def _is_program(x: Any) -> bool:
+    return isinstance(x, ClosedJaxpr | Jaxpr)
+
+
+def _count(members: tuple[Any, ...]) -> int:
+    """The number of members along axis 0 of all arrays."""
+    counts = {}
+    for path, x in jax.tree_util.tree_leaves_with_path(members):
+        name = f"Argument {jax.tree_util.keystr(path)}"
+        if isinstance(x, bool | int | float | complex) or (isinstance(x, _ARRAYS) and not np.shape(x)):
+            raise ValueError(
+                f"{name} is a single number, {x!r}: members are along axis 0. Those that are given one by one are "
+                "stacked by jax.tree.map(lambda *x: jnp.stack(x), *members), if they have one structure."
+            )
+        if isinstance(x, _ARRAYS):
+            counts[name] = np.shape(x)[0]
+    if not counts:
+        raise ValueError("A batch needs an array with members along axis 0, got none.")
+    (first, count), *others = counts.items()
+    for name, own in others:
+        if own != count:
+            raise ValueError(f"{first} has {count} members, but {name} has {own}.")
+    if count == 0:
+        raise ValueError(f"A batch needs at least one member, and {first} has none.")
+    return count

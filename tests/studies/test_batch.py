@@ -1,0 +1,183 @@
+"""Batches in blocks: the numbers of `jax.vmap` and of a loop, remainders, derivatives, sizes and refusals."""
+
+import contextlib
+import itertools
+import logging
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb.studies.batch import Member
+
+
+def halved(x):
+    """The halves of `start` down to one `small`, by a loop whose length depends on the member."""
+    out = jax.lax.while_loop(lambda s: s[0] > x["small"], lambda s: (s[0] / 2, s[1] + 1), (x["start"], 0))
+    return {"last": (out[0], jnp.stack([out[0], x["small"]])), "steps": out[1]}
+
+
+def members(count):
+    return {"start": np.geomspace(1.0, 1e6, count), "small": np.linspace(0.3, 0.9, count)}
+
+
+@pytest.mark.parametrize(
+    ("count", "size"), [(7, None), (7, 1), (7, 2), (7, 3), (7, 6), (7, 100), (8, 4), (2, 1), (1, None), (1, 3)]
+)
+def test_blocks_have_the_numbers_of_a_batch_and_of_a_loop(count, size):
+    x = members(count)
+    found, together = mb.batch(halved, size)(x), jax.vmap(halved)(x)
+    assert jax.tree.structure(found) == jax.tree.structure(together)
+    loop = [halved({name: column[k] for name, column in x.items()}) for k in range(count)]
+    alone = jax.tree.map(lambda *parts: jnp.stack(parts), *loop)
+    for own, other, third in zip(*map(jax.tree.leaves, (found, together, alone)), strict=True):
+        np.testing.assert_array_equal(own, other)
+        np.testing.assert_array_equal(own, third)
+        assert own.dtype == other.dtype == third.dtype
+
+
+def test_several_arguments_names_and_what_is_shared():
+    factor = np.array([2.0, 3.0])
+    scaled = lambda x, how, y: {how: x["a"] * factor + y}
+    found = mb.batch(scaled, 2)({"a": np.arange(5.0)}, "sum", np.ones(5))
+    np.testing.assert_array_equal(found["sum"], np.arange(5.0)[:, None] * factor + 1)
+    assert mb.batch(scaled)({"a": np.arange(5.0)}, "other", np.ones(5)).keys() == {"other"}
+
+
+class _Compiled(logging.Handler):
+    """The names of programs, as they are compiled."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def emit(self, record):
+        found = re.match(r"Finished XLA compilation of (?:jit\()?(\w+)", record.getMessage())
+        if found:
+            self.names.append(found[1])
+
+
+@contextlib.contextmanager
+def compiled():
+    handler, logger = _Compiled(), logging.getLogger("jax._src.dispatch")
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield handler.names
+    finally:
+        logger.removeHandler(handler)
+
+
+def test_a_remainder_compiles_nothing_more():
+    traced = []
+
+    def function(x):
+        traced.append(1)
+        return jnp.sum(x**2)
+
+    own, x = mb.batch(function, 4), np.arange(20.0).reshape(10, 2)
+    with compiled() as names:
+        np.testing.assert_array_equal(own(x), np.sum(x**2, axis=1))
+        own(x + 1)
+    assert len(names) == 1 and len(traced) == 1
+
+
+@pytest.mark.parametrize("size", [1, 3, None])
+def test_derivatives_are_those_of_a_batch(size):
+    shared, x = jnp.array([0.3, 0.7]), jnp.linspace(0.5, 2.0, 7)
+
+    def total(batch):
+        def of(shared, x):
+            # Also through what the function refers to.
+            return jnp.sum(batch(lambda x: jnp.sum(jnp.sin(shared * x) ** 2) * x)(x) ** 2)
+
+        return of
+
+    own, plain = total(lambda f: mb.batch(f, size)), total(jax.vmap)
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+        of_both = (jax.jit(derivative(function, (0, 1))) for function in (own, plain))
+        for found, expected in zip(*(jax.tree.leaves(of(shared, x)) for of in of_both), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    outer = lambda function: jax.vmap(jax.jit(function), (None, 0))(shared, jnp.stack([x, 2 * x]))
+    np.testing.assert_allclose(outer(own), outer(plain), rtol=1e-14)
+    inner = lambda batch: batch(jax.grad(lambda x: jnp.sum(jnp.sin(shared * x))))(x)
+    np.testing.assert_allclose(inner(lambda f: mb.batch(f, size)), inner(jax.vmap), rtol=1e-14)
+
+
+def test_a_last_member_that_fails_leaves_the_others():
+    x = jnp.array([4.0, 9.0, 16.0, 25.0, -1.0])
+    own = mb.batch(lambda x: jnp.where(x > 0, jnp.sqrt(x), jnp.nan), 2)
+    np.testing.assert_array_equal(own(x), [2.0, 3.0, 4.0, 5.0, np.nan])
+    slope = jax.grad(lambda x: jnp.sum(own(x)[:4]))(x)
+    np.testing.assert_allclose(slope[:4], 0.5 / np.sqrt(x[:4]))
+
+
+def test_the_size_of_a_block_is_that_of_what_loops_carry():
+    """Twice as much to carry halves a block, a power of two; without a loop a block is the whole batch."""
+
+    def size(numbers, members=1000):
+        def function(x):
+            return jax.lax.fori_loop(0, 10, lambda k, y: jnp.sin(y), x * jnp.ones(numbers))
+
+        return Member(function, np.asarray(1.0)).block_size(members)
+
+    sizes = [size(2**k) for k in range(4, 20)]
+    assert sizes[0] == 64 and sizes[-1] == 1
+    assert all(a in (b, 2 * b) for a, b in itertools.pairwise(sizes))
+    assert Member(lambda x: jnp.sin(x) * jnp.ones(10), np.asarray(1.0)).block_size(1000) == 1000
+
+
+@pytest.mark.parametrize("size", [0, -1, 1.5, True, "4"])
+def test_a_size_that_is_none_is_refused(size):
+    with pytest.raises(ValueError, match=re.escape(f"size must be an integer of at least 1, or None, got {size!r}.")):
+        mb.batch(halved, size)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "A batch needs an array with members along axis 0, got none."),
+        (("name",), "A batch needs an array with members along axis 0, got none."),
+        ((2.0,), r"Argument \[0\] is a single number, 2.0: members are along axis 0"),
+        ((np.ones(3), {"a": np.ones(4)}), r"Argument \[0\] has 3 members, but Argument \[1\]\['a'\] has 4."),
+        ((np.ones((0, 2)),), r"A batch needs at least one member, and Argument \[0\] has none."),
+        (([{"a": 1.0}, {"a": 2.0, "b": 1.0}],), "stacked by jax.tree.map.* if they have one structure"),
+    ],
+)
+def test_arguments_that_are_no_members_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        mb.batch(lambda *x: x)(*arguments)
+
+
+def test_functions_that_cannot_be_batched_are_refused():
+    with pytest.raises(ValueError, match="batch needs a function, got 3"):
+        mb.batch(3)
+    with pytest.raises(ValueError, match="cannot be batched: it needs the number of an argument"):
+        mb.batch(lambda x: x if x > 0 else -x)(np.ones(4))
+    known = jax.extend.core.Primitive("no_rule_for_batches")
+    known.def_abstract_eval(lambda x: x)
+    jax.interpreters.mlir.register_lowering(known, jax.interpreters.mlir.lower_fun(jnp.sin, multiple_results=False))
+    with pytest.raises(ValueError, match=r"cannot be batched .*no_rule_for_batches.* size=1 computes one member after"):
+        mb.batch(known.bind, 2)(np.arange(4.0))
+    np.testing.assert_allclose(mb.batch(known.bind, 1)(np.arange(4.0)), np.sin(np.arange(4.0)), rtol=1e-15)
+
+
+def test_motions_in_blocks():
+    """Steps and states of a batch of simulations, one of which fails, and of single runs."""
+    mechanism = mb.mechanisms.get("pendulum")
+
+    def swing(mass):
+        system = mb.with_parameters(mechanism.system, {"bob.mass": mass})
+        return mb.simulate(system, mechanism.state, t1=0.5, rtol=1e-8, throw=False)
+
+    outcome = lambda mass: (lambda sol: (sol.ys, sol.result._value, sol.stats["num_steps"]))(swing(mass))
+    masses = np.array([1.0, 0.5, 2.0, -1.0, 3.0])
+    found, alone = mb.batch(outcome, 2)(masses), jax.jit(outcome)
+    assert np.all(np.isfinite(found[0].q[np.array([0, 1, 2, 4])])) and np.all(np.isnan(found[0].q[3]))
+    for k, mass in enumerate(masses):
+        one = alone(mass)
+        np.testing.assert_array_equal([found[1][k], found[2][k]], one[1:])
+        np.testing.assert_allclose(found[0].q[k], one[0].q, rtol=1e-9)
