@@ -1,10 +1,8 @@
 """One chunk of a sweep: its members in blocks, those that take long once more in blocks of their own."""
 
 import dataclasses
-import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import jax
@@ -114,10 +112,7 @@ def whole_chunk(chunk: int, devices: tuple[Any, ...]) -> int:
 
 
 class _Program:
-    """The compiled program of a block with a limit of steps, `size` its members; of a whole chunk on several devices.
-
-    Threads compute blocks side by side, one on each core.
-    """
+    """The compiled program of a block of `size` members with a limit of steps; of a whole chunk on several devices."""
 
     def __init__(self, own: Batch, steps: int | None, columns: Mapping[str, np.ndarray]):
         fixed = {} if steps is None else {"max_steps": steps}
@@ -141,32 +136,17 @@ class _Program:
             members = member.block(self.size)
         self._run = jax.jit(members).lower(self._block(columns, 0)).compile()
         self.seconds = time.perf_counter() - begin
-        on_cores = not own.devices and jax.default_backend() == "cpu"
-        self._threads = int(os.environ.get("NPROC") or os.cpu_count() or 1) if on_cores else 1
 
     def __call__(
         self, columns: Mapping[str, np.ndarray], tell: Callable[[int], object] = lambda members: None
     ) -> Returned:
         """The outputs of some members, in blocks."""
         count = next(iter(columns.values())).shape[0]
-        starts = range(0, count, self.size)
         blocks = []
-        for start, found in zip(starts, self._computed(columns, starts), strict=True):
-            blocks.append(found)
+        for start in range(0, count, self.size):
+            blocks.append(jax.tree.map(np.asarray, self._run(self._block(columns, start))))
             tell(min(self.size, count - start))
         return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
-
-    def _computed(self, columns: Mapping[str, np.ndarray], starts: Sequence[int]):
-        compute = lambda start: jax.tree.map(np.asarray, self._run(self._block(columns, start)))
-        threads = min(self._threads, len(starts))
-        if threads == 1:
-            yield from map(compute, starts)
-            return
-        pool = ThreadPoolExecutor(threads)
-        try:
-            yield from pool.map(compute, starts)
-        finally:
-            pool.shutdown(cancel_futures=True)
 
     def _block(self, columns: Mapping[str, np.ndarray], start: int) -> dict[str, Any]:
         """The parameters of a block, filled up to its size with the last member."""

@@ -80,7 +80,7 @@ def sweep(
     **Other arguments:**
 
     - `chunk`: members that are written together, default 512 or fewer; what is lost when a process is killed, and what
-        takes memory. The store keeps it. They are computed in blocks as by `jaxmb.batch`, on all cores.
+        takes memory. The store keeps it. They are computed in blocks as by `jaxmb.batch`.
     - `budget`: most steps of a member at first. Members of a block run together and take as long as the slowest of
         them. So if the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`,
         members that use up the budget are computed anew with the default of `max_steps`, in blocks of their own, by a

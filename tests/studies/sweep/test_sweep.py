@@ -305,6 +305,33 @@ def test_members_beyond_the_budget_are_computed_anew():
         assert other.drop_attrs().identical(found.drop_attrs()), budget
 
 
+@pytest.mark.parametrize(("pays", "programs"), [(2.0, 1), (-1.0, 2)])
+def test_a_budget_is_chosen_only_where_it_pays(monkeypatch, pays, programs):
+    """Short motions in a few chunks are worth no second program; if it costs nothing, members have the same outputs."""
+    batches = sys.modules["jaxmb.studies.sweep.batch"]
+    monkeypatch.setattr(batches, "_PAYS", pays)
+    made, own = [], batches.Chunks.__init__
+    monkeypatch.setattr(batches.Chunks, "__init__", lambda chunks, batch: (made.append(chunks), own(chunks, batch))[1])
+    n = np.full(400, 10)
+    n[::50], n[[7, 309]], n[77] = 90, 300, 3
+    function = lambda n, max_steps=100: _steps(n, None, max_steps)
+    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=100)
+    assert made[0].programs == programs and found.attrs["budget"] is None
+    np.testing.assert_array_equal(found["n2"], np.where(n <= 100, n * n, -1))
+    np.testing.assert_array_equal(found["num_steps"], np.minimum(n, 100))
+
+
+def test_the_cheapest_budget():
+    batches = sys.modules["jaxmb.studies.sweep.batch"]
+    steps = np.full(64, 100)
+    # All alike: nothing is saved.
+    assert batches.cheapest_budget(steps, 8)[1] == 0.0
+    steps[[3, 20]] = 1000
+    # Two of eight blocks wait for 1000 steps; with a budget they end at 111, and one block of both takes 1000.
+    budget, share = batches.cheapest_budget(steps, 8)
+    assert budget == 111 and share == pytest.approx(1 - (6 * 100 + 2 * 111 + 1000) / (6 * 100 + 2 * 1000))
+
+
 @pytest.mark.long
 def test_motions_that_fail_have_a_status():
     mechanism = mb.mechanisms.get("pendulum")
