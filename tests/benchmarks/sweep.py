@@ -6,6 +6,7 @@ Run it with `NPROC=1 python tests/benchmarks/sweep.py overhead | long | devices`
 `MEMBERS=2000 jaxmb sweep tests/benchmarks/sweep_vehicle.py --out vehicle.zarr --processes 2`.
 """
 
+import dataclasses
 import os
 import shutil
 import sys
@@ -25,11 +26,11 @@ from sweep_four_bar import four_bar
 
 import jaxmb as mb
 from jaxmb.studies.sweep import engine
-from jaxmb.studies.sweep.batch import Batch
+from jaxmb.studies.sweep.batch import Batch, cheapest_budget
 from jaxmb.studies.sweep.outputs import declared, statuses
 
-# Members of the batch with some that take long, and of a chunk as sweeps have it.
-CHUNK, DEFAULT, REPEATS = 256, 512, 8
+# Members of the batch with some that take long, of a chunk as sweeps have it, and of a block.
+CHUNK, DEFAULT, SIZE, REPEATS = 256, 512, 64, 8
 LONG, FAILED = [17, 101, 202], [40, 90, 250]
 
 
@@ -65,7 +66,7 @@ def overhead(chunks=4):
     mb.sweep(four_bar, cases, store, chunk=DEFAULT, budget=None, progress=False)
     print(f"the whole sweep with compiling: {time.perf_counter() - begin:.1f} s")
     work = engine.Work(batch_of(cases, chunk=DEFAULT, max_steps=65536), store)
-    swept = lambda: [work(engine.Task(k, part)) for k, part in enumerate(parts)] and None
+    swept = lambda: [work(engine.Task(k, part, 0)) for k, part in enumerate(parts)] and None
     plain = lambda: [np.asarray(bare(**part)["angle"]) for part in parts]
     swept(), plain()
     times = fastest(swept, plain)
@@ -86,12 +87,14 @@ def long():
     t1[LONG], length[FAILED] = 20.0, 9.0
     mixed = mb.cases.table(length=length, t1=t1)
     full = batch_of(mixed, chunk=CHUNK, max_steps=65536)
-    chosen = full.with_budget(mixed)
-    run, alone = chosen.compiled(), full.compiled()
-    found, steps = run(mixed.columns), np.asarray(alone(good).steps)
+    alone = full.compiled()
+    steps = np.asarray(alone(good).steps)
+    budget, _ = cheapest_budget(np.asarray(alone(mixed.columns).steps), SIZE)
+    run = dataclasses.replace(full, budget=budget).compiled()
+    found = run(mixed.columns)
     words = [full.outputs.statuses[code][0] for code in statuses(found)]
     own = np.asarray(found.steps)
-    print(f"budget {chosen.budget}, steps of the good {steps.min()} to {steps.max()}, of the long {own[LONG]}")
+    print(f"budget {budget}, steps of the good {steps.min()} to {steps.max()}, of the long {own[LONG]}")
     print(f"failed: {sorted({words[k] for k in FAILED})}, steps {own[FAILED]}")
     times = fastest(lambda: run(mixed.columns), lambda: alone(good), lambda: alone(mixed.columns))
     print(f"with a budget {times[0]:.3f} s, the good alone {times[1]:.3f} s, mixed without a budget {times[2]:.3f} s")
