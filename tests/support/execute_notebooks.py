@@ -1,9 +1,9 @@
 """Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
 
-Without names all notebooks are executed, and the figures `work_precision` and `four_bar` of the README are made. A notebook keeps the
-version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares them with the package
-and with the cells, and in its long tests what is printed with what a new execution prints. Cells with the tag `varies`
-print what differs between machines and runs, such as times, and are not compared.
+Without names all notebooks are executed, and the figures `work_precision` and `four_bar` of the README are made. A
+notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares
+them with the package and with the cells, and in its long tests what is printed with what a new execution prints. Cells
+with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
 """
 
 import hashlib
