@@ -154,8 +154,8 @@ class Linearisation(eqx.Module):
         return StateSpace(*map(np.asarray, (self.A, self.B, self.C, self.D)))
 
     def to_control(self) -> Any:
-        """The same as a `control.StateSpace` of python-control, with the names of states, inputs and outputs, in which an
-        underscore takes the place of the point, `motor_torque`.
+        """The same as a `control.StateSpace` of python-control, with all names, whose points become underscores:
+        `motor_torque`.
 
         **Raises:** `ImportError` without python-control.
         """
