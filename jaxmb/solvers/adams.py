@@ -19,7 +19,6 @@ from .evaluation import (
     Evaluation,
     controlled_components,
     evaluate,
-    field_of,
     next_chart,
     project_near,
     ravel,

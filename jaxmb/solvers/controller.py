@@ -100,8 +100,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
 
-    Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long the
-    first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
+    Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
+    the first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
 
     If no acceptable step is found down to `dtmin`, or to the resolution of the floating-point time, the solve ends with
     `diffrax.RESULTS.dt_min_reached`.
@@ -197,7 +197,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         self._check_resolution(y0)
         opening = 2 if dt0 is None else 0
         if dt0 is None:
-            dt0 = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)) * _TRIAL
+            dt0 = lax.stop_gradient(jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)) * _TRIAL)
         dt0 = self._bound(dt0, t0.dtype)
         return t0 + dt0, ControllerState(lax.stop_gradient(dt0), jnp.array([0, 0, opening, 0, 0], np.int32))
 

@@ -165,8 +165,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return chart
 
     def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
-        """Whether the state at the end of a step is none of the manifold; the step is then retried with a smaller one.
-        """
+        """Whether the state at the end of a step is none of the manifold; the step is then retried, shorter."""
         del chart
         return False
 

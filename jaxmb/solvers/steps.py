@@ -50,9 +50,7 @@ class AbstractSteps(eqx.Module):
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
-    def memory_at_start(
-        self, equations: PyTree, start: Any, along: tuple[PyTree, Array, PyTree]
-    ) -> PyTree[Array]:
+    def memory_at_start(self, equations: PyTree, start: Any, along: tuple[PyTree, Array, PyTree]) -> PyTree[Array]:
         """The tangent of the memory that the first step of a run begins with; by default the one that it is given.
 
         **Arguments:** `equations`: the terms, their arguments and the solver; `start`: the first state of diffrax's
