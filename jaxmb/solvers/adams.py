@@ -72,8 +72,9 @@ class AdamsState(AbstractMultistepState):
 
 
 class _Step(AbstractAttempt):
-    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas, the
-    `mismatch` of the corrector at the end, and the evaluations of the prediction and of the corrected state.
+    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas (of a
+    first step, which has one, the state before it and the change by its derivative beside that), the `mismatch` of
+    the corrector at the end, and the evaluations of the prediction and of the corrected state.
     """
 
     after: Float[Array, " n"]
@@ -203,7 +204,7 @@ class Adams(AbstractMultistep):
         tangents = None
         if self.tangent_control is not None:
             control = self.tangent_control
-            ws = control.starts() if before is None else [tangent.w for tangent in before.tangents]
+            ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
             tangents = tuple(Tangent(w, jnp.zeros_like(history.differences), control.largest(w)) for w in ws)
         order = jnp.asarray(1, np.int32)
         return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents)
@@ -224,6 +225,7 @@ class Adams(AbstractMultistep):
         corrected = explicit + of.h * of.last * (first.f - neighbours[1])
         second = project_near(terms, t1, corrected, like, first, args)
         errors = of.h * of.differences[:, None] * (jnp.where(starts, second.f, first.f)[None] - neighbours)
+        errors = jnp.where(starts, jnp.stack([before, errors[1], of.h * first.f]), errors)
         mismatch = explicit + of.h * of.last * (second.f - neighbours[1]) - second.y
         return _Step(
             second.y, advance(history, of.end, second.f, partial_sums), errors, mismatch, predicted, first, second
@@ -237,15 +239,13 @@ class Adams(AbstractMultistep):
         step, along = self.attempted(terms, t1, before, y0, args, state)
         after = step.after
 
-        h = (t1 - history.mesh[0]).astype(dtype)
         failed = step.first.failed | step.second.failed
         started = self._started(state.sizes, before, step.first.f)
         state = eqx.tree_at(lambda state: state.sizes, state, started, is_leaf=lambda x: x is None)
         scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
         # In the first step the state changes at most by its own size, or by the tolerance.
-        size = lambda x: self.weighted_norm(lax.stop_gradient(x), scale, y0)
-        reached = h * size(step.first.f) / jnp.maximum(size(before), 1)
+        reached = sizes[2] / jnp.maximum(sizes[0], 1)
         sizes = jnp.where(starts, jnp.maximum(sizes, _TARGET * reached**2), sizes)
         tangents, scales = self.tangents_after(state.tangents, along)
         for end, own in zip(along, scales, strict=True):
@@ -261,12 +261,13 @@ class Adams(AbstractMultistep):
             target=_TARGET,
             work=jnp.asarray(_WORK),
         )
-        lost = starts & (step.first.failed | ~jnp.all(jnp.isfinite(step.first.f)))
+        lost = starts & (step.first.failed | ~jnp.isfinite(reached))
         # After one step the second order is known to be better, but not by how much: by more than steps may grow.
         growth = jnp.where(starts, jnp.asarray(jnp.inf, dtype), estimate.growth)
         retry = jnp.where(lost, jnp.asarray(-1.0, dtype), estimate.retry)
         estimate = eqx.tree_at(lambda e: (e.growth, e.retry), estimate, (growth, retry))
         y1 = unravel_like(y0, after)
+        h = (t1 - history.mesh[0]).astype(dtype)
         new_state = AdamsState(
             history=step.history,
             order=order + change,
@@ -290,7 +291,9 @@ class Adams(AbstractMultistep):
     def _started(self, sizes, before, f) -> Float[Array, " groups"] | None:
         """The sizes that the absolute tolerance is relative to, where there are none yet those of a first state."""
         scales = self.tolerances.scales
-        return None if scales is None else jnp.where(sizes > 0, sizes, scales.start(before, f))
+        if scales is None:
+            return None
+        return jnp.where(sizes > 0, sizes, scales.start(before, f))
 
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
