@@ -126,7 +126,7 @@ class Mesh(eqx.Module):
         zeros unless they are `used`.
         """
         blank = self.blank()
-        first = self._first(*x[1], blank if any(used.rows) else blank._replace(rows=[]))
+        first = self._first(x[1][0], x[1][1], blank if any(used.rows) else blank._replace(rows=[]))
         if self.segments is None:
             return self._out(self._pushed(x[0], first, self.rows, self.count), blank)
 
