@@ -21,7 +21,8 @@ def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     def of_arrays(arrays, program):
         structure, rest = program
         left = iter(arrays)
-        return function(*jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest]))
+        given: Any = jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest])
+        return function(*given, **{})
 
     # The name that profiles and logs of compilations show.
     of_arrays.__name__ = function.__name__.lstrip("_")
