@@ -18,11 +18,13 @@ def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     `equinox.filter_jit` does the same for any function, and takes twice as long to call one of many numbers.
     """
 
+    any_function: Callable[..., _Result] = function
+
     def of_arrays(arrays, program):
         structure, rest = program
         left = iter(arrays)
         arguments, named = jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest])
-        return function(*arguments, **named)
+        return any_function(*arguments, **named)
 
     # The name that profiles and logs of compilations show.
     of_arrays.__name__ = function.__name__.lstrip("_")
