@@ -77,18 +77,19 @@ if TYPE_CHECKING:
         RootLocus as RootLocus,
         floquet as floquet,
         linearise as linearise,
+        linearize as linearize,
         root_locus as root_locus,
         steady_motion as steady_motion,
     )
-    from .studies.optimise import Optimum as Optimum, optimise as optimise, robust as robust
+    from .studies.optimise import Optimum as Optimum, optimise as optimise, optimize as optimize, robust as robust
     from .studies.sweep import cases as cases, load_sweep as load_sweep, sweep as sweep
 else:
     _MODULES = ("importers", "lagrangian", "mechanisms", "planar", "report", "spatial", "studies", "viz")
     _NAMES = {
         "studies.batch": "batch",
         "studies.identify": "Experiment Identification Measurements Sensor identify read_measurements",
-        "studies.linear": "Floquet Linearisation RootLocus floquet linearise root_locus steady_motion",
-        "studies.optimise": "Optimum optimise robust",
+        "studies.linear": "Floquet Linearisation RootLocus floquet linearise linearize root_locus steady_motion",
+        "studies.optimise": "Optimum optimise optimize robust",
         "studies.sweep": "cases load_sweep sweep",
     }
     _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}

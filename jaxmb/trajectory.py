@@ -67,6 +67,11 @@ def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
 class Trajectory(eqx.Module):
     """The motion that `simulate` returns, or a batch of them.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, saveat=np.linspace(0.0, 1.0, 11))
+    motion["bar"].angle, motion["pin"].angle_rate, motion.energy, motion.constraint_violation
+    ```
+
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`

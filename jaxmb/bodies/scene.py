@@ -53,6 +53,12 @@ from .structure import with_structure
 class Scene(eqx.Module):
     """Bodies, joints and forces by name.
 
+    ```python
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    system = jaxmb.Scene([bar], joints=[pin], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
+
     A scene is planar or spatial, never both; its bodies decide. Joints are position or velocity constraints, in any
     order; closed loops and redundant joints are the normal case.
 

@@ -29,6 +29,16 @@ _NOT_IN_FILES = "/\\:\0"
 class LagrangianSystem(AbstractLagrangian):
     r"""A mechanical system from its Lagrangian `L(t, q, q̇)`, forces, and constraints at any level.
 
+    ```python
+    pendulum = jaxmb.lagrangian.LagrangianSystem(
+        lambda t, q, v, p: 0.5 * p["length"] ** 2 * v[0] ** 2 + 9.81 * p["length"] * jnp.cos(q[0]),
+        q=[0.5],
+        coordinates=["theta"],
+        parameters={"length": 1.0},
+    )
+    jaxmb.simulate(pendulum, jaxmb.assemble(pendulum), t1=1.0)["theta"]
+    ```
+
     With velocities u, `q̇ = K(t, q, u)` and `B = ∂K/∂u`, the equations are Lagrange's, projected on the columns of B:
 
     $$B^T \left(\frac{d}{dt} \frac{\partial L}{\partial \dot q} - \frac{\partial L}{\partial q} - Q\right)

@@ -12,16 +12,19 @@ _Result = TypeVar("_Result")
 
 
 def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`jax.jit` of a function of pytrees, given by position, whose leaves that are no arrays belong to the program; all
-    leaves of the result are arrays.
+    """`jax.jit` of a function of pytrees, whose leaves that are no arrays belong to the program; all leaves of the
+    result are arrays.
 
     `equinox.filter_jit` does the same for any function, and takes twice as long to call one of many numbers.
     """
 
+    any_function: Callable[..., _Result] = function
+
     def of_arrays(arrays, program):
         structure, rest = program
         left = iter(arrays)
-        return function(*jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest]))
+        arguments, named = jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest])
+        return any_function(*arguments, **named)
 
     # The name that profiles and logs of compilations show.
     of_arrays.__name__ = function.__name__.lstrip("_")
@@ -29,8 +32,7 @@ def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
 
     @functools.wraps(function)
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
-        assert not named
-        leaves, structure = jax.tree.flatten(arguments)
+        leaves, structure = jax.tree.flatten((arguments, named))
         # A pytree has no leaves that are None.
         rest = tuple(None if isinstance(x, _ARRAYS) else x for x in leaves)
         arrays = [x for x, own in zip(leaves, rest, strict=True) if own is None]

@@ -103,6 +103,9 @@ class StatefulTerm(AbstractManifoldTerm):
     def update_chart(self, t, y, chart, args):
         return _at(self.term, y).update_chart(t, _mechanical(y), chart, args)
 
+    def after_step(self, t, y, chart, args):
+        return _at(self.term, y).after_step(t, _mechanical(y), chart, args)
+
     def refuses(self, chart):
         return self.term.refuses(chart)
 

@@ -14,6 +14,7 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -338,8 +339,8 @@ class Partition(AbstractManifold):
 
 
 class RedundantRows(eqx.Module):
-    """The `sizes` of the rows of ψ, and the `violation` of redundant ones at the state of a chart relative to what is
-    allowed.
+    """The `sizes` of the rows of ψ, and the `violation` of redundant ones at the end of the last step relative to what
+    is allowed.
     """
 
     sizes: Float[Array, "velocity_rows"]
@@ -398,13 +399,12 @@ class PartitionTerm(AbstractManifoldTerm):
         return VectorField(self.system, self.formulation)(t, y, args)
 
     def init_chart(self, t, y, args):
+        # A chart of no use, so that charts are chosen in one place.
         system, y = lax.stop_gradient((self.system, y))
-        split, fresh, singular = _choose(system, t, y, _of_coordinates(system, t, y))
-        redundant = None
-        if drops_rows(system):
-            sizes = row_sizes(system, t, y)
-            redundant = RedundantRows(sizes, _violation(system, t, y, sizes, self.newton_tol))
-        return Chart(split, fresh, fresh, jnp.stack([0, 0, 0, 1, singular.astype(int)]), redundant)
+        choose = lambda system: _choose(system, t, y, _of_coordinates(system, t, y))
+        split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, system))
+        redundant = RedundantRows(row_sizes(system, t, y), jnp.zeros((), y.q.dtype)) if drops_rows(system) else None
+        return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant)
 
     def evaluate(self, t, y, chart, args):
         q = correct_positions(self.system, t, y.q, lax.stop_gradient(chart.split))
@@ -490,7 +490,10 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def update_chart(self, t, y, chart, args):
         del args
-        chart = _updated(*lax.stop_gradient((self.system, t, y, chart)), self.max_influence)
+        return _updated(*lax.stop_gradient((self.system, t, y, chart)), self.max_influence)
+
+    def after_step(self, t, y, chart, args):
+        del args
         if chart.redundant is None:
             return chart
         violation = _violation(*lax.stop_gradient((self.system, t, y, chart.redundant.sizes, self.newton_tol)))
@@ -511,7 +514,8 @@ def _counted(chart, iterations):
 def _updated(system, t, y, chart, max_influence):
     """The chart, refreshed or chosen anew where it has become worse."""
     bounds = np.array([max_influence, _ROW_GROWTH])[: chart.fresh.size]
-    worse = lambda chart: jnp.any(chart.quality > bounds * chart.fresh)
+    # Of no quality, not a number, are charts that are none.
+    worse = lambda chart: ~jnp.all(chart.quality <= bounds * chart.fresh)
 
     def renewed(chart, jacobian):
         def renew(chart):

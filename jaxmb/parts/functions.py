@@ -75,6 +75,13 @@ class VelocityConstraint(AbstractVelocityConstraint):
 class Force(AbstractPotentialForce):
     """A force law from a function, `function(poses, velocities, t, parameters) -> wrenches`.
 
+    ```python
+    def drag(poses, velocities, t, parameters):
+        return -parameters["c"] * velocities  # of each body: force and moment
+
+    jaxmb.Force("drag", ["bar"], drag, parameters={"c": 0.1})
+    ```
+
     **Arguments:**
 
     - `bodies`: one name or several; `"ground"` may be among them (its wrench is dropped).

@@ -41,6 +41,10 @@ class AbstractSignal(eqx.Module):
 class Series(AbstractSignal):
     """A value given at some times, such as a measured or a planned input.
 
+    ```python
+    torque = jaxmb.Series([0.0, 0.5, 1.0], [0.0, 2.0, 0.0], interpolation="held")
+    ```
+
     **Arguments:**
 
     - `ts` [s], shape (n,), ascending, n ≥ 2; `values`, shape (n, …): numbers, vectors or matrices, in SI units.

@@ -1,4 +1,18 @@
-"""Reports: error against run time, stiff and extreme variants, and the costs of formulations and of methods."""
+"""Reports: error against run time, stiff and extreme variants, and the costs of formulations and of methods.
+
+- `work_precision(system, state, t1=)`: error against run time and evaluations, for solvers and tolerances, against two
+  methods that agree.
+- `stress_test(system, state, t1=)`: the true error, or the refusal, of stiff and extreme variants: springs, masses,
+  lengths, speeds, redundant joints, tolerances.
+- `left_out(system, state, t1=)`: what specialisation saves: each unused feature is switched on in turn, and tracing,
+  compiling and evaluating are timed.
+- `formulation_costs(mechanism)`: run time and program size of every formulation, with derivatives.
+- `method_costs(mechanism)`: coordinate partitioning compared with integrating all coordinates: evaluations, linear
+  algebra and time at equal error.
+
+`jaxmb report KIND NAME` writes one of them from the command line; NAME is a mechanism or `file.py:function`, where the
+function returns a scene, or a system and a state.
+"""
 
 from .formulations import (
     FormulationCost as FormulationCost,

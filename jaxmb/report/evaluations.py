@@ -5,20 +5,18 @@ from typing import Any
 
 import diffrax
 
-# Evaluations by which `MultistepController` chooses the first step.
-_FIRST_STEP = 2
-
 
 def evaluations(solver: diffrax.AbstractSolver, stats: Mapping[str, Any]) -> int | None:
     """Evaluations of the vector field in a run with adaptive steps whose first step the controller chooses.
 
     Rejected steps count like accepted ones. The first stage of a Runge–Kutta method that is the last stage of the
     previous step counts once. Evaluations that choose the first step of these methods, and those repeated if it is
-    rejected, are not counted, which favours them by one or two. None for implicit Runge–Kutta methods, which do not
+    rejected, are not counted, which favours them by one or two; the trial of a `MultistepController` is. None for
+    implicit Runge–Kutta methods, which do not
     report their iterations.
     """
     if "num_evaluations" in stats:
-        return int(stats["num_evaluations"]) + _FIRST_STEP
+        return int(stats["num_evaluations"])
     tableau = getattr(solver, "tableau", None)
     if not isinstance(tableau, diffrax.ButcherTableau) or tableau.implicit:
         return None

@@ -72,6 +72,12 @@ def simulate(
 ) -> Trajectory:
     """Integrate the motion of a system.
 
+    ```python
+    state = jaxmb.assemble(system, fix={"bar.angle": 0.5})
+    motion = jaxmb.simulate(system, state, t1=1.0, saveat=np.linspace(0.0, 1.0, 11))
+    motion["bar"].angle, motion.energy, motion.reactions["pin"].force
+    ```
+
     **Main arguments:**
 
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.

@@ -19,7 +19,6 @@ from .evaluation import (
     Evaluation,
     controlled_components,
     evaluate,
-    field_of,
     next_chart,
     project_near,
     ravel,
@@ -52,7 +51,7 @@ class AdamsState(AbstractMultistepState):
     - `order`: the order of the next step.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
         accepted steps of order `k`. The number of evaluations of the vector field, rejected steps included, is
-        `step_counts[0] + 2 * solution.stats["num_steps"]`, and two more without a given `dt0`.
+        `2 * solution.stats["num_steps"]`, with steps of given lengths `step_counts[0]` more.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
@@ -73,8 +72,9 @@ class AdamsState(AbstractMultistepState):
 
 
 class _Step(AbstractAttempt):
-    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas, the
-    `mismatch` of the corrector at the end, and the evaluations of the prediction and of the corrected state.
+    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas (of a
+    first step, which has one, the state before it and the change by its derivative beside that), the `mismatch` of
+    the corrector at the end, and the evaluations of the prediction and of the corrected state.
     """
 
     after: Float[Array, " n"]
@@ -96,7 +96,8 @@ class Adams(AbstractMultistep):
     Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order $k$ predicts with the
     Adams-Bashforth formula of order $k$ and corrects with the Adams-Moulton formula of order $k + 1$. Two evaluations a
     step, whatever the order; at tolerances of about 1e-6 and below it needs roughly half the evaluations of high-order
-    Runge-Kutta methods, so it pays when the vector field is expensive.
+    Runge-Kutta methods, so it pays when the vector field is expensive. The first step, of order one, evaluates at its
+    start instead of at a prediction: it is Euler's.
 
     Use it with [`jaxmb.solvers.MultistepController`][], which reads its error estimates and from which it takes the
     tolerances:
@@ -179,7 +180,7 @@ class Adams(AbstractMultistep):
 
     def statistics(self, solver_state: AdamsState, controller_state, stats):
         out = {
-            "num_evaluations": solver_state.step_counts[0] + 2 * stats["num_steps"],
+            "num_evaluations": 2 * stats["num_steps"] + (solver_state.step_counts[0] if self.tolerances.fixed else 0),
             "orders": solver_state.step_counts[1:],
         }
         if solver_state.stiffness is not None:
@@ -187,51 +188,65 @@ class Adams(AbstractMultistep):
         return out
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before: AdamsState | None) -> AdamsState:
-        first = evaluate(terms, t0, ravel(y0), y0, chart, args)
-        f, chart = first.f, first.chart
-        if first.failed is not False:
-            # The NaN reaches the error estimate, so the step is rejected.
-            f = jnp.where(first.failed, jnp.full_like(f, jnp.nan), f)
+        flat = ravel(y0)
+        history = start(t0, jnp.zeros_like(flat), t1 - t0)
+        history = eqx.tree_at(lambda history: history.known, history, jnp.zeros_like(history.known))
+        starts = jnp.zeros((), np.int32)
+        if self.tolerances.fixed:
+            # No error is controlled, so that of Euler's method may be large in the first step.
+            first = evaluate(terms, t0, flat, y0, next_chart(terms, t0, y0, chart, args), args)
+            history, chart, starts = start(t0, first.f, t1 - t0), first.chart, starts + 1
         if before is None:
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
+            sizes = None if self.tolerances.scales is None else self.tolerances.scales.none(flat.dtype)
         else:
-            step_counts, stiffness = before.step_counts, before.stiffness
-        history = start(t0, f, t1 - t0)
-
-        def numbers(terms, flat):
-            (y, f), _ = field_of(terms, t0, unravel_like(y0, flat), chart, args)(t0, flat)
-            return y, start(t0, f, t1 - t0).differences
-
-        tangents = self.first_tangents(numbers, terms, ravel(y0), before)
+            step_counts, stiffness, sizes = before.step_counts, before.stiffness, before.sizes
+        tangents = None
+        if self.tangent_control is not None:
+            control = self.tangent_control
+            ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
+            tangents = tuple(Tangent(w, jnp.zeros_like(history.differences), control.largest(w)) for w in ws)
         order = jnp.asarray(1, np.int32)
-        sizes = self.first_sizes(ravel(y0), f, before)
-        return AdamsState(history, order, step_counts.at[0].add(1), chart, stiffness, sizes, tangents)
+        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents)
 
     def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
         of = coefficients(history.mesh, order, t1, before.dtype)
-        partial_sums, neighbours, mean = of.sums(history.differences)
-        predicted = before + of.h * mean
-        first = evaluate(terms, t1, predicted, like, chart, args)
+        starts = history.known == 0
+        sums = of.sums(history.differences)
+        predicted = before + of.h * sums[2]
+        first = evaluate(terms, jnp.where(starts, history.mesh[0], t1), predicted, like, chart, args)
+        # At a start nothing has been known to predict from: this is the first point, and its derivative all of it.
+        f = jnp.where(starts, first.f, jnp.zeros((), before.dtype))
+        partial_sums, neighbours, mean = of.with_first(sums, f)
+        history = eqx.tree_at(lambda history: history.known, history, jnp.maximum(history.known, 1))
 
-        defects = first.f[None] - neighbours
-        errors = of.h * of.differences[:, None] * defects
-        corrected = predicted + of.h * of.last * defects[1]
+        explicit = before + of.h * mean
+        corrected = explicit + of.h * of.last * (first.f - neighbours[1])
         second = project_near(terms, t1, corrected, like, first, args)
-        mismatch = predicted + of.h * of.last * (second.f - neighbours[1]) - second.y
+        errors = of.h * of.differences[:, None] * (jnp.where(starts, second.f, first.f)[None] - neighbours)
+        errors = jnp.where(starts, jnp.stack([before, errors[1], of.h * first.f]), errors)
+        mismatch = explicit + of.h * of.last * (second.f - neighbours[1]) - second.y
         return _Step(
             second.y, advance(history, of.end, second.f, partial_sums), errors, mismatch, predicted, first, second
         )
 
     def advance(self, terms, t1, y0, args, state: AdamsState):
         history, order, before = state.history, state.order, ravel(y0)
-        dtype = before.dtype
+        dtype, starts = before.dtype, history.known == 0
+        chart = next_chart(terms, history.mesh[0], y0, state.chart, args)
+        state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
         step, along = self.attempted(terms, t1, before, y0, args, state)
         after = step.after
 
         failed = step.first.failed | step.second.failed
+        started = self._started(state.sizes, before, step.first.f)
+        state = eqx.tree_at(lambda state: state.sizes, state, started, is_leaf=lambda x: x is None)
         scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
+        # In the first step the state changes at most by its own size, or by the tolerance.
+        reached = sizes[2] / jnp.maximum(sizes[0], 1)
+        sizes = jnp.where(starts, jnp.maximum(sizes, _TARGET * reached**2), sizes)
         tangents, scales = self.tangents_after(state.tangents, along)
         for end, own in zip(along, scales, strict=True):
             sizes = jnp.maximum(sizes, self._sizes(terms, y0, own, end.errors, state.chart))
@@ -246,13 +261,18 @@ class Adams(AbstractMultistep):
             target=_TARGET,
             work=jnp.asarray(_WORK),
         )
+        lost = starts & (step.first.failed | ~jnp.isfinite(reached))
+        # After one step the second order is known to be better, but not by how much: by more than steps may grow.
+        growth = jnp.where(starts, jnp.asarray(jnp.inf, dtype), estimate.growth)
+        retry = jnp.where(lost, jnp.asarray(-1.0, dtype), estimate.retry)
+        estimate = eqx.tree_at(lambda e: (e.growth, e.retry), estimate, (growth, retry))
         y1 = unravel_like(y0, after)
         h = (t1 - history.mesh[0]).astype(dtype)
         new_state = AdamsState(
             history=step.history,
             order=order + change,
-            step_counts=state.step_counts + (order == INDEX).astype(np.int32),
-            chart=next_chart(terms, t1, y1, step.second.chart, args),
+            step_counts=state.step_counts + ((order == INDEX) | (starts & (INDEX == 0))).astype(np.int32),
+            chart=step.second.chart,
             stiffness=self._observed(state, h, before, step.predicted, after, step.first.f, step.second.f, y0),
             sizes=self.grown_sizes(state.sizes, after),
             tangents=tangents,
@@ -267,6 +287,13 @@ class Adams(AbstractMultistep):
         if self.stiffness == "stop" and state.stiffness is not None:
             failed = failed | state.stiffness.found
         return y1, estimate, dense_info, new_state, failed
+
+    def _started(self, sizes, before, f) -> Float[Array, " groups"] | None:
+        """The sizes that the absolute tolerance is relative to, where there are none yet those of a first state."""
+        scales = self.tolerances.scales
+        if scales is None:
+            return None
+        return jnp.where(sizes > 0, sizes, scales.start(before, f))
 
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:

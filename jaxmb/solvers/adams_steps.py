@@ -18,7 +18,16 @@ from jaxtyping import Array, Float, Int
 from .._compat import any_of_batch
 from ._history import INDEX, LENGTH, basis_means, before_each, known_differences, start, step_end
 from ._interpolation import RateInterpolation
-from .evaluation import after_jump, at_solution, field_of, kept_of_chart, next_chart, ravel, unravel_like
+from .evaluation import (
+    after_jump,
+    at_solution,
+    evaluate,
+    field_of,
+    kept_of_chart,
+    next_chart,
+    ravel,
+    unravel_like,
+)
 from .steps import AbstractSteps, LinearStep
 
 
@@ -41,6 +50,11 @@ class Coefficients(eqx.Module):
         """
         sums = self.products @ differences
         return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
+
+    def with_first(self, sums: tuple[Array, Array, Array], f: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        """The same with a latest derivative that is larger by `f`."""
+        every, near, mean = (weights * f[None] for weights in jnp.split(self.products[:, :1], [LENGTH, LENGTH + 3]))
+        return sums[0] + every, sums[1] + near, sums[2] + mean[0]
 
 
 def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, dtype: Any) -> Coefficients:
@@ -96,7 +110,7 @@ class AdamsSteps(AbstractSteps):
 
     def row(self, terms, before, after):
         old, new = before.solver_state, after.solver_state
-        mesh, order, known, jump = old.history.mesh, old.order, old.history.known, None
+        mesh, order, known, jump = old.history.mesh, old.order, jnp.maximum(old.history.known, 1), None
         if self.jumps:
             made = jnp.asarray(before.made_jump)
             first = start(before.tprev, new.history.differences[0], before.tnext - before.tprev)
@@ -108,6 +122,17 @@ class AdamsSteps(AbstractSteps):
 
     def memory(self, solver_state):
         return solver_state.memory
+
+    def memory_at_start(self, equations, start, along):
+        state, like, (dequations, w, given) = start.solver_state, start.y, along
+        chart = next_chart(equations[0], start.tprev, like, state.chart, equations[1])
+
+        def field(equations, flat):
+            terms, args, _ = equations
+            return evaluate(terms, start.tprev, flat, like, chart, args).f
+
+        _, f = eqx.filter_jvp(field, (equations, ravel(like)), (dequations, w))
+        return jnp.where(state.history.known == 0, given.at[0].set(f), given)
 
     def linearised(self, of, moved, like, row):
         def at(of_terms, flat):

@@ -13,11 +13,11 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from .evaluation import check_real, check_term, evaluate, first_chart, ravel
+from .evaluation import check_real, check_term, ravel
 from .manifold_term import Args, Y
 from .order import StepEstimate
 from .scales import RunningScales
-from .tolerances import MultistepNorm, Tolerances, norm_of
+from .tolerances import MultistepNorm
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -29,6 +29,8 @@ _WITHOUT_ESTIMATE = 0.25
 # Repeated rejections mean that errors do not decrease according to the order, as at a kink or a jump: upper bounds of
 # the factor after the first, second, and every further rejection.
 _REPEATED = (0.95, 0.5, 0.1)
+# The length of the trial before the first step, in units of the interval, and the factors from it to the first step.
+_TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
 # The recovery from a step shortened by a wrapper is at most this factor; beyond it differences are rounding errors.
 _RECOVERY = 100.0
 # After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
@@ -63,15 +65,31 @@ class ControllerState(AbstractControllerState):
     **Fields:**
 
     - `intended`: the last step size that was requested.
-    - `rejections`: the number of rejections since the last accepted step.
-    - `caution`: the number of next steps with limited growth.
-    - `wasted`: evaluations of the vector field, and matrices computed, in all rejected steps.
+    - `counters`: see the properties.
     """
 
     intended: Float[Array, ""]
-    rejections: Int[Array, ""]
-    caution: Int[Array, ""]
-    wasted: Int[Array, "2"]
+    counters: Int[Array, "5"]
+
+    @property
+    def rejections(self) -> Int[Array, ""]:
+        """The number of rejections since the last accepted step."""
+        return self.counters[0]
+
+    @property
+    def caution(self) -> Int[Array, ""]:
+        """The number of next steps with limited growth."""
+        return self.counters[1]
+
+    @property
+    def opening(self) -> Int[Array, ""]:
+        """Two while the first step is a trial, one until a step has been accepted after it, then zero."""
+        return self.counters[2]
+
+    @property
+    def wasted(self) -> Int[Array, "2"]:
+        """Evaluations of the vector field, and matrices computed, in all rejected steps."""
+        return self.counters[3:]
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
@@ -81,6 +99,9 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
     [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
+
+    Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
+    the first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
 
     If no acceptable step is found down to `dtmin`, or to the resolution of the floating-point time, the solve ends with
     `diffrax.RESULTS.dt_min_reached`.
@@ -119,7 +140,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         - `dtmin`, `dtmax`: bounds of the step.
         - `force_dtmin`: if true, steps of size `dtmin` are accepted with any error, and the solve continues.
         - `safety`: multiplies every step that the error estimates allow.
-        - `factormin`, `factormax`: the smallest factor after a rejection, and the largest after an accepted step.
+        - `factormin`, `factormax`: the smallest factor after a rejection, except before the first step, and the largest
+            after an accepted step.
 
         **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state
         can resolve, and for inconsistent bounds.
@@ -169,15 +191,15 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         func: Callable[..., Y],
         error_order: Any,
     ) -> tuple[Any, ControllerState]:
-        del func, error_order
+        del args, func, error_order
         check_term(terms)
         check_real(y0)
         self._check_resolution(y0)
+        opening = 2 if dt0 is None else 0
         if dt0 is None:
-            dt0 = self._first_step(terms, t0, t1, y0, args)
+            dt0 = lax.stop_gradient(jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)) * _TRIAL)
         dt0 = self._bound(dt0, t0.dtype)
-        none = jnp.asarray(0, np.int32)
-        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), none, none, jnp.zeros(2, np.int32))
+        return t0 + dt0, ControllerState(lax.stop_gradient(dt0), jnp.array([0, 0, opening, 0, 0], np.int32))
 
     def adapt_step_size(
         self,
@@ -200,21 +222,27 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         dt = t1 - t0
         dtype = dt.dtype
         intended, rejections = controller_state.intended, controller_state.rejections
-        keep = y_error.error < 1
-        if self.force_dtmin:
-            keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
+        opening, caution = controller_state.opening, controller_state.caution
+        trial = opening == 2
 
         scalar = lambda x: jnp.asarray(x, y_error.error.dtype)
-        allowed = (scalar(self.safety) * y_error.growth) ** y_error.response
+        # The first step has no others before it.
+        response = jnp.where(opening > 0, scalar(1.0), y_error.response)
+        allowed = (scalar(self.safety) * y_error.growth) ** response
+        retry = (scalar(self.safety) * y_error.retry) ** response
+        keep = (y_error.error < 1) & ~(trial & (retry > scalar(self.factormax)))
+        if self.force_dtmin:
+            keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
-        caution = controller_state.caution
         growth = jnp.where(caution > 0, jnp.minimum(growth, scalar(_CAUTIOUS)), growth)
         # The last step before a stop may be short only because of the stop.
         recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
-        shrink = (scalar(self.safety) * y_error.retry) ** y_error.response
-        shrink = jnp.clip(shrink, scalar(self.factormin), repeated.astype(allowed.dtype))
+        repeated = jnp.where(trial, _LONGER, repeated)
+        smallest = jnp.where(opening > 0, scalar(_SHORTER), scalar(self.factormin))
+        shrink = jnp.clip(retry, smallest, repeated.astype(allowed.dtype))
         shrink = jnp.where(y_error.retry > 0, shrink, scalar(_WITHOUT_ESTIMATE))
+        shrink = jnp.where(y_error.retry < 0, scalar(0.0), shrink)
         factor = jnp.where(keep, jnp.maximum(growth, recovered), shrink)
         next_dt = self._bound(dt * lax.stop_gradient(factor).astype(dtype), dtype)
 
@@ -225,13 +253,14 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         result = diffrax.RESULTS.where(
             ~keep & (next_dt <= smallest), diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful
         )
-        none = jnp.asarray(0, np.int32)
-        state = ControllerState(
-            intended=lax.stop_gradient(next_dt),
-            rejections=jnp.where(keep, none, rejections + 1),
-            caution=jnp.where(keep, jnp.maximum(caution - 1, none), jnp.where(y_error.retry > 0, caution, _CAUTION)),
-            wasted=controller_state.wasted + jnp.where(keep, 0, y_error.work).astype(np.int32),
-        )
+        counters = [
+            jnp.where(keep | trial, 0, rejections + 1),
+            jnp.where(keep, jnp.maximum(caution - 1, 0), jnp.where(y_error.retry > 0, caution, _CAUTION)),
+            jnp.where(keep, 0, jnp.minimum(opening, 1)),
+        ]
+        wasted = controller_state.wasted + jnp.where(keep, 0, y_error.work).astype(np.int32)
+        counters = jnp.concatenate([jnp.stack(counters).astype(np.int32), wasted])
+        state = ControllerState(lax.stop_gradient(next_dt), counters)
         return keep, next_t0, next_t0 + next_dt, False, state, result
 
     def _bound(self, dt: Any, dtype: Any) -> Any:
@@ -248,36 +277,6 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
                 f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is "
                 f"{finest:.1e}. For finer ones switch on `jax_enable_x64`."
             )
-
-    def _first_step(self, terms, t0, t1, y0, args) -> Any:
-        """The step of order one that would just meet the tolerance, from one trial evaluation."""
-        frozen = lambda tree: jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
-        terms, t0, t1, y0, args = frozen((terms, t0, t1, y0, args))
-        flat, chart = ravel(y0), first_chart(terms, t0, y0, args)
-        scales, tolerances = self.norm.scales, Tolerances(self.rtol, self.atol, self.norm)
-        span = jnp.where(jnp.isfinite(t1), t1 - t0, jnp.ones_like(t0)).astype(flat.dtype)
-
-        def trial(carry, _):
-            # At the start, then after a step along the first derivative; in a loop, so that the vector field is
-            # compiled once.
-            t, y, scale = carry
-            f = evaluate(terms, t, y, y0, chart, args).f
-            if scales is not None:
-                scale = jnp.where(scale > 0, scale, tolerances.of_step(flat, flat, scales.start(flat, f)))
-            size = lambda x: norm_of(self.norm, x / scale, y0)
-            # Within this time the state changes by its own size, or at least by the tolerance.
-            reach = jnp.minimum(jnp.maximum(size(flat), 1) / size(f), span / 100)
-            return (t0 + (reach / 100).astype(t0.dtype), flat + reach / 100 * f, scale), (f, reach)
-
-        first = jnp.zeros_like(flat) if scales is not None else tolerances.of_step(flat, flat, None)
-        carry = t0, flat, jnp.broadcast_to(first, flat.shape)
-        (_, _, scale), (f, (reach, _)) = lax.scan(trial, carry, None, length=2)
-        # The local error of order one is h^2/2 times the change of the derivative.
-        change = norm_of(self.norm, (f[1] - f[0]) / scale, y0) / (reach / 100)
-        step = jnp.minimum(1 / jnp.sqrt(change), reach)
-        # Without a derivative at the start no step succeeds: none is the shortest.
-        otherwise = jnp.where(jnp.all(jnp.isfinite(f[0])), span / 1000, 0)
-        return jnp.where(jnp.isfinite(step), step, otherwise).astype(t0.dtype)
 
 
 def _is_known(x: Any) -> bool:

@@ -66,7 +66,7 @@ def derivative(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
 
 
 def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None:
-    """A chart at `y`, or `None` for a plain vector field."""
+    """A chart that `next_chart` makes one at `y`; `None` for a plain vector field."""
     manifold = _manifold(term)
     return None if manifold is None else freeze(manifold.init_chart(t * direction_of(term), y, args))
 
@@ -77,8 +77,14 @@ def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: A
     return None if manifold is None else freeze(manifold.update_chart(t * direction_of(term), y, chart, args))
 
 
+def chart_after_step(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
+    """The chart at the end of a step to `y`, from which `refused` tells; `None` for a plain vector field."""
+    manifold = _manifold(term)
+    return None if manifold is None else freeze(manifold.after_step(t * direction_of(term), y, chart, args))
+
+
 def refused(term: Any, chart: Chart | None) -> Any:
-    """Whether the step that led to a chart must be retried with a smaller one."""
+    """Whether the step that ended with a chart must be retried with a smaller one."""
     manifold = _manifold(term)
     return False if manifold is None else manifold.refuses(chart)
 

@@ -201,6 +201,7 @@ class Hermite(AbstractMultistep):
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
+        chart = next_chart(terms, t0, y0, chart, args)
         field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
         free = free_components(terms, flat, chart)
         known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)

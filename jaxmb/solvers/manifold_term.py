@@ -87,7 +87,10 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def init_chart(self, t: Any, y: Y, args: Args) -> Chart:
-        """Choose a chart at a state; any pytree of arrays, of a structure and shape that never change."""
+        """A chart to begin with at a state, any pytree of arrays, of a structure and shape that never change.
+
+        `update_chart` follows at the same state before anything is evaluated, and may do the choosing.
+        """
 
     @abc.abstractmethod
     def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
@@ -98,7 +101,8 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """Project a state on the manifold, and evaluate the vector field there.
 
         The independent components of `y` are kept; the others are a first guess and are solved for. `linearized_at` is
-        the evaluation of the prediction that `y` corrects, at the same time; its `factors` may make this one cheap.
+        an evaluation nearby, of the prediction that `y` corrects, at the same time, or in a first step of the state
+        before it; its `factors` may make this one cheap.
         """
 
     def project_cold(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
@@ -144,10 +148,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def update_chart(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
-        """Keep the chart or choose a better one at a state on the manifold.
-
-        The result is used only if the step to this state is accepted. It is also called before a restart after a jump.
-        """
+        """Keep the chart or choose a better one at a state on the manifold, from which a step begins."""
 
     def jacobian(self, t: Any, y: Y, args: Args) -> AbstractFieldJacobian | None:
         """The derivative of the vector field at a state on the manifold, if the term knows its structure; by default
@@ -158,10 +159,13 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         del t, y, args
         return None
 
+    def after_step(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
+        """The chart at the end of a step, with what `refuses` needs to know of the state there; by default the same."""
+        del t, y, args
+        return chart
+
     def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
-        """Whether the state at which a chart was updated is none of the manifold; the step to it is then retried with a
-        smaller one.
-        """
+        """Whether the state at the end of a step is none of the manifold; the step is then retried, shorter."""
         del chart
         return False
 

@@ -528,8 +528,8 @@ def _recorded_jvp(primals, tangents):
     _, saveat, options, steps, _ = fixed
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
-    of_start = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
-    x = Moving(dequations, djumps), of_start
+    w, given = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    x = Moving(dequations, djumps), (w, steps.memory_at_start(equations, init_state, (dequations, w, given)))
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")

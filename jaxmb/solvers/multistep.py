@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import any_of_batch, from_controller
-from .evaluation import after_jump, check_real, check_term, derivative, first_chart, next_chart, refused
+from .evaluation import after_jump, chart_after_step, check_real, check_term, derivative, first_chart, refused
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
 from .steps import AbstractSteps
@@ -116,12 +116,13 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     ) -> tuple[Y, StepEstimate | None, dict[str, Any], Any, diffrax.RESULTS]:
         def restart():
             after = after_jump(terms, t0, y0, args)
-            chart = next_chart(terms, t0, after, solver_state.chart, args)
-            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
+            return after, self.initial_state(terms, t0, t1, after, args, solver_state.chart, solver_state)
 
         y0, state = _restart_after(made_jump, restart, (y0, solver_state))
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
-        off = refused(terms, state.chart)
+        chart = chart_after_step(terms, t1, y1, state.chart, args)
+        state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
+        off = refused(terms, chart)
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
         result: Any = diffrax.RESULTS.successful
@@ -157,10 +158,12 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     ) -> AbstractMultistepState:
         """The solver state at a start.
 
-        `first_sizes` and `first_tangents` give two of its fields.
+        A method that evaluates here takes two fields from `first_sizes` and `first_tangents`, and its chart from
+        `next_chart`. The vector field and the choice of a chart are then compiled once more for each start, which
+        `Adams` leaves to the first step.
 
-        **Arguments:** `t1`: the end of the first step; `chart`: one at `y0`; `before`: the state before a jump, None at
-        the first start.
+        **Arguments:** `t1`: the end of the first step that is tried; `chart`: one that `next_chart` makes one at `y0`;
+        `before`: the state before a jump, None at the first start.
         """
 
     @abc.abstractmethod

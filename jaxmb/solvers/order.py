@@ -25,7 +25,8 @@ class StepEstimate(eqx.Module):
 
     - `error`: the weighted norm of the local error; below one the step is good.
     - `growth`: the factor by which all steps may grow, with the order chosen for the next step.
-    - `retry`: the same for the order just used; zero if there is no usable estimate.
+    - `retry`: the same for the order just used; zero if there is no usable estimate, negative if no step from here can
+        have one.
     - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
     - `work`: evaluations of the vector field, and matrices computed. Not integers, which diffrax does not expect in an

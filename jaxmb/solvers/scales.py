@@ -46,6 +46,10 @@ class RunningScales(eqx.Module):
     units: Float[Array, " n"]
     blocks: tuple[Block, ...]
 
+    def none(self, dtype: Any) -> Float[Array, " groups"]:
+        """Zeros, for sizes that are not known yet."""
+        return jnp.zeros(len(self.blocks), dtype)
+
     def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " groups"]:
         """The sizes at the start of a motion, from the state and its derivative."""
         sizes: dict[str, Array] = {}

@@ -50,6 +50,15 @@ class AbstractSteps(eqx.Module):
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
+    def memory_at_start(self, equations: PyTree, start: Any, along: tuple[PyTree, Array, PyTree]) -> PyTree[Array]:
+        """The tangent of the memory that the first step of a run begins with; by default the one that it is given.
+
+        **Arguments:** `equations`: the terms, their arguments and the solver; `start`: the first state of diffrax's
+        loop; `along`: the tangents of the equations, of the raveled state and of the memory in `start`.
+        """
+        del equations, start
+        return along[2]
+
     @abc.abstractmethod
     def linearised(self, of: Callable, moved: Moving, like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
         """A step at its row.

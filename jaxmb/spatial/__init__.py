@@ -1,4 +1,24 @@
-"""Parts of spatial scenes."""
+"""Parts of spatial scenes.
+
+- Bodies: `Body`, `PointMass`; `rod`, `box`, `cylinder`, `disc` and `sphere` are inertia matrices.
+- Joints: `Spherical`, `Revolute`, `Universal`, `Gimbal`, `Cylindrical`, `Prismatic`, `Screw`, `Planar`, `Fixed`,
+  `Distance`, `PointOnLine`, `PointOnPlane`; `Composite` of hinges and slides in succession, without mass in between;
+  `KnifeEdge`, `RollingDisc` and `RollingSphere` roll without slipping; `Driver` prescribes a motion.
+- Forces: `SpringDamper`, `TorsionalSpringDamper`, `Damper`, `RotationalDamper`, `Bushing`, `Torque`, `PointForce`;
+  `Friction` in joints, from the joint's actual reaction.
+- Ground: `Contact` of points and balls on a terrain of `jaxmb.terrain`, with laws of `jaxmb.contact`; `Tyre`.
+- `Frame`: a named frame fixed in a body, which parts may name in its place, and which measures as an accelerometer and
+  a gyroscope there do.
+
+Units are SI and radians; Euler parameters are scalar first, and angular velocities are in the body frame. Joints have
+their own coordinates by name, `"hip.angle"` or `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]`
+shows with rates and accelerations. On them act, from `jaxmb`, `JointSpring`, `JointForce`, `Actuator`, `JointStop`,
+`JointFriction`, `JointDriver` and `JointInertia`; on several, `JointCoupling`, `FixedTendon` along joints, through
+full turns, and `Tendon` from point to point. `Motor` is a force, speed or position whose force lags, with a limit;
+`Controller` a function of named measurements, with a memory. `Servo` enforces any position constraint by a control
+force. `Constraint`, `VelocityConstraint`, `Force` and `NonIdeal` are functions of the user's; classes of one's own
+derive from those of `jaxmb.parts`.
+"""
 
 from ..parts.contact import Contact as Contact
 from ..parts.forces import Damper as Damper, PointForce as PointForce, SpringDamper as SpringDamper

@@ -50,6 +50,10 @@ def assemble(
 ) -> State:
     """Find a consistent state near a guess.
 
+    ```python
+    state = jaxmb.assemble(system, fix={"bar.angle": 0.5}, rates={"pin.angle": 2.0})
+    ```
+
     **Arguments:**
 
     - `system`: a compiled scene, or another system.

@@ -56,6 +56,11 @@ def equilibrium(
 ) -> State:
     """Find a static equilibrium near a guess, by default one that is stable: a pendulum hangs.
 
+    ```python
+    hanging = jaxmb.equilibrium(system)
+    upright = jaxmb.equilibrium(system, jaxmb.assemble(system, fix={"bar.angle": 1.5}), stable=False)
+    ```
+
     An equilibrium is stable here if the forces lead back from displacements that the constraints allow: if no
     eigenvalue of the stiffness has a negative real part, which for conservative forces are those of a minimum of the
     potential. One that is not is left along the displacement from which the forces lead away, on one side and if need

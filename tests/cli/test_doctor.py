@@ -125,6 +125,7 @@ def test_the_second_process_waits_less():
 
 
 def test_the_readme_quotes_what_is_printed():
-    block = re.search(r"`jaxmb doctor` says.*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL).group(1)
+    block = re.search(r"`jaxmb doctor` .*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL).group(1)
     names = [line.split("  ")[0] for line in block.splitlines() if re.match(r"\w.*  ", line)]
-    assert names == [*doctor._SHOWN, *doctor._STEPPED]
+    printed = [*doctor._SHOWN, *doctor._STEPPED]
+    assert names and names == [name for name in printed if name in names]

@@ -293,8 +293,7 @@ def test_charts_change_without_a_restart():
     assert max(float(error[-1]) for error in mechanism.errors(saved).values()) <= 1e-7
     stats, (_, free) = saved.stats, run("free_body")
     assert stats["charts"] - 1 >= 5
-    # Evaluations beyond two a step are starts: there was the first, and no other.
-    assert stats["num_evaluations"] - 2 * stats["num_steps"] == 1
+    assert stats["num_evaluations"] == 2 * stats["num_steps"]
     # Low orders belong to the start. The motion without charts visits them as often.
     low = slice(0, 7)
     assert np.sum(stats["orders"][low]) <= np.sum(free.stats["orders"][low]) + 2

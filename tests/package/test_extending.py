@@ -125,6 +125,7 @@ class TwoStep(solvers.AbstractMultistep):
         return {"num_evaluations": 1 + 2 * stats["num_steps"]}
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before):
+        chart = solvers.next_chart(terms, t0, y0, chart, args)
         first = solvers.evaluate(terms, t0, solvers.ravel(y0), y0, chart, args)
 
         def numbers(terms, flat):

@@ -113,3 +113,14 @@ def test_readme_example(capsys):
     promised = [float(number) for number in code.group(1).rsplit("#", 1)[1].split()]
     printed = [float(number) for number in capsys.readouterr().out.split()]
     np.testing.assert_allclose(printed, promised, rtol=0, atol=1e-6)
+    # The moving picture is of the same motion.
+    with Image.open(FOLDER / "four_bar.gif") as image:
+        shown = json.loads(image.info["comment"])
+    assert shown["jaxmb"] == mb.__version__
+    np.testing.assert_allclose(shown["angle"], printed[0], rtol=0, atol=1e-8)
+
+
+def test_the_readme_is_short():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 150 and len(text.split()) <= 1500
+    assert (FOLDER / "four_bar.gif").stat().st_size < 1e6

@@ -90,6 +90,30 @@ def test_constrained_body_has_them():
     assert pendulum["custom_jvp_call"] > 0 and pendulum["argmax"] > 0
 
 
+def inside_loops(jaxpr, inside=False) -> Counter:
+    """How often each primitive and each named function occurs, in and outside of loops of unknown length."""
+    counts = Counter()
+    for equation in jaxpr.eqns:
+        counts[equation.params.get("name", equation.primitive.name), inside] += 1
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            if isinstance(value, core.ClosedJaxpr | core.Jaxpr):
+                own = value.jaxpr if isinstance(value, core.ClosedJaxpr) else value
+                counts += inside_loops(own, inside or equation.primitive.name == "while")
+    return counts
+
+
+@pytest.mark.parametrize("options", [{}, {"jumps": [0.5]}, {"dt0": 0.01}])
+def test_charts_and_evaluations_stand_in_one_place(options):
+    """The first step is the start, and a restart after a jump is a start: neither has its own search and evaluation."""
+    system = mb.mechanisms.four_bar().system
+    run = lambda system, state: mb.simulate(system, state, t1=1.0, throw=False, **options).ys
+    counts = inside_loops(jax.make_jaxpr(run)(system, system.guess).jaxpr)
+    # A failure is explained by one more search, after the loop.
+    assert counts["argmax", True] == 1 and counts["argmax", False] <= 1
+    for name, most in (("ideal_acceleration", 1), ("restore", 1), ("_updated", 1)):
+        assert counts[name, True] == most and counts[name, False] == 0, name
+
+
 def test_free_body_in_space_has_no_charts(monkeypatch):
     body = spatial.Body("body", mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0.1, 2.0, 0.1))
     system = mb.Scene([body]).compile()

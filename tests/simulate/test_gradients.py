@@ -4,14 +4,11 @@ Every mechanism gets a driven anchor and a spring from the anchor to one of its 
 kind are there: mass, inertia, body-fixed point, stiffness, a driver's parameter, and an initial rate.
 """
 
-import re
-from pathlib import Path
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from execute_notebooks import readme_example
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -137,16 +134,12 @@ def test_gradients_in_a_batch():
 
 
 def test_the_example_of_the_readme_without_an_option():
-    """First and second derivatives of its loss, and differences of it."""
-    code = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "README.md").read_text(), re.DOTALL)
-    assert code is not None
-    scope: dict[str, Any] = {}
-    exec(code.group(1).rsplit("print(", 1)[0], scope)
-    angle, mass, h = scope["angle"], 1.0, 1e-3
-    first, along, second = jax.grad(angle)(mass), jax.jacfwd(angle)(mass), jax.hessian(angle)(mass)
+    """First and second derivatives by a length of the loop, and differences of it."""
+    angle, length, h = readme_example()["angle"], 2.0, 1e-3
+    first, along, second = jax.grad(angle)(length), jax.jacfwd(angle)(length), jax.hessian(angle)(length)
     np.testing.assert_allclose(along, first, rtol=1e-11)
-    low2, low, high, high2 = (angle(mass + k * h) for k in (-2, -1, 1, 2))
+    low2, low, high, high2 = (angle(length + k * h) for k in (-2, -1, 1, 2))
     np.testing.assert_allclose(first, (8 * (high - low) - (high2 - low2)) / (12 * h), rtol=1e-6)
-    slopes = [jax.grad(angle)(mass + k * h) for k in (-2, -1, 1, 2)]
+    slopes = [jax.grad(angle)(length + k * h) for k in (-2, -1, 1, 2)]
     central = (8 * (slopes[2] - slopes[1]) - (slopes[3] - slopes[0])) / (12 * h)
     np.testing.assert_allclose(second, central, rtol=1e-5)

@@ -1,18 +1,24 @@
 """Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
 
-Without names all notebooks are executed, and the figure `work_precision` of the README is made. A notebook keeps the
-version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares them with the package
-and with the cells, and in its long tests what is printed with what a new execution prints. Cells with the tag `varies`
-print what differs between machines and runs, such as times, and are not compared.
+Without names all notebooks are executed, and the figures `work_precision` and `four_bar` of the README are made. A
+notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares
+them with the package and with the cells, and in its long tests what is printed with what a new execution prints. Cells
+with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
 """
 
 import hashlib
+import io
+import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
+import jax
 import nbformat
 from nbclient import NotebookClient
+from PIL import Image
 
 import jaxmb
 
@@ -91,18 +97,51 @@ def _agree(a: str, b: str) -> bool:
     return abs(x - y) <= OF_VALUES * size
 
 
+def readme_example() -> dict[str, Any]:
+    """The names of the README's first block of code."""
+    code = re.search(r"```python\n(.*?)```", (FOLDER.parent / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    scope: dict[str, Any] = {}
+    exec(code.group(1).rsplit("print(", 1)[0], scope)
+    return scope
+
+
+def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
+    """An animated GIF of a planar motion, one frame for each saved time."""
+    frames = []
+    for k in range(trajectory.ts.shape[0]):
+        until = lambda x, k=k: x[max(k - 12, 0) : k + 1]
+        shown = eqx.tree_at(lambda t: (t.ts, t.ys), trajectory, jax.tree.map(until, (trajectory.ts, trajectory.ys)))
+        figure = jaxmb.viz.plot_mechanism(shown, frames=3)
+        (axes,) = figure.axes
+        axes.set(xlim=(-1.2, 3.2), ylim=(-1.3, 2.1), title="")
+        for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
+            legend.remove()
+        axes.axis("off")
+        figure.set_size_inches(5.2, 4.0)
+        figure.set_layout_engine("none")
+        axes.set_position((0.0, 0.0, 1.0, 1.0))
+        file = io.BytesIO()
+        figure.savefig(file, dpi=70)
+        frames.append(Image.open(file).convert("P", palette=Image.Palette.ADAPTIVE, colors=64))
+    text = {"jaxmb": jaxmb.__version__, "angle": float(trajectory["rocker"].angle[-1])}
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=50, loop=0, optimize=True, comment=json.dumps(text)
+    )
+
+
 def main(names: list[str]) -> None:
     known = {path.stem: path for path in sorted(FOLDER.glob("*.ipynb"))}
-    for name in names or [*known, "work_precision"]:
+    for name in names or [*known, "work_precision", "four_bar"]:
         print(name, flush=True)
         if name == "work_precision":
             jaxmb.report.work_precision(jaxmb.mechanisms.get("andrews")).figure(FOLDER / f"{name}.png")
+        elif name == "four_bar":
+            moving_picture(readme_example()["motion"](2.0), FOLDER / f"{name}.gif")
         else:
             nbformat.write(executed(known[name]), known[name])
 
 
 if __name__ == "__main__":
-    import jax
-
     jax.config.update("jax_enable_x64", True)
     main(sys.argv[1:])

@@ -59,6 +59,13 @@ def identify(
 ) -> Identification:
     """Estimate parameters so that the simulated motion fits a measured one, by nonlinear least squares.
 
+    ```python
+    ts = np.linspace(0.1, 2.0, 20)
+    measured = {"bar.angle": jaxmb.simulate(system, state, t1=2.0, saveat=ts)["bar"].angle}
+    fit = jaxmb.identify(system, measured, ts=ts, free={"bar.inertia": 0.2}, state=state)
+    fit.parameters["bar.inertia"], fit.converged
+    ```
+
     **Arguments:**
 
     - `system`: a compiled scene, or another system.

@@ -1,5 +1,7 @@
 """The linear equations of small motions: eigenvalues, modes and frequency responses."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from ..._arguments import real_array
-from ..._types import Scalar, State
+from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import is_traced
 from ...manifold import project_normalized
 from ...system import AbstractSystem
@@ -125,6 +127,45 @@ class Linearisation(eqx.Module):
         if omega.ndim != 1:
             raise ValueError(f"omega must be a vector of angular frequencies, got shape {omega.shape}.")
         return _response(self, omega)
+
+    def response(self, z0: ArrayLike, ts: VectorLike) -> Float[Array, "times k"]:
+        """The states at times [s] after small changes z0 (k,) of them, `exp(A t) z0`, without inputs.
+
+        **Raises:** `ValueError` for arguments of another shape.
+        """
+        dtype, count = self.A.dtype, len(self.states)
+        start, times = (
+            jnp.asarray(real_array("z0", z0, dtype, ((count,),))),
+            jnp.asarray(real_array("ts", ts, dtype, None)),
+        )
+        if times.ndim != 1:
+            raise ValueError(f"ts must be a vector of times, got shape {times.shape}.")
+        return jax.vmap(lambda t: jax.scipy.linalg.expm(self.A * t) @ start)(times)
+
+    def to_scipy(self) -> Any:
+        """The same as a `scipy.signal.StateSpace`, without names.
+
+        **Raises:** `ImportError` without SciPy.
+        """
+        try:
+            from scipy.signal import StateSpace
+        except ImportError as error:
+            raise ImportError('to_scipy needs SciPy; install it with: pip install "jaxmb[studies]"') from error
+        return StateSpace(*map(np.asarray, (self.A, self.B, self.C, self.D)))
+
+    def to_control(self) -> Any:
+        """The same as a `control.StateSpace` of python-control, with all names, whose points become underscores:
+        `motor_torque`.
+
+        **Raises:** `ImportError` without python-control.
+        """
+        try:
+            from control import ss
+        except ImportError as error:
+            raise ImportError("to_control needs python-control; install it with: pip install control") from error
+        own = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in own.items()}
+        return ss(*map(np.asarray, (self.A, self.B, self.C, self.D)), **names)
 
     def __str__(self) -> str:
         if is_traced(self.A) or self.A.ndim != 2:

@@ -39,6 +39,11 @@ def linearise(
 ) -> Linearisation:
     """Linearise the equations of motion about an equilibrium or a steady motion, in independent coordinates.
 
+    ```python
+    about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system), outputs=["bar.angle"])
+    about_rest.eigenvalues, about_rest.states
+    ```
+
     `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. There
     are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, and
     internal states, so no eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as

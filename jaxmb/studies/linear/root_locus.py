@@ -59,6 +59,10 @@ def root_locus(
 ) -> RootLocus:
     """Linearise along values of a parameter and follow the modes.
 
+    ```python
+    locus = jaxmb.root_locus(system, "bar.mass", [0.5, 1.0, 2.0], state=jaxmb.equilibrium)
+    ```
+
     Modes at neighbouring values are matched by the overlap of their shapes and the nearness of their eigenvalues, all
     at once, so that they keep their places where eigenvalues cross.
 

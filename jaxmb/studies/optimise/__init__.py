@@ -2,3 +2,6 @@
 
 from .optimise import Optimum as Optimum, optimise as optimise
 from .robust import robust as robust
+
+# The American spelling.
+optimize = optimise

@@ -72,6 +72,25 @@ def test_a_double_pendulum_has_its_closed_form():
     assert "upper.angle" in str(linear) and str(linear).count("±") == 2
 
 
+def test_other_programs_and_responses():
+    """The same numbers and names; free motion as SciPy computes it."""
+    system, state = double_pendulum()
+    linear = mb.linearize(system, state, inputs=["motor.torque"], outputs=["lower.angle", "upper.angle"])
+    scipys, controls = linear.to_scipy(), linear.to_control()
+    for name in "ABCD":
+        np.testing.assert_array_equal(getattr(scipys, name), getattr(linear, name))
+        np.testing.assert_array_equal(getattr(controls, name), getattr(linear, name))
+    assert controls.state_labels == [name.replace(".", "_") for name in linear.states]
+    assert controls.input_labels == ["motor_torque"] and controls.output_labels == ["lower_angle", "upper_angle"]
+    z0, ts = np.array([0.1, -0.2, 0.0, 0.3]), np.linspace(0.0, 3.0, 7)
+    expected = np.array([scipy.linalg.expm(np.asarray(linear.A) * t) @ z0 for t in ts])
+    np.testing.assert_allclose(linear.response(z0, ts), expected, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"z0 must have shape \(4,\)"):
+        linear.response(z0[:3], ts)
+    with pytest.raises(ValueError, match="ts must be a vector of times"):
+        linear.response(z0, 1.0)
+
+
 def test_a_mode_moves_on_the_constraints():
     linear = linear_pendulum()
     mode = linear.mode(0)
