@@ -350,7 +350,8 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
         limited.low[own],
         limited.high[own],
     )
-    part = Program(program.function, program.space, tuple(finite), program.forward)
+    # In forward mode, since a reverse pass through anything that is NaN is NaN, whatever its weight.
+    part = Program(program.function, program.space, tuple(finite), True)
     start = evaluate(part, first.z)
     if not start.good or not kept.excess(start.rows).any():
         raise ValueError(f"{what}, and no constraint that is violated leads away from it. {cure}")
