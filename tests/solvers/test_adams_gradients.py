@@ -54,7 +54,7 @@ def test_forward_equals_reverse():
     loss = lambda adjoint: lambda p: _loss(p, adjoint, 1e-4)
     forward = jax.jit(jax.jacfwd(loss(diffrax.ForwardMode())))(PARAMETERS)
     reverse = jax.jit(jax.grad(loss(diffrax.RecursiveCheckpointAdjoint())))(PARAMETERS)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
 def test_gradient_equals_central_differences(forward, differences):
