@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, VectorLike
 from ..linalg.arrays import is_traced
+from ..solvers.closures import opened
 from .fields import as_jax, as_parameter
 
 Interpolation = Literal["linear", "cubic", "held"]
@@ -139,11 +140,14 @@ class Series(AbstractSignal):
 
 
 class Signal(AbstractSignal):
-    """A value from a function of time. The arrays of a function that is an equinox module are differentiable."""
+    """A value from a function of time, differentiable by the arrays of an equinox module, and by traced values that a
+    function closes over.
+    """
 
     function: Any
 
     def __init__(self, function: Callable[..., Any]):
+        function = opened(function)
         self.function = function if isinstance(function, eqx.Module) else _Static(function)
 
     def __call__(self, t):

@@ -19,6 +19,7 @@ from ..linalg.arrays import as_array, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
 from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
+from ..solvers.closures import opened
 from ..solvers.one_step import OneStepController
 from ..system import AbstractSystem
 from ..system.parameters import parameters
@@ -170,6 +171,7 @@ def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     if saveat is _END:
         return _ENDS
     first = saveat.subs if saveat.subs is not None else diffrax.SubSaveAt(t1=True)
+    first = eqx.tree_at(lambda first: first.fn, first, opened(first.fn))
     return diffrax.SaveAt(
         subs=(first, diffrax.SubSaveAt(t1=True)), dense=saveat.dense, solver_state=True, controller_state=True
     )

@@ -6,6 +6,7 @@ from typing import Literal
 
 import diffrax
 import equinox as eqx
+import jax
 import numpy as np
 from jax import lax
 from jaxtyping import ArrayLike
@@ -17,6 +18,7 @@ from ..linalg.arrays import is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
+from ..solvers.closures import opened
 from ..states.consistency import consistent
 from ..system import AbstractSystem
 from ..system.inputs import Signals, input_break_times, with_inputs
@@ -43,6 +45,10 @@ from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
+_HIDDEN = (
+    "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
+    "an attribute of an object: make it a parameter, or let the function close over it."
+)
 
 
 @names_arguments
@@ -191,6 +197,7 @@ def simulate(
         "times": times,
         "saveat": saved,
         "restarts": restarts,
+        "event": jax.tree.map(opened, event),
         "changes": {} if direction is None else parameter_changes(system, direction),
     }
     traced = is_traced(numbers)
@@ -199,7 +206,6 @@ def simulate(
     problem = Problem(
         **numbers,
         adjoint=adjoint,
-        event=event,
         limit=np.asarray(max_steps),
         room=max_steps if adjoint is not None else room_for(max_steps, saved),
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
@@ -214,6 +220,8 @@ def simulate(
             return *solved(problem), None
         with told_of_compiling(system):
             trajectory, outcome = solved(problem)
+            if is_traced(outcome.flags):
+                raise ValueError(_HIDDEN)
             return trajectory, outcome, np.asarray(outcome.flags)
 
     trajectory, outcome, flags = run(problem)

@@ -190,7 +190,7 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     if problem.traced:
         # A derivative would be that of the part before the failure. The error goes with the value, and not with a
         # derivative that is taken alone.
-        inputs = system, problem.state, times, problem.formulation, problem.manifold
+        inputs = system, problem.state, times, problem.formulation, problem.manifold, problem.event, first.fn
         motion = nan_where(failed, motion, inputs)
     flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts))])
     outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
+from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
 from .linear_map import filled, linear_map
 from .steps import AbstractSteps, LinearStep, Moving
@@ -348,8 +349,10 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
     most: int = eqx.field(static=True)
 
-    def loop(self, *, max_steps, **options):
-        return self.run(max_steps, max_steps, **options)
+    def loop(self, *, terms, event, max_steps, **options):
+        # What a function closes over is an argument of the rule below, or its derivative would be zero.
+        terms, event = jax.tree.map(opened, (terms, event))
+        return self.run(max_steps, max_steps, terms=terms, event=event, **options)
 
     def run(
         self,
@@ -373,7 +376,9 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         jumps = jump_times(options["stepsize_controller"])
         final, *_ = _recorded((terms, args, own), jumps, init_state, fixed, max_steps, self.most)
         given = lambda *_, **__: final
-        return _run(given, terms, args, init_state, fixed, max_steps)
+        # The time of an event depends on its function, after the steps are taken.
+        ended = *freeze((solver, saveat)), freeze(options) | {"event": options["event"]}
+        return _run(given, terms, args, init_state, ended, max_steps)
 
 
 def _run(outer, terms, args, init_state, fixed, max_steps):

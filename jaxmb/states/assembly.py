@@ -122,8 +122,11 @@ def configuration(
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed)
     # The poses that a system was compiled at are often their own closest configuration; then nothing is compiled.
-    if guess is system.guess.q and not fixed.any() and not is_traced((system, q, t)) and bool(_is_met(system, t, q)):
-        return q, fixed, jnp.array(True)
+    if guess is system.guess.q and not fixed.any() and not is_traced((system, q, t)):
+        met = _is_met(system, t, q)
+        # Under a trace, results of concrete numbers are traced as well.
+        if not is_traced(met) and met:
+            return q, fixed, jnp.array(True)
     q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if throw and not is_traced(ok) and not ok:
         raise ValueError(_cannot_assemble(system, t, q, fixed, names))

@@ -119,3 +119,11 @@ def test_a_prescribed_angle_is_met_and_not_its_opposite():
     state = mb.assemble(system)
     heading = rotate(state.q[3:], jnp.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(heading[:2], [np.cos(2.0), np.sin(2.0)], rtol=0, atol=1e-10)
+
+
+def test_known_numbers_within_a_trace():
+    """A scene that is known is assembled in a function that JAX traces as outside of it."""
+    system = mb.mechanisms.four_bar().system
+    expected = mb.assemble(system).q
+    np.testing.assert_allclose(jax.jit(lambda x: x * mb.assemble(system).q)(1.0), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(lambda x: x * mb.assemble(system).q)(1.0), expected, rtol=0, atol=1e-12)
