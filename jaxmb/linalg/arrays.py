@@ -12,6 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+# Types of arrays.
+ARRAYS = (jax.Array, np.ndarray, np.generic)
 # Types of values that hold no tracers.
 _CONCRETE = (float, int, np.ndarray, np.generic)
 

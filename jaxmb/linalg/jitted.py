@@ -5,7 +5,8 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
-import numpy as np
+
+from .arrays import ARRAYS
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -34,11 +35,8 @@ def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
         leaves, structure = jax.tree.flatten((arguments, named))
         # A pytree has no leaves that are None.
-        rest = tuple(None if isinstance(x, _ARRAYS) else x for x in leaves)
+        rest = tuple(None if isinstance(x, ARRAYS) else x for x in leaves)
         arrays = [x for x, own in zip(leaves, rest, strict=True) if own is None]
         return compiled(arrays, (structure, rest))
 
     return called
-
-
-_ARRAYS = (jax.Array, np.ndarray, np.generic)

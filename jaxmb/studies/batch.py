@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._compat import ClosedJaxpr, Jaxpr
+from ..linalg.arrays import ARRAYS
 from ..parts.names import names_arguments
 
 # What JAX raises where a number is asked for that is not known in tracing.
@@ -23,7 +24,6 @@ NEED_NUMBERS = (
 )
 # What the loops of the members of a block may carry [bytes], and the most members of a block.
 _CARRIED, _MOST = 2**20, 64
-_ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
 @names_arguments
@@ -63,7 +63,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
 
     @eqx.filter_jit
     def in_blocks(members, count):
-        arrays, shared = eqx.partition(members, lambda x: isinstance(x, _ARRAYS))
+        arrays, shared = eqx.partition(members, lambda x: isinstance(x, ARRAYS))
         member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
         number = -(-count // min(size or member.block_size(count), count))
         together = -(-count // number)
@@ -142,12 +142,12 @@ def _count(members: tuple[Any, ...]) -> int:
     counts = {}
     for path, x in jax.tree_util.tree_leaves_with_path(members):
         name = f"Argument {jax.tree_util.keystr(path)}"
-        if isinstance(x, bool | int | float | complex) or (isinstance(x, _ARRAYS) and not np.shape(x)):
+        if isinstance(x, bool | int | float | complex) or (isinstance(x, ARRAYS) and not np.shape(x)):
             raise ValueError(
                 f"{name} is a single number, {x!r}: members are along axis 0. Those that are given one by one are "
                 "stacked by jax.tree.map(lambda *x: jnp.stack(x), *members), if they have one structure."
             )
-        if isinstance(x, _ARRAYS):
+        if isinstance(x, ARRAYS):
             counts[name] = np.shape(x)[0]
     if not counts:
         raise ValueError("A batch needs an array with members along axis 0, got none.")

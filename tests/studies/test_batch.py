@@ -1,14 +1,13 @@
 """Batches in blocks: the numbers of `jax.vmap` and of a loop, remainders, derivatives, sizes and refusals."""
 
-import contextlib
 import itertools
-import logging
 import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 
 import jaxmb as mb
 from jaxmb.studies.batch import Member
@@ -45,30 +44,6 @@ def test_several_arguments_names_and_what_is_shared():
     found = mb.batch(scaled, 2)({"a": np.arange(5.0)}, "sum", np.ones(5))
     np.testing.assert_array_equal(found["sum"], np.arange(5.0)[:, None] * factor + 1)
     assert mb.batch(scaled)({"a": np.arange(5.0)}, "other", np.ones(5)).keys() == {"other"}
-
-
-class _Compiled(logging.Handler):
-    """The names of programs, as they are compiled."""
-
-    def __init__(self):
-        super().__init__()
-        self.names = []
-
-    def emit(self, record):
-        found = re.match(r"Finished XLA compilation of (?:jit\()?(\w+)", record.getMessage())
-        if found:
-            self.names.append(found[1])
-
-
-@contextlib.contextmanager
-def compiled():
-    handler, logger = _Compiled(), logging.getLogger("jax._src.dispatch")
-    logger.addHandler(handler)
-    try:
-        with jax.log_compiles():
-            yield handler.names
-    finally:
-        logger.removeHandler(handler)
 
 
 def test_a_remainder_compiles_nothing_more():

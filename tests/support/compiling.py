@@ -1,9 +1,12 @@
 """How the tests compile: quickly where many run side by side, and as users do where rounding has to be the same."""
 
+import contextlib
+import logging
 import os
+import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 
@@ -74,3 +77,26 @@ def jit_quickly(function: Callable) -> Callable:
 
 def _value(text):
     return {"false": False, "true": True}.get(text, int(text) if text.isdigit() else text)
+
+
+class _Names(logging.Handler):
+    def __init__(self):
+        super().__init__()
+        self.names: list[str] = []
+
+    def emit(self, record):
+        found = re.match(r"Finished XLA compilation of (?:jit\()?(\w+)", record.getMessage())
+        if found:
+            self.names.append(found[1])
+
+
+@contextlib.contextmanager
+def compiled() -> Iterator[list[str]]:
+    """The names of the programs that are compiled meanwhile, in their order."""
+    handler, logger = _Names(), logging.getLogger("jax._src.dispatch")
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield handler.names
+    finally:
+        logger.removeHandler(handler)
