@@ -20,9 +20,10 @@ from ..linalg.rotations import cross, normalize, rotate
 from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
+from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
-from ..system.equation import Ranks
+from ..system.equation import Contacts, Ranks
 from ..system.quantities import Quantity
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
@@ -271,6 +272,19 @@ class RigidBodySystem(AbstractSystem):
         """Name and number within its part of every row of A."""
         groups = [(g.group.names, range(g.rows)) for g in self.joints]
         return tuple((name, k) for names, rows in groups for name in names for k in rows)
+
+    @property
+    def contacts(self):
+        rows, names, modes, restitution, first = [], [], [], [], 0
+        for g in self.constraints:
+            count = len(g.group.names) * g.rows
+            if isinstance(g.group.part, AbstractUnilateralConstraint):
+                names += g.group.names
+                rows += range(first, first + count)
+                modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
+                restitution.append(g.group.part.restitution)
+            first += count
+        return Contacts(tuple(names), tuple(rows), tuple(modes), jnp.concatenate(restitution)) if names else None
 
     # Scalar coordinates
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..solvers import AbstractManifoldTerm, Block
 from ..system import AbstractSystem
+from .manifold import VectorField
 
 
 def with_internal_states(term: Any) -> Any:
@@ -88,9 +89,18 @@ class StatefulTerm(AbstractManifoldTerm):
         own, rates = term.at_solution(t, _mechanical(y), _mechanical(f), kept, args)
         return State(own.q, own.u, y.z), State(rates.q, rates.u, term.system.state_rates(t, own.q, own.u))
 
+    @property
+    def guards(self):
+        return self.term.guards
+
     def after_jump(self, t, y, args):
+        if self.guards is not None:
+            return self.guards.impact(StatefulField(VectorField(self.system, self.term.formulation)), t, y).after
         after = self.term.after_jump(t, _mechanical(y), args)
         return State(after.q, after.u, y.z)
+
+    def chart_after_jump(self, chart):
+        return self.term.chart_after_jump(chart)
 
     def controlled(self, chart):
         own = self.term.controlled(chart)

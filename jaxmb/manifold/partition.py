@@ -43,7 +43,7 @@ from .constraints import (
     solved,
 )
 from .diagnosis import diagnose
-from .impulse import after_impulse
+from .impact import after_jump, contact_guards
 from .manifold import AbstractManifold, VectorField, newton_tolerance
 from .orthogonal_projection import project_normalized
 
@@ -472,8 +472,18 @@ class PartitionTerm(AbstractManifoldTerm):
         out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
         return out.y, out.f
 
+    @property
+    def guards(self):
+        return contact_guards(self.system, self.formulation, self.newton_tol)
+
     def after_jump(self, t, y, args):
-        return after_impulse(self.system, t, y)
+        return after_jump(self, t, y)
+
+    def chart_after_jump(self, chart):
+        if self.system.contacts is None:
+            return chart
+        # Contacts that close or open make the chart one of other rows.
+        return eqx.tree_at(lambda chart: chart.quality, chart, jnp.full_like(chart.quality, jnp.inf))
 
     def controlled(self, chart):
         # All components: where dependent ones change fast, the error of the independent ones alone shows it too late.

@@ -21,6 +21,7 @@ from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
+from .impact import after_jump, contact_guards
 from .impulse import after_impulse
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
@@ -218,8 +219,12 @@ class ProjectionTerm(AbstractManifoldTerm):
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)
 
+    @property
+    def guards(self):
+        return contact_guards(self.system, self.formulation, self.newton_tol)
+
     def after_jump(self, t, y, args):
-        return after_impulse(self.system, t, y)
+        return after_jump(self, t, y)
 
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))

@@ -298,7 +298,8 @@ class AbstractLink(AbstractActor):
             raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
         frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}
         part = cls.with_fields(self, body_frames=frames)
-        return cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(own)])), own
+        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(own)]))
+        return part, (*own, *known.scalars.get(self.name, ()))
 
     def components(self) -> tuple["AbstractLink", ...]:
         """Hook: the parts that it consists of, by default itself; called after the numbers have been filled in."""

@@ -18,7 +18,7 @@ from ..formulations import AbstractFormulation
 from ..linalg.arrays import as_array, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
-from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
+from ..solvers import AbstractMultistep, Adams, EventController, MultistepController, RunningScales
 from ..solvers.closures import opened
 from ..solvers.one_step import OneStepController
 from ..system import AbstractSystem
@@ -57,7 +57,9 @@ def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales 
     return OneStepController.around(diffrax.PIDController(rtol, atol), scales)
 
 
-def with_restarts(controller: Any, restarts: Any) -> Any:
+def with_restarts(controller: Any, restarts: Any, events: int | None) -> Any:
+    """A controller that restarts at some times, and at as many events of contacts; None where there are none."""
+    controller = controller if events is None else EventController(controller, events)
     return controller if restarts is None else diffrax.ClipStepSizeController(controller, jump_ts=restarts)
 
 

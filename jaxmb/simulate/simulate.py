@@ -73,6 +73,7 @@ def simulate(
     direction: Mapping[str, VectorLike] | None = None,
     error: bool = False,
     max_steps: int = 65536,
+    max_events: int = 1024,
     throw: bool | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Trajectory:
@@ -207,6 +208,7 @@ def simulate(
         **numbers,
         adjoint=adjoint,
         limit=np.asarray(max_steps),
+        max_events=max_events,
         room=max_steps if adjoint is not None else room_for(max_steps, saved),
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,

@@ -62,6 +62,7 @@ class Problem(NamedTuple):
     adjoint: Any
     event: Any
     limit: Any
+    max_events: int
     room: int
     progress_meter: Any
     restarts: Any
@@ -106,7 +107,9 @@ class Problem(NamedTuple):
         return self.times | {
             "y0": start,
             "saveat": self.saveat,
-            "stepsize_controller": with_restarts(controller, self.restarts),
+            "stepsize_controller": with_restarts(
+                controller, self.restarts, None if self.system.contacts is None else self.max_events
+            ),
             "event": self.event,
             "max_steps": self.room,
             "progress_meter": self.progress_meter,
@@ -139,6 +142,9 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     first = problem.saveat.subs[0]
     options = problem.options(start) | lax.stop_gradient(times)
+    if system.contacts is not None:
+        # Contacts that are closed at the start, and those that close there.
+        options["y0"] = start = term.after_jump(times["t0"], start, None)
     if problem.moving[0]:
         options["y0"] = start = at_frozen_start(term, times["t0"], start)
     at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)

@@ -21,6 +21,7 @@ from ._interpolation import RateInterpolation
 from .evaluation import (
     after_jump,
     at_solution,
+    chart_after_jump,
     evaluate,
     field_of,
     kept_of_chart,
@@ -191,7 +192,7 @@ def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
             flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
             at = jump.time + late
         y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
-        chart = next_chart(terms, jump.time, y, jump.chart, args)
+        chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
         field = field_of(terms, jump.time, y, chart, args)
         if late is None:
             (flat, f), _ = field(jump.time, ravel(y))

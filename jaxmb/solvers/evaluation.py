@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._compat import direction_of, inner_term, unwrapped
-from .manifold_term import AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .manifold_term import AbstractGuards, AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
 
 
 class Evaluation(NamedTuple):
@@ -93,6 +93,18 @@ def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
     """The state just after a jump; `y` for a plain vector field."""
     manifold = _manifold(term)
     return y if manifold is None else manifold.after_jump(t * direction_of(term), y, args)
+
+
+def chart_after_jump(term: Any, chart: Chart | None) -> Chart | None:
+    """The chart just after a jump, which `next_chart` makes one; `None` for a plain vector field."""
+    manifold = _manifold(term)
+    return None if manifold is None else manifold.chart_after_jump(chart)
+
+
+def guards_of(term: Any) -> AbstractGuards | None:
+    """The guards of a term; None for a plain vector field."""
+    manifold = _manifold(term)
+    return None if manifold is None else manifold.guards
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:

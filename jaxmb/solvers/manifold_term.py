@@ -7,12 +7,17 @@ solved for (`project_near`), so a change of chart preserves history and order.
 """
 
 import abc
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 Chart: TypeAlias = PyTree[Array]
 Y: TypeAlias = PyTree[Array]
@@ -69,6 +74,27 @@ class AbstractFieldJacobian(eqx.Module):
     @abc.abstractmethod
     def resolvent(self, r: Complex[Array, ""]) -> AbstractResolvent:
         """Factor `1 - r J`."""
+
+
+class AbstractGuards(eqx.Module):
+    """The guards of a term, functions of time and state, both in the term's own time.
+
+    **Fields:** `touch`: values down to minus this count as zero; `near`: a step that was meant to end at an event does
+    so where a guard is at most this.
+    """
+
+    touch: AbstractVar[Float[Array, ""]]
+    near: AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def values(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
+        """The guards."""
+
+    @abc.abstractmethod
+    def rates(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
+        """The rates of those guards that may be negative in the middle of a step alone, and of those whose zeros are
+        passed in one direction only; infinite for others.
+        """
 
 
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
@@ -137,6 +163,15 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """
         del t, args
         return y
+
+    def chart_after_jump(self, chart: Chart) -> Chart:
+        """The chart just after a jump, which `update_chart` makes one there; by default the one before it."""
+        return chart
+
+    @property
+    def guards(self) -> AbstractGuards | None:
+        """The functions at whose zeros `after_jump` is asked for the state after them; by default None."""
+        return None
 
     @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:

@@ -12,8 +12,19 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import any_of_batch, from_controller
-from .evaluation import after_jump, chart_after_step, check_real, check_term, derivative, first_chart, refused
+from .._compat import any_of_batch, direction_of, from_controller
+from .evaluation import (
+    after_jump,
+    chart_after_jump,
+    chart_after_step,
+    check_real,
+    check_term,
+    derivative,
+    first_chart,
+    guards_of,
+    refused,
+)
+from .events import Crossing, crossing
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
 from .steps import AbstractSteps
@@ -113,10 +124,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         args: Args,
         solver_state: Any,
         made_jump: Any,
-    ) -> tuple[Y, StepEstimate | None, dict[str, Any], Any, diffrax.RESULTS]:
+    ) -> tuple[Y, StepEstimate | Crossing | None, dict[str, Any], Any, diffrax.RESULTS]:
         def restart():
             after = after_jump(terms, t0, y0, args)
-            return after, self.initial_state(terms, t0, t1, after, args, solver_state.chart, solver_state)
+            chart = chart_after_jump(terms, solver_state.chart)
+            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
 
         y0, state = _restart_after(made_jump, restart, (y0, solver_state))
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
@@ -125,10 +137,15 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         off = refused(terms, chart)
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
+        estimate = None if self.tolerances.fixed else estimate
+        guards = guards_of(terms)
+        if guards is not None:
+            at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
+            estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), (y0, y1), at)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
-        return y1, None if self.tolerances.fixed else estimate, dense_info, state, result
+        return y1, estimate, dense_info, state, result
 
     def linear_steps(self, jumps: bool) -> AbstractSteps | None:
         """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.

@@ -40,6 +40,23 @@ class Ranks(eqx.Module):
     acceleration: int = eqx.field(static=True)
 
 
+class Contacts(eqx.Module):
+    """The unilateral constraints of a system: gaps that stay non-negative.
+
+    Each has a row of A and a coordinate of its own, its mode. The row says `gap = 0` where the contact is closed, and
+    otherwise that the mode stays what it is. So the number and the rank of rows never change, and the mode, which no
+    force acts on, is a number of the state like any other.
+
+    **Fields:** their `names`; for each the number of its `rows` of A, among those of positions, and the index of its
+    mode in q, `modes`; coefficients of `restitution`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)
+    modes: tuple[int, ...] = eqx.field(static=True)
+    restitution: Float[Array, "contacts"]
+
+
 class AbstractEquation(eqx.Module):
     """The equation of a constrained mechanical system, as formulations, manifolds and the search for states see it; a
     pytree with every number a leaf and every choice static.
@@ -242,6 +259,13 @@ class AbstractEquation(eqx.Module):
         """`C`, from the multipliers λ of the same equation."""
         del t, q, multipliers
         return jnp.zeros_like(u)
+
+    # Unilateral constraints
+
+    @property
+    def contacts(self) -> Contacts | None:
+        """The unilateral constraints; None without any."""
+        return None
 
     # Implicit methods
 

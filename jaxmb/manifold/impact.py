@@ -1,0 +1,221 @@
+"""Impacts and loss of contact: the state after an event of unilateral constraints, and the guards that tell of it.
+
+An impact is Newton's: with the impulses `Λ ≥ 0` of all contacts that touch, `M (u⁺ − u⁻) = Aᵀ Λ`, and a gap that closed
+at a rate v opens at least at `restitution` times v; where it opens faster its impulse is zero. Contacts that do not
+open then stay closed where their forces push: `λ ≥ 0`, the second derivative of the gap `≥ 0`, and one of them zero.
+Both are linear complementarity problems, over the constraints that are always there.
+
+Sources: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", in: Nonsmooth Mechanics and
+Applications, Springer, 1988; Ch. Glocker, "Set-Valued Force Laws", Springer, 2001. The derivative of the state after an
+event by that before it is the saltation matrix: P. C. Müller, "Calculation of Lyapunov exponents for dynamic systems
+with discontinuities", Chaos, Solitons & Fractals 5, 1995.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar, State
+from ..formulations import AbstractFormulation, accelerations
+from ..linalg.complementarity import positive_components, solved_components
+from ..solvers import AbstractGuards
+from ..system import AbstractEquation
+from ..system.gaps import (
+    CLOSED,
+    IMPLIED,
+    OPEN,
+    contacts_of,
+    gap_accelerations,
+    gap_gradients,
+    gap_rates,
+    gaps,
+    modes_of,
+    with_modes,
+)
+from ..system.residuals import binding_velocities
+from .impulse import after_impulse
+from .manifold import VectorField
+from .orthogonal_projection import project_velocities
+
+# A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
+_NEAR = 1e3
+# A contact closes where it would bounce no higher than this multiple of it.
+_BOUNCE = 1e2
+# Rates and accelerations of gaps below this fraction of what adds up in them are zero.
+_REST = 1e-9
+
+
+class ContactGuards(AbstractGuards):
+    """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
+    force.
+    """
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    touch: Float[Array, ""]
+
+    @property
+    def near(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _NEAR * self.touch
+
+    def values(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        contacts, q = contacts_of(system), system.normalize(y.q)
+        t, modes = jnp.asarray(t, q.dtype), modes_of(system, q)
+        free = gaps(system, t, q) / system.length
+
+        def forces():
+            own = system.at(y)
+            _, multipliers = accelerations(own, self.formulation, t, q, y.u)
+            largest = jnp.max(jnp.abs(multipliers)) + jnp.finfo(q.dtype).tiny
+            return multipliers[jnp.array(contacts.rows)] / largest
+
+        closed = modes == CLOSED
+        held = lax.cond(jnp.any(closed), forces, lambda: jnp.ones_like(free))
+        return jnp.where(closed, held, jnp.where(modes == OPEN, free, 1.0))
+
+    def impact(self, field: Callable[[Scalar, State, Any], State], t: Scalar, y: State) -> "Impact":
+        """The event at a state; `field(t, y, None)`: the vector field of the system, of all that y has."""
+        return impact(field, self.system.at(y), self.formulation, self.touch, t, y)
+
+    def rates(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        q = system.normalize(y.q)
+        rates = gap_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
+        return jnp.where(modes_of(system, q) == OPEN, rates, jnp.inf)
+
+
+def contact_guards(
+    system: AbstractEquation, formulation: AbstractFormulation, touch: Float[Array, ""]
+) -> ContactGuards | None:
+    """The guards of a system's contacts; None without any."""
+    return None if system.contacts is None else ContactGuards(system, formulation, touch)
+
+
+def after_jump(term: Any, t: Scalar, y: State) -> State:
+    """The state after prescribed rates have jumped, or contacts closed or opened, of a term with `system`,
+    `formulation` and `guards`.
+    """
+    if term.guards is None:
+        return after_impulse(term.system, t, y)
+    return term.guards.impact(VectorField(term.system, term.formulation), t, y).after
+
+
+class Impact(NamedTuple):
+    """An event of contacts.
+
+    **Fields:** the state `after` it, at the time that was asked for; the event is `late` after that; `impulses` of
+    contacts; `modes` before and after it; `rest`: the time from the event until the last of infinitely many bounces
+    that are left out, zero for contacts without any; the `energy` lost; whether it is `solvable`.
+    """
+
+    after: State
+    late: Float[Array, ""]
+    impulses: Float[Array, "contacts"]
+    modes: tuple[Float[Array, "contacts"], Float[Array, "contacts"]]
+    rest: Float[Array, "contacts"]
+    energy: Float[Array, ""]
+    solvable: Bool[Array, ""]
+
+
+def impact(
+    field: Callable[[Scalar, State, Any], State],
+    system: AbstractEquation,
+    formulation: AbstractFormulation,
+    touch: Scalar,
+    t: Scalar,
+    y: State,
+) -> Impact:
+    """The event of contacts that are about to close, or to open, at a state.
+
+    The first gap that closes at a rate v is zero later by `τ = −gap / v`, a small time. The state moves on by τ, changes,
+    and moves back by τ with the new equations. So the state after it is right to the third power of τ, and the
+    derivatives are those of a motion whose event time depends on the state.
+
+    **Arguments:** `field(t, y, None)`: the vector field of `system`; `touch`: gaps down to minus this, in units of the
+    system's size, count as zero.
+    """
+    contacts, t = contacts_of(system), jnp.asarray(t, y.q.dtype)
+    modes = lax.stop_gradient(modes_of(system, y.q))
+    length = lax.stop_gradient(system.length)
+    late, moved, hit, free = _moved_to_zero(field, system, t, y, modes == OPEN, _NEAR * touch * length)
+    t, q, u = t + late, moved.q, moved.u
+
+    touching = (modes != OPEN) | hit | (gaps(system, t, q) <= touch * length)
+    open_q = with_modes(system, q, OPEN)
+    inertia = system.inertia(t, open_q, u)
+    rows = gap_gradients(system, t, q, u)
+    jacobian = binding_velocities(system, t, open_q, u).selected(system.velocity_rank, system.velocity_scale())
+    projector = jacobian.projector(inertia)
+    none = jnp.zeros(system.acceleration_rows, u.dtype)
+    # The changes of velocities by unit impulses, with those that the other constraints answer with.
+    moves = jax.vmap(lambda row: projector.solve(row, none)[0])(rows)
+    influence = rows @ moves.T
+
+    # Bounces that nothing can resolve are left out. Each takes `restitution` times the time of the one before.
+    before = gap_rates(system, t, q, u)
+    e, falls = contacts.restitution, free < 0
+    bounce = e * jnp.maximum(-before, 0.0)
+    unseen = falls & (bounce**2 <= 2 * jnp.abs(free) * _BOUNCE * touch * length) & (before < 0) & (e < 1)
+    rest = jnp.where(
+        unseen, 2 * bounce / (jnp.where(falls, -free, 1.0) * jnp.where(unseen, 1 - e, 1.0)), 0.0
+    )
+    bounce = jnp.where(unseen, 0.0, bounce)
+
+    unbound, _ = project_velocities(system, t, open_q, u, inertia)
+    impulses, _, solvable = _complementary(influence, gap_rates(system, t, q, unbound) - bounce, touching)
+    u = unbound + impulses @ moves
+    sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(moved.u))
+    staying = touching & (gap_rates(system, t, q, u) <= _REST * sizes)
+    own = system.at(dataclasses.replace(moved, q=open_q, u=u))
+    udot, _ = accelerations(own, formulation, t, open_q, u)
+    opening = gap_accelerations(system, t, q, u, udot)
+    forces, closed, held = _complementary(influence, opening, staying)
+    sizes = jnp.abs(rows) @ jnp.abs(udot) + jnp.abs(opening)
+    implied = staying & ~closed & (influence @ forces + opening <= _REST * sizes)
+    new = lax.stop_gradient(jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))).astype(q.dtype)
+
+    after = dataclasses.replace(moved, q=with_modes(system, q, new), u=u)
+    energy = 0.5 * (jnp.dot(moved.u, inertia.product(moved.u)) - jnp.dot(u, inertia.product(u)))
+    after = _flowed(field, t, after, -late)
+    return Impact(after, late, impulses, (modes, new), lax.stop_gradient(rest), energy, solvable & held)
+
+
+def _moved_to_zero(field, system, t, y, is_open, near):
+    """The time after which the first open gap is zero, zero where none is about to close; the state there; which gap it
+    is; and the second derivatives of all gaps before.
+    """
+    f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
+    gap, closing = gaps(system, t, y.q), gap_rates(system, t, y.q, y.u)
+    curve = gap_accelerations(system, t, y.q, y.u, f.u)
+    about_to = lax.stop_gradient(is_open & (gap <= near) & (closing < 0))
+    first = jnp.argmin(jnp.where(about_to, -lax.stop_gradient(gap / closing), jnp.inf))
+    any_one = about_to[first]
+    g, v, a = (jnp.where(any_one, x[first], instead) for x, instead in ((gap, 0.0), (closing, -1.0), (curve, 0.0)))
+    late = -g / v - 0.5 * a * g**2 / v**3
+    move = lambda y, f, rate: y + late * f + 0.5 * late**2 * rate
+    return late, jax.tree.map(move, y, f, rate), about_to & (jnp.arange(gap.size) == first), lax.stop_gradient(curve)
+
+
+def _flowed(field, t, y, time):
+    """A state after a small time, to its second power."""
+    f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
+    return jax.tree.map(lambda y, f, rate: y + time * f + 0.5 * time**2 * rate, y, f, rate)
+
+
+def _complementary(influence, free, among):
+    """Impulses `≥ 0` of some contacts with `influence impulses + free ≥ 0`, of which contacts they are positive, and
+    whether there are any.
+    """
+    among = lax.stop_gradient(among)
+    both = among[:, None] & among[None, :]
+    influence = jnp.where(both, influence, jnp.eye(free.size, dtype=free.dtype))
+    free = jnp.where(among, free, 1.0)
+    positive, solvable = positive_components(influence, free)
+    return solved_components(influence, free, positive), positive, solvable
