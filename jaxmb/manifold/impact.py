@@ -38,10 +38,9 @@ from ..system.gaps import (
     modes_of,
     with_modes,
 )
-from ..system.residuals import binding_velocities
+from ..system.residuals import binding_velocities, velocity_rows
 from .impulse import after_impulse
 from .manifold import VectorField
-from .orthogonal_projection import project_velocities
 
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
 _NEAR = 1e3
@@ -142,71 +141,88 @@ def impact(
     system's size, count as zero.
     """
     contacts, t = contacts_of(system), jnp.asarray(t, y.q.dtype)
-    modes = lax.stop_gradient(modes_of(system, y.q))
     length = lax.stop_gradient(system.length)
-    late, moved, hit, free = _moved_to_zero(field, system, t, y, modes == OPEN, _NEAR * touch * length)
-    t, q, u = t + late, moved.q, moved.u
+    modes = lax.stop_gradient(modes_of(system, y.q))
 
-    touching = (modes != OPEN) | hit | (gaps(system, t, q) <= touch * length)
+    def moved(carry, at_event):
+        """To the event, and what happens there; or back from it."""
+        y, late, out = carry
+        f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
+        curve = gap_accelerations(system, t, y.q, y.u, f.u)
+        found, hit = _first_zero(system, t, y, modes == OPEN, curve, _NEAR * touch * length)
+        late = jnp.where(at_event, found, -late)
+        y = jax.tree.map(lambda y, f, rate: y + late * f + 0.5 * late**2 * rate, y, f, rate)
+        at = lambda: _at_event(system, formulation, touch * length, t + late, y, modes, hit, lax.stop_gradient(curve))
+        y, out = lax.cond(at_event, at, lambda: (y, out))
+        return (y, jnp.where(at_event, late, -late), out), None
+
+    none = jnp.zeros(len(contacts.names), y.q.dtype)
+    start = y, jnp.zeros_like(t), (none, none, none, jnp.zeros_like(t), jnp.array(True))
+    # A loop, so that the field is compiled once.
+    (after, late, out), _ = lax.scan(moved, start, jnp.array([True, False]))
+    impulses, new, rest, energy, solvable = out
+    return Impact(after, late, impulses, (modes, new), rest, energy, solvable)
+
+
+def _first_zero(system, t, y, is_open, curve, near):
+    """The time after which the first open gap is zero, zero where none is about to close; and which one it is."""
+    gap, closing = gaps(system, t, y.q), gap_rates(system, t, y.q, y.u)
+    about_to = lax.stop_gradient(is_open & (gap <= near) & (closing < 0))
+    first = jnp.argmin(jnp.where(about_to, -lax.stop_gradient(gap / closing), jnp.inf))
+    any_one = about_to[first]
+    g, v, a = (jnp.where(any_one, x[first], instead) for x, instead in ((gap, 0.0), (closing, -1.0), (curve, 0.0)))
+    return -g / v - 0.5 * a * g**2 / v**3, about_to & (jnp.arange(gap.size) == first)
+
+
+def _at_event(system, formulation, touch, t, y, modes, hit, free):
+    """The state after an event that happens at a state, with impulses, modes, times of rest, the energy lost, and
+    whether the problems had a solution.
+
+    **Arguments:** `touch` [m, rad]; `modes` before; which contact is `hit`; `free`: second derivatives of gaps before.
+    """
+    contacts, q = contacts_of(system), y.q
+    touching = (modes != OPEN) | hit | (gaps(system, t, q) <= touch)
     open_q = with_modes(system, q, OPEN)
-    inertia = system.inertia(t, open_q, u)
-    rows = gap_gradients(system, t, q, u)
-    jacobian = binding_velocities(system, t, open_q, u).selected(system.velocity_rank, system.velocity_scale())
+    inertia = system.inertia(t, open_q, y.u)
+    rows = gap_gradients(system, t, q, y.u)
+    jacobian = binding_velocities(system, t, open_q, y.u).selected(system.velocity_rank, system.velocity_scale())
     projector = jacobian.projector(inertia)
-    none = jnp.zeros(system.acceleration_rows, u.dtype)
-    # The changes of velocities by unit impulses, with those that the other constraints answer with.
-    moves = jax.vmap(lambda row: projector.solve(row, none)[0])(rows)
+    none = jnp.zeros(system.acceleration_rows, q.dtype)
+    # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
+    # change that these constraints ask for themselves.
+    unmet = -velocity_rows(system, t, open_q, y.u)
+    forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
+    asked = jnp.concatenate([jnp.tile(none, (len(rows), 1)), unmet[None]])
+    moves = jax.vmap(lambda force, rows: projector.solve(force, rows)[0])(forces, asked)
+    moves, unbound = moves[:-1], y.u + moves[-1]
     influence = rows @ moves.T
 
     # Bounces that nothing can resolve are left out. Each takes `restitution` times the time of the one before.
-    before = gap_rates(system, t, q, u)
+    before = gap_rates(system, t, q, y.u)
     e, falls = contacts.restitution, free < 0
     bounce = e * jnp.maximum(-before, 0.0)
-    unseen = falls & (bounce**2 <= 2 * jnp.abs(free) * _BOUNCE * touch * length) & (before < 0) & (e < 1)
-    rest = jnp.where(
-        unseen, 2 * bounce / (jnp.where(falls, -free, 1.0) * jnp.where(unseen, 1 - e, 1.0)), 0.0
-    )
+    unseen = falls & (bounce**2 <= 2 * jnp.abs(free) * _BOUNCE * touch) & (before < 0) & (e < 1)
+    rest = jnp.where(unseen, 2 * bounce / (jnp.where(falls, -free, 1.0) * jnp.where(unseen, 1 - e, 1.0)), 0.0)
     bounce = jnp.where(unseen, 0.0, bounce)
 
-    unbound, _ = project_velocities(system, t, open_q, u, inertia)
-    impulses, _, solvable = _complementary(influence, gap_rates(system, t, q, unbound) - bounce, touching)
+    impulses, _, solvable = _complementary(influence, before + rows @ (unbound - y.u) - bounce, touching)
     u = unbound + impulses @ moves
-    sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(moved.u))
+    sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(y.u))
     staying = touching & (gap_rates(system, t, q, u) <= _REST * sizes)
-    own = system.at(dataclasses.replace(moved, q=open_q, u=u))
-    udot, _ = accelerations(own, formulation, t, open_q, u)
+    if system.ideal and system.acceleration_rows == system.velocity_rows:
+        gamma = -system.acceleration_residual(t, open_q, u, jnp.zeros_like(u))
+        udot, _ = projector.solve(system.force(t, open_q, u), gamma)
+    else:
+        udot, _ = accelerations(system, formulation, t, open_q, u)
     opening = gap_accelerations(system, t, q, u, udot)
     forces, closed, held = _complementary(influence, opening, staying)
     sizes = jnp.abs(rows) @ jnp.abs(udot) + jnp.abs(opening)
     implied = staying & ~closed & (influence @ forces + opening <= _REST * sizes)
     new = lax.stop_gradient(jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))).astype(q.dtype)
 
-    after = dataclasses.replace(moved, q=with_modes(system, q, new), u=u)
-    energy = 0.5 * (jnp.dot(moved.u, inertia.product(moved.u)) - jnp.dot(u, inertia.product(u)))
-    after = _flowed(field, t, after, -late)
-    return Impact(after, late, impulses, (modes, new), lax.stop_gradient(rest), energy, solvable & held)
-
-
-def _moved_to_zero(field, system, t, y, is_open, near):
-    """The time after which the first open gap is zero, zero where none is about to close; the state there; which gap it
-    is; and the second derivatives of all gaps before.
-    """
-    f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
-    gap, closing = gaps(system, t, y.q), gap_rates(system, t, y.q, y.u)
-    curve = gap_accelerations(system, t, y.q, y.u, f.u)
-    about_to = lax.stop_gradient(is_open & (gap <= near) & (closing < 0))
-    first = jnp.argmin(jnp.where(about_to, -lax.stop_gradient(gap / closing), jnp.inf))
-    any_one = about_to[first]
-    g, v, a = (jnp.where(any_one, x[first], instead) for x, instead in ((gap, 0.0), (closing, -1.0), (curve, 0.0)))
-    late = -g / v - 0.5 * a * g**2 / v**3
-    move = lambda y, f, rate: y + late * f + 0.5 * late**2 * rate
-    return late, jax.tree.map(move, y, f, rate), about_to & (jnp.arange(gap.size) == first), lax.stop_gradient(curve)
-
-
-def _flowed(field, t, y, time):
-    """A state after a small time, to its second power."""
-    f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
-    return jax.tree.map(lambda y, f, rate: y + time * f + 0.5 * time**2 * rate, y, f, rate)
+    after = dataclasses.replace(y, q=with_modes(system, q, new), u=u)
+    energy = 0.5 * (jnp.dot(y.u, inertia.product(y.u)) - jnp.dot(u, inertia.product(u)))
+    return after, (impulses, new, lax.stop_gradient(rest), energy, solvable & held)
 
 
 def _complementary(influence, free, among):

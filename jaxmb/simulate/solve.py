@@ -143,8 +143,8 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     first = problem.saveat.subs[0]
     options = problem.options(start) | lax.stop_gradient(times)
     if system.contacts is not None:
-        # Contacts that are closed at the start, and those that close there.
-        options["y0"] = start = term.after_jump(times["t0"], start, None)
+        # Contacts may close, or be closed, at the start.
+        options["made_jump"] = jnp.array(True)
     if problem.moving[0]:
         options["y0"] = start = at_frozen_start(term, times["t0"], start)
     at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)

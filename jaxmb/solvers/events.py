@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import any_of_batch
 from .controller import AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
@@ -43,6 +42,33 @@ class Crossing(NamedTuple):
     near: Float[Array, ""]
 
 
+# What the search in a step looks for: whether there is a zero in it, the least value of a guard, a point before the
+# zero at which guards are positive, the zero; nothing more.
+_LOOK, _DIP, _RISE, _ZERO, _DONE = range(5)
+
+
+class _Search(NamedTuple):
+    """The search for the first zero in a step, whose times are fractions of it.
+
+    **Fields:** the `phase`; `s`: where guards are evaluated next; an interval from `a` to `b` with the values of what
+    changes its sign in it; which guards are `looked_at`; whether these are positive at the start of the step; guards
+    and their rates at the end of it; whether one is negative in its middle; the number of evaluations in this `phase`.
+    """
+
+    phase: Any
+    s: Any
+    a: Any
+    b: Any
+    of_a: Any
+    of_b: Any
+    looked_at: Any
+    positive: Any
+    end: Any
+    rates: Any
+    dips: Any
+    count: Any
+
+
 def crossing(
     guards: AbstractGuards, direction: Any, error: PyTree, step: tuple[Any, Any], ends: tuple[Any, Any], at: Callable
 ) -> Crossing:
@@ -51,82 +77,126 @@ def crossing(
     **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `ends`: the states there;
     `at(t)`: a state in between.
     """
-    t0, t1 = step
+    (t0, t1), (y0, y1) = step, ends
     sign = jnp.asarray(direction, t0.dtype)
-    values = lambda t, y: guards.values(t * sign, y)
-    rates = lambda t, y: guards.rates(t * sign, y) * sign.astype(ravel(y).dtype)
-    v0, v1, r0, r1 = values(t0, ends[0]), values(t1, ends[1]), rates(t0, ends[0]), rates(t1, ends[1])
-    below, inside = v1 < -guards.touch, (r0 < 0) & (r1 > 0) & jnp.isfinite(r0) & (v1 >= -guards.touch)
-    state = lambda s: at(t0 + s * (t1 - t0))
+    start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
 
-    def search():
-        value = lambda s: values(t0 + s * (t1 - t0), state(s))
-        # A guard whose rate changes its sign has its least value there.
-        most = jnp.argmin(jnp.where(inside, v0 + v1, jnp.inf))
-        rate = lambda s: rates(t0 + s * (t1 - t0), state(s))[most]
-        lowest = _zero(rate, *(jnp.asarray(x, t0.dtype) for x in (0.0, 1.0)), r0[most], r1[most])
-        dips = jnp.any(inside) & (value(lowest)[most] < -guards.touch)
-        looked_at = below | (dips & (jnp.arange(v0.size) == most))
-        least = lambda s: jnp.min(jnp.where(looked_at, value(s), jnp.inf))
-        end = jnp.where(jnp.any(below), 1.0, lowest).astype(t0.dtype)
-        start, end = _rising(least, jnp.min(jnp.where(looked_at, v0, jnp.inf)) > guards.touch, end)
-        found = _zero(least, start, end, least(start), least(end))
-        return t0 + found * (t1 - t0), dips
+    def advance(search):
+        # One evaluation for all that is looked for, so that the guards are compiled once.
+        s, t = search.s, t0 + search.s * (t1 - t0)
+        y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
+        values, rates = guards.values(t * sign, y), guards.rates(t * sign, y) * sign.astype(start.dtype)
+        out = lax.switch(
+            search.phase,
+            [_looked, _dipped, _risen, _zero_found],
+            search._replace(count=search.count + 1),
+            values,
+            rates,
+            start,
+            guards.touch,
+        )
+        return out
 
-    look = jnp.any(below | inside)
-    target, dips = lax.cond(any_of_batch(look), search, lambda: (t1, jnp.array(False)))
-    falling = jnp.any((jnp.abs(v1) <= guards.touch) & (r1 < 0))
-    within, falling = (x.astype(v1.dtype) for x in (dips & look, falling))
-    touch, near = (jnp.asarray(x, v1.dtype) for x in (guards.touch, guards.near))
-    return Crossing(error, jnp.where(look, target, t1), within, jnp.min(v1), falling, touch, near)
-
-
-def _rising(least, positive, end):
-    """An interval whose end is a zero or behind it and before whose start there is none, from one that starts at
-    zero.
-    """
-
-    def halved(carry):
-        s, _, k = carry
-        return s / 2, s, k + 1
-
-    def proceed(carry):
-        s, _, k = carry
-        return (least(s) <= 0) & (k < _HALVINGS)
-
-    start, end, _ = lax.while_loop(
-        lambda carry: ~positive & proceed(carry), halved, (end / 2, end, jnp.array(0))
+    none, one = jnp.zeros_like(start), jnp.ones((), t0.dtype)
+    zero = jnp.zeros((), start.dtype)
+    first = _Search(
+        jnp.array(_LOOK),
+        one,
+        jnp.zeros_like(one),
+        one,
+        zero,
+        zero,
+        none > 0,
+        jnp.array(False),
+        none,
+        none,
+        jnp.array(False),
+        jnp.array(0),
     )
-    return jnp.where(positive, 0.0, start), end
+    found = lax.while_loop(lambda search: search.phase != _DONE, advance, first)
+    falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
+    within, falling = (x.astype(start.dtype) for x in (found.dips, falling))
+    touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
+    return Crossing(error, t0 + found.b * (t1 - t0), within, jnp.min(found.end), falling, touch, near)
 
 
-def _zero(function, a, b, fa, fb):
-    """The end of a short interval in which a function changes its sign, from a longer one, on the side of `b`.
+def _looked(search: _Search, values, rates, start, touch):
+    """At the end of a step: guards that are negative, and those whose rate has changed its sign."""
+    below = values < -touch
+    inside = (start < 0) & (rates > 0) & jnp.isfinite(start) & ~below
+    # Of several the one that is least at the end.
+    least = jnp.argmin(jnp.where(inside, values, jnp.inf))
+    dips, crosses = jnp.any(inside) & ~jnp.any(below), jnp.any(below)
+    s = search.s / 2
+    return search._replace(
+        phase=jnp.where(crosses, _RISE, jnp.where(dips, _DIP, _DONE)),
+        s=s,
+        of_a=jnp.where(dips, start[least], search.of_a),
+        of_b=jnp.where(dips, rates[least], jnp.min(jnp.where(below, values, jnp.inf))),
+        looked_at=jnp.where(crosses, below, jnp.arange(values.size) == least),
+        end=values,
+        rates=rates,
+        count=jnp.array(0),
+    )
+
+
+def _dipped(search: _Search, values, rates, start, touch):
+    """Towards the zero of a guard's rate, where it is least."""
+    del start
+    own = jnp.argmax(search.looked_at)
+    narrowed = _narrowed(search, rates[own])
+    ends = _is_short(narrowed)
+    dips = ends & (values[own] < -touch)
+    again = narrowed._replace(
+        phase=jnp.where(dips, _RISE, jnp.where(ends, _DONE, _DIP)),
+        dips=dips,
+        count=jnp.where(ends, 0, narrowed.count),
+    )
+    s, b = jnp.where(dips, search.s / 2, again.s), jnp.where(dips, search.s, jnp.where(ends, 1.0, again.b))
+    return again._replace(s=s, b=b, a=jnp.where(ends, 0.0, again.a))
+
+
+def _risen(search: _Search, values, rates, start, touch):
+    """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
+    del rates, start, touch
+    least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
+    positive, ends = least > 0, search.count >= _HALVINGS
+    found = search._replace(
+        phase=jnp.where(positive, _ZERO, jnp.where(ends, _DONE, _RISE)),
+        a=jnp.where(positive, search.s, 0.0),
+        b=jnp.where(positive, search.b, search.s),
+        of_a=jnp.where(positive, least, search.of_a),
+        of_b=jnp.where(positive, search.of_b, least),
+        count=jnp.where(positive, 0, search.count),
+    )
+    return found._replace(s=jnp.where(positive, 0.5 * (found.a + found.b), search.s / 2))
+
+
+def _zero_found(search: _Search, values, rates, start, touch):
+    """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
+    del rates, start, touch
+    narrowed = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
+    return narrowed._replace(phase=jnp.where(_is_short(narrowed), _DONE, _ZERO))
+
+
+def _is_short(search: _Search):
+    return (search.b - search.a <= _FRACTION) | (search.of_b == 0) | (search.count >= _EVALUATIONS)
+
+
+def _narrowed(search: _Search, value):
+    """The shorter interval with a value at `s` in it, and where the next one is asked for.
 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
     1971 (the Illinois method).
     """
-
-    def proceed(carry):
-        a, b, _, fb, k = carry
-        return (jnp.abs(b - a) > _FRACTION) & (fb != 0) & (k < _EVALUATIONS)
-
-    def advance(carry):
-        a, b, fa, fb, k = carry
-        slope = fb - fa
-        secant = (a * fb - b * fa) / jnp.where(slope == 0, 1.0, slope)
-        inside = (secant - a) * (secant - b) < 0
-        # Every third interval is halved, so that the number of evaluations is bounded.
-        middle = jnp.where(inside & (slope != 0) & (k % 3 != 2), secant, 0.5 * (a + b))
-        f = function(middle)
-        same = jnp.sign(f) == jnp.sign(fb)
-        # `b` stays the side of the negative values: where the new point is on the other side, `a` moves.
-        a, fa = jnp.where(same, a, middle), jnp.where(same, fa * 0.5, f)
-        b, fb = jnp.where(same, middle, b), jnp.where(same, f, fb * 0.5)
-        return a, b, fa, fb, k + 1
-
-    fa, fb = fa.astype(a.dtype), fb.astype(a.dtype)
-    return lax.while_loop(proceed, advance, (a, b, fa, fb, jnp.array(0)))[1]
+    same = jnp.sign(value) == jnp.sign(search.of_b)
+    a, of_a = jnp.where(same, search.a, search.s), jnp.where(same, 0.5 * search.of_a, value)
+    b, of_b = jnp.where(same, search.s, search.b), jnp.where(same, value, 0.5 * search.of_b)
+    slope = (of_b - of_a).astype(a.dtype)
+    secant = (a * of_b.astype(a.dtype) - b * of_a.astype(a.dtype)) / jnp.where(slope == 0, 1.0, slope)
+    # Every third interval is halved, so that the number of evaluations is bounded.
+    good = (secant > a) & (secant < b) & (slope != 0) & (search.count % 3 != 2)
+    return search._replace(a=a, b=b, of_a=of_a, of_b=of_b, s=jnp.where(good, secant, 0.5 * (a + b)))
 
 
 class EventState(AbstractControllerState):

@@ -53,5 +53,8 @@ def gap_gradients(
     return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
 
 
-def _of_contacts(system, rows):
-    return rows[np.array(contacts_of(system).rows)]
+def _of_contacts(system, values):
+    # Slices of rows that follow one another, so that the compiler leaves out those of other parts.
+    rows = np.array(contacts_of(system).rows)
+    runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1))
+    return jnp.concatenate([values[run[0] : run[-1] + 1] for run in runs])
