@@ -22,6 +22,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "contradict the others. Remove them, or make dimensions and prescribed motions agree. With `throw=False` the "
         "motion up to there is kept."
     )
+    too_many_events = (
+        "There were more impacts and other events of contacts than `max_events`. With `throw=False` the motion up to "
+        "there is kept."
+    )
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )

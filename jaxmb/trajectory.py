@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ._compat import steps_of
 from ._results import RESULTS
 from ._types import State
+from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import unknown
@@ -81,6 +82,8 @@ class Trajectory(eqx.Module):
     generalized coordinates `trajectory["theta"]` is a coordinate and `trajectory["theta_rate"]` its rate, shape
     (times,).
 
+    `events` are the impacts of unilateral constraints, as a table.
+
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
     that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
     """
@@ -93,6 +96,7 @@ class Trajectory(eqx.Module):
     result: RESULTS
     interpolation: diffrax.AbstractPath | None
     event_mask: Any
+    found_events: FoundEvents | None = None
     closer: "Trajectory | None" = None
 
     def __getitem__(self, name: str) -> Any:
@@ -125,6 +129,17 @@ class Trajectory(eqx.Module):
         if name not in known:
             raise unknown("quantity", name, known)
         return self._measured((name,))[name]
+
+    @property
+    def events(self) -> ContactEvents:
+        """Impacts, and contacts that close and open: a table of times, parts, impulses and energies lost."""
+        if self.found_events is None:
+            raise ValueError("There are no events, since the system has no unilateral constraints such as jaxmb.Stop.")
+        return self._events()
+
+    @_of_each_member
+    def _events(self):
+        return contact_events(self.system, self.formulation, self.found_events)
 
     @property
     def error(self) -> "GlobalError":

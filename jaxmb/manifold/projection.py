@@ -16,13 +16,14 @@ from ..formulations.formulation import check_mass, solve_constrained
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
-from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
+from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation, crossing
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .impact import after_jump, contact_guards
+from .impact import ContactGuards, after_jump, contact_guards
 from .impulse import after_impulse
+from .internal_states import equations_of
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
@@ -75,7 +76,8 @@ class Projection(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
-            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system)
+            guards = contact_guards(system, formulation, newton_tolerance(self.newton_tol, rtol))
+            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system, guards)
         _check_multistep(system, formulation, type(solver).__name__)
         if solver.solves_implicitly and not system.has_field_jacobian:
             raise ValueError(
@@ -237,9 +239,13 @@ class ProjectionTerm(AbstractManifoldTerm):
 
 
 class ProjectedSolver(WrappedSolver):
-    """A Runge–Kutta solver whose steps end with a projection on the constraints."""
+    """A Runge–Kutta solver whose steps end with a projection on the constraints, or at events of contacts.
+
+    **Fields:** the `system`; the `guards` of its contacts, None without any.
+    """
 
     system: AbstractEquation
+    guards: ContactGuards | None
 
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
@@ -249,7 +255,8 @@ class ProjectedSolver(WrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         direction = direction_of(terms)
         if made_jump is not False:
-            y0 = cond_of_any_lane(made_jump, lambda y: after_impulse(self.system, t0 * direction, y), lambda y: y, y0)
+            y0 = cond_of_any_lane(made_jump, lambda y: self._after_jump(t0 * direction, y), lambda y: y, y0)
+        first, last = t0, t1
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction
         y1, failed = projected(self.system, t1, y1)
@@ -263,4 +270,12 @@ class ProjectedSolver(WrappedSolver):
             # diffrax forgets the result of a step that is rejected.
             violated = _violated(*lax.stop_gradient((self.system, t1, y1)))
             result = diffrax.RESULTS.where(violated, _FAILED, result)
+        if self.guards is not None:
+            at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
+            error = crossing(self.guards, direction, error, (first, last), (y0, y1), at)
         return y1, error, dense_info, solver_state, result
+
+    def _after_jump(self, t, y):
+        if self.guards is None:
+            return after_impulse(self.system, t, y)
+        return self.guards.impact(equations_of(self.system, self.guards.formulation), t, y).after

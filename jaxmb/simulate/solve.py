@@ -11,6 +11,7 @@ from jax import lax
 
 from .._results import RESULTS
 from .._types import State
+from ..contact_events import FoundEvents
 from ..formulations import AbstractFormulation
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
@@ -23,7 +24,15 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
-from ..solvers import AbstractMultistep, MeshAdjoint, RunningScales, TangentControl, intended_step, with_tangents
+from ..solvers import (
+    AbstractMultistep,
+    MeshAdjoint,
+    RunningScales,
+    TangentControl,
+    events_found,
+    intended_step,
+    with_tangents,
+)
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
@@ -173,11 +182,16 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
         if are_states and problem.moving[1]:
             saved = at_moving_times(term, ts, saved)
 
+    found, events = None, events_found(solution.controller_state)
+    if events is not None:
+        found = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
+    if found is not None:
+        result = RESULTS.where(found.count > problem.max_events, RESULTS.too_many_events, result)
     stuck, coupling = has_failed(result) & finite, None
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
@@ -200,7 +214,7 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
         motion = nan_where(failed, motion, inputs)
     flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts))])
     outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)
-    return (ts, motion[0], stats, result, motion[1], solution.event_mask), outcome
+    return (ts, motion[0], stats, result, motion[1], solution.event_mask, found), outcome
 
 
 @eqx.filter_jit

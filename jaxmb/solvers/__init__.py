@@ -16,7 +16,12 @@ from .evaluation import (
     ravel as ravel,
     unravel_like as unravel_like,
 )
-from .events import EventController as EventController, EventState as EventState, events_found as events_found
+from .events import (
+    EventController as EventController,
+    EventState as EventState,
+    crossing as crossing,
+    events_found as events_found,
+)
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
 from .manifold_term import (
     AbstractFieldJacobian as AbstractFieldJacobian,

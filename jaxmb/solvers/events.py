@@ -42,6 +42,17 @@ class Crossing(NamedTuple):
     near: Float[Array, ""]
 
 
+def error_of(y_error: Any) -> PyTree:
+    """The error estimate in what a solver returns, which may be a `Crossing`."""
+    # A concrete class, which alone holds another error.
+    return y_error.error if isinstance(y_error, Crossing) else y_error
+
+
+def with_error(y_error: Any, error: PyTree) -> Any:
+    """The same with another error estimate."""
+    return y_error._replace(error=error) if isinstance(y_error, Crossing) else error
+
+
 # What the search in a step looks for: whether there is a zero in it, the least value of a guard, a point before the
 # zero at which guards are positive, the zero; nothing more.
 _LOOK, _DIP, _RISE, _ZERO, _DONE = range(5)
@@ -203,7 +214,7 @@ class EventState(AbstractControllerState):
     """The state of `EventController`.
 
     **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
-    `count` of events, their `times` and the raveled `states` before them, in buffers.
+    `count` of events, their `times` and the raveled `states` before them, in buffers; `touch` of the guards.
     """
 
     inner: Any
@@ -211,6 +222,7 @@ class EventState(AbstractControllerState):
     count: Any
     times: Float[Array, " events"]
     states: Float[Array, "events n"]
+    touch: Float[Array, ""]
 
     @property
     def intended(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -247,7 +259,8 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         # The last entry of the buffers is written where there is no event.
         times = jnp.full(self.most + 1, jnp.inf, t0.dtype)
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
-        return first, EventState(inner, jnp.asarray(jnp.inf, t0.dtype), jnp.array(0), times, states)
+        touch = jnp.zeros((), flat.dtype)
+        return first, EventState(inner, jnp.asarray(jnp.inf, t0.dtype), jnp.array(0), times, states, touch)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         before, found = controller_state, y_error
@@ -269,6 +282,7 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
             before.count + ends,
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),
+            found.touch,
         )
         full = ends & (before.count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.event_occurred, result)

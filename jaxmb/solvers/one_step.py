@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from .._compat import WrappedSolver, with_loops
 from .controller import AbstractControllerState
 from .evaluation import ravel, unravel_like
+from .events import error_of, with_error
 from .multistep import AbstractMultistep
 from .scales import RunningScales
 from .tangent import Tangent, TangentControl, pushed, pushed_only
@@ -56,10 +57,11 @@ class WithTangents(WrappedSolver):
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
         for tangent, (dy1, derror, _, memory, _) in zip(before, along, strict=True):
-            w = ravel(dy1)
+            w, derror = ravel(dy1), error_of(derror)
             tangents.append(Tangent(w, memory, jnp.maximum(tangent.peak, self.control.largest(w))))
             errors.append(ravel(derror) / self.control.scale(self.rtol, tangent, w))
-        return y1, ErrorWithTangents(error, errors), dense_info, (state, tangents), result
+        with_errors = with_error(error, ErrorWithTangents(error_of(error), errors))
+        return y1, with_errors, dense_info, (state, tangents), result
 
 
 def _step_from(solver, t0, t1, args, made_jump, terms, y0, state):

@@ -1,0 +1,136 @@
+"""Impacts, and contacts that close and open, along a motion."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from ._types import State
+from .formulations import AbstractFormulation
+from .linalg.jitted import jitted
+from .manifold import contact_guards, equations_of
+from .system import AbstractSystem
+from .system.gaps import CLOSED, OPEN
+
+
+class FoundEvents(NamedTuple):
+    """What a run notes of its events: their `count`, and buffers with the `times` of the ends of steps at which they
+    happen, and the raveled `states` before them; `touch`: gaps that count as closed, in units of the system's size.
+    """
+
+    count: Int[Array, ""]
+    times: Float[Array, " events"]
+    states: Float[Array, "events n"]
+    touch: Float[Array, ""]
+
+
+class Event(NamedTuple):
+    """An event of one contact.
+
+    **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
+    `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; the `impulse` [N s, N m s]; the kinetic energy
+    [J] that was lost at this time, by all contacts together.
+    """
+
+    time: float
+    part: str
+    kind: str
+    impulse: float
+    energy_lost: float
+
+
+class ContactEvents(eqx.Module):
+    """The events of contacts along a motion, in the order of time; `print(motion.events)` shows a table, and
+    `list(motion.events)` has an `Event` for each contact that takes part in one.
+
+    A state that is saved just at an event may be that before it or that after it.
+
+    **Fields:** `times` [s], shape (events,); `impulses` [N s, of angles N m s], shape (events, contacts);
+    `energy_lost` [J], shape (events,): that of the impact; `before` and `after`: modes of the contacts, 0 where it is
+    open, 1 where it is closed, 2 where others imply it; `rest` [s], shape (events, contacts): the time from an event to
+    the end of the infinitely many bounces that begin with it and are too low to be resolved, after which the contact is
+    at rest; zero where there are none. Under `jit` or in a batch there are as many events as `max_events`, with times
+    of infinity after the last.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    times: Float[Array, "events"]
+    impulses: Float[Array, "events contacts"]
+    energy_lost: Float[Array, "events"]
+    before: Float[Array, "events contacts"]
+    after: Float[Array, "events contacts"]
+    rest: Float[Array, "events contacts"]
+
+    def __len__(self) -> int:
+        return len(self._rows())
+
+    def __iter__(self):
+        return iter(self._rows())
+
+    def __getitem__(self, k: int) -> Event:
+        return self._rows()[k]
+
+    def __str__(self) -> str:
+        rows = [
+            (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}") for e in self._rows()
+        ]
+        table = [("time [s]", "part", "kind", "impulse", "energy lost [J]"), *rows]
+        widths = [max(len(row[k]) for row in table) for k in range(5)]
+        return "\n".join(
+            "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in table
+        )
+
+    def _rows(self) -> list[Event]:
+        if isinstance(self.times, Tracer) or self.times.ndim != 1:
+            raise ValueError(
+                "The events of one motion are a table, those of a batch or under jit are arrays: see the fields of "
+                "ContactEvents."
+            )
+        times, impulses, lost, before, after, rest = map(
+            np.asarray, (self.times, self.impulses, self.energy_lost, self.before, self.after, self.rest)
+        )
+        rows = []
+        for k in np.flatnonzero(np.isfinite(times)):
+            for i, name in enumerate(self.names):
+                was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
+                impulse = float(impulses[k, i])
+                struck = impulse > 0 and was_open
+                kind = "impact" if struck and is_open else "close" if was_open and not is_open else "open"
+                if struck or was_open != is_open:
+                    rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
+                if rest[k, i] > 0 and after[k, i] == CLOSED:
+                    rows.append(Event(float(times[k] + rest[k, i]), name, "rest", 0.0, 0.0))
+        return sorted(rows, key=lambda event: event.time)
+
+
+def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
+    """The events of a run from what it notes of them."""
+    names = () if system.contacts is None else system.contacts.names
+    out = ContactEvents(names, *_evaluated(system, formulation, found))
+    if isinstance(out.times, Tracer):
+        return out
+    count = int(np.sum(np.isfinite(np.asarray(out.times))))
+    return jax.tree.map(lambda x: x[:count], out)
+
+
+@jitted
+def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
+    guards, field = contact_guards(system, formulation, found.touch), equations_of(system, formulation)
+    assert guards is not None, "a system without contacts has no events"
+    nq, nu = system.nq, system.nu
+
+    def single(k, t, flat):
+        # Behind the last event a state is needed that has no failure.
+        taken = k < found.count
+        flat = jnp.where(taken, flat, found.states[0])
+        y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
+        out = guards.impact(field, jnp.where(taken, t, found.times[0]), y)
+        time = jnp.where(taken, t + out.late, jnp.inf)
+        values = out.impulses, out.energy, *out.modes, out.rest
+        return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)
+
+    return jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
