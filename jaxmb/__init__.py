@@ -36,7 +36,13 @@ from .parts.functions import (
 from .parts.names import UnknownNameError as UnknownNameError
 from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
-from .parts.unilateral import Stop as Stop
+from .parts.unilateral import (
+    RigidBallContact as RigidBallContact,
+    RigidContact as RigidContact,
+    RigidPlaneContact as RigidPlaneContact,
+    Slack as Slack,
+    Stop as Stop,
+)
 from .simulate import simulate as simulate
 from .states.assembly import assemble as assemble
 from .states.equilibrium import equilibrium as equilibrium

@@ -197,24 +197,24 @@ def _at_event(system, formulation, touch, t, y, modes, hit, free):
     moves, unbound = moves[:-1], y.u + moves[-1]
     influence = rows @ moves.T
 
-    # Bounces that nothing can resolve are left out. Each takes `restitution` times the time of the one before.
     before = gap_rates(system, t, q, y.u)
-    e, falls = contacts.restitution, free < 0
-    bounce = e * jnp.maximum(-before, 0.0)
-    unseen = falls & (bounce**2 <= 2 * jnp.abs(free) * _BOUNCE * touch) & (before < 0) & (e < 1)
-    rest = jnp.where(unseen, 2 * bounce / (jnp.where(falls, -free, 1.0) * jnp.where(unseen, 1 - e, 1.0)), 0.0)
-    bounce = jnp.where(unseen, 0.0, bounce)
-
+    bounce = contacts.restitution * jnp.maximum(-before, 0.0)
     impulses, _, solvable = _complementary(influence, before + rows @ (unbound - y.u) - bounce, touching)
-    u = unbound + impulses @ moves
-    sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(y.u))
-    staying = touching & (gap_rates(system, t, q, u) <= _REST * sizes)
-    if system.ideal and system.acceleration_rows == system.velocity_rows:
-        gamma = -system.acceleration_residual(t, open_q, u, jnp.zeros_like(u))
-        udot, _ = projector.solve(system.force(t, open_q, u), gamma)
-    else:
-        udot, _ = accelerations(system, formulation, t, open_q, u)
-    opening = gap_accelerations(system, t, q, u, udot)
+    struck = unbound + impulses @ moves
+    udot = _free_acceleration(system, formulation, projector, t, open_q, struck)
+    opening, rate = gap_accelerations(system, t, q, struck, udot), gap_rates(system, t, q, struck)
+    sizes = jnp.abs(rows) @ (jnp.abs(struck) + jnp.abs(y.u))
+    staying = touching & (rate <= _REST * sizes)
+    # Contacts that would open by less than can be seen, before they close again, stay closed.
+    falls = jnp.where(opening < 0, -opening, 1.0)
+    low = touching & ~staying & (opening < 0) & (rate**2 <= 2 * falls * _BOUNCE * touch) & (contacts.restitution < 1)
+    staying = staying | lax.stop_gradient(low)
+    lost = jnp.where(jnp.any(low), solved_components(influence, rate, _independent(influence, staying)), 0.0)
+    u, impulses = struck + lost @ moves, impulses + lost
+    # Each bounce takes `restitution` times the time of the one before.
+    bounces = lax.stop_gradient(low & (bounce > 0))
+    ratio = jnp.where(bounces, contacts.restitution, 0.0)
+    rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
     forces, closed, held = _complementary(influence, opening, staying)
     sizes = jnp.abs(rows) @ jnp.abs(udot) + jnp.abs(opening)
     implied = staying & ~closed & (influence @ forces + opening <= _REST * sizes)
@@ -223,6 +223,24 @@ def _at_event(system, formulation, touch, t, y, modes, hit, free):
     after = dataclasses.replace(y, q=with_modes(system, q, new), u=u)
     energy = 0.5 * (jnp.dot(y.u, inertia.product(y.u)) - jnp.dot(u, inertia.product(u)))
     return after, (impulses, new, lax.stop_gradient(rest), energy, solvable & held)
+
+
+def _independent(influence, among):
+    """Contacts of some ones whose impulses can all be found from the changes of the rates of their gaps."""
+    among = lax.stop_gradient(among)
+    both = among[:, None] & among[None, :]
+    # What must be cancelled in a random direction is nearly always cancelled by a basis.
+    asked = -jnp.where(both, influence, 0.0) @ (1 + jnp.arange(among.size, dtype=influence.dtype))
+    matrix = jnp.where(both, influence, jnp.eye(among.size, dtype=influence.dtype))
+    return positive_components(matrix, jnp.where(among, asked, 1.0))[0]
+
+
+def _free_acceleration(system, formulation, projector, t, q, u):
+    """The accelerations at coordinates with open contacts, where the projector on the other constraints is known."""
+    if system.ideal and system.acceleration_rows == system.velocity_rows:
+        gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+        return projector.solve(system.force(t, q, u), gamma)[0]
+    return accelerations(system, formulation, t, q, u)[0]
 
 
 def _complementary(influence, free, among):

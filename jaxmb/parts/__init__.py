@@ -54,3 +54,7 @@ from .space import (
     separation_rate as separation_rate,
 )
 from .terrain import AbstractTerrain as AbstractTerrain
+from .unilateral import (
+    AbstractGeometricContact as AbstractGeometricContact,
+    AbstractUnilateralConstraint as AbstractUnilateralConstraint,
+)

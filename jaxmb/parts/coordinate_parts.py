@@ -143,7 +143,7 @@ class AbstractCoordinatePart(AbstractOfJoints):
 
 def is_length(within: str) -> bool:
     """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
-    return within.startswith(("displacement", "length"))
+    return within.startswith(("displacement", "length", "gap"))
 
 
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -13,9 +13,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractInertialConstraint, ScalarCoordinate
+from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate
 from .coordinate_parts import AbstractScalarPart
+from .shapes import Ground, marked_ball, wheel
+from .space import AbstractSpace, both_points, separation
+from .terrain import AbstractTerrain, distance
 
 # The mode of a contact that is closed, as `jaxmb.system` numbers modes.
 _CLOSED = 1
@@ -52,21 +56,26 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
 
     @abc.abstractmethod
-    def gap(self, space, poses, t) -> Float[Array, ""]:
-        """The gap [m, rad] at the poses of the bodies; its derivatives are finite wherever bodies may be."""
+    def gap(self, space: AbstractSpace, poses: Poses) -> Float[Array, ""]:
+        """The gap [m, rad] at the poses of the bodies, as a smooth function, also where it is negative."""
 
     def residual(self, space, poses, t):
+        del t
         mode = poses[-1, 0]
         kind = lax.stop_gradient(jnp.round(mode))
-        return jnp.where(kind == _CLOSED, self.gap(space, poses[:-1], t), mode - kind)[None]
+        return jnp.where(kind == _CLOSED, self.gap(space, poses[:-1]), mode - kind)[None]
 
 
 class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     """Rigid stops at one end or both ends of a coordinate's range.
 
+    ```python
+    jaxmb.Stop("buffer", "slide.displacement", lower=0.0, upper=0.2, restitution=0.6)
+    ```
+
     **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
     which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before. The
-    range of an angle must be less than a full turn.
+    range of an angle must be less than a full turn. `JointStop` is a compliant one.
     """
 
     lower: fields.Number = fields.parameter(unit="rad or m", optional=True)
@@ -92,10 +101,115 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
                 )
         return super().with_numbers(given)
 
-    def gap(self, space, poses, t):
+    def gap(self, space, poses):
         (value,) = self.measured(space, poses)
         if self.lower is None or self.upper is None:
             return value - self.lower if self.upper is None else self.upper - value
         middle = 0.5 * (self.lower + self.upper)
         # Of the two stops that which is nearer.
         return 0.5 * (self.upper - self.lower) - jnp.abs(self.near(value[None], middle)[0] - middle)
+
+
+class AbstractGeometricContact(AbstractUnilateralConstraint):
+    """A unilateral constraint of lengths; its coordinate is the `gap` [m], `"floor.gap"`."""
+
+    def coordinates(self, space, poses):
+        return {"gap": self.gap(space, poses[:-1])}
+
+
+class RigidContact(AbstractGeometricContact):
+    """Rigid contact of a body with a terrain, as a disc (in the plane), a sphere (in space), or a point, without
+    friction.
+
+    ```python
+    jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
+    ```
+
+    The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is a
+    compliant one.
+
+    **Arguments:** `body`; `terrain`, from `jaxmb.terrain`, fixed in the world; `radius` [m] ≥ 0, 0 for a point;
+    `centre` [m], body-fixed, default the origin of the frame; `restitution` from 0 to 1, default 0.
+    """
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    radius: fields.Number = fields.length(sign="non-negative", default=0.0)
+    centre: fields.Number = fields.point(body=0, default="origin")
+
+    def gap(self, space, poses):
+        return distance(self.terrain, space.point(poses[0], self.centre)) - self.radius
+
+    def shapes(self, space, size):
+        solid = wheel if space.dimension == 2 else marked_ball
+        out = [(None, Ground(height=self.terrain.height))]
+        if self.radius > 0:
+            out += [(0, shape) for shape in solid(self.radius, position=space.in_space(self.centre))]
+        return tuple(out)
+
+
+class RigidBallContact(AbstractGeometricContact, AbstractPair):
+    """Rigid contact of two discs (in the plane) or balls (in space) of different bodies, without friction.
+
+    **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
+    centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0. The centres must not
+    coincide.
+    """
+
+    radius_a: fields.Number = fields.length(sign="non-negative")
+    radius_b: fields.Number = fields.length(sign="non-negative")
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
+
+    def gap(self, space, poses):
+        return norm(separation(space, self, poses)) - self.radius_a - self.radius_b
+
+    def shapes(self, space, size):
+        solid = wheel if space.dimension == 2 else marked_ball
+        both = ((0, self.radius_a, self.point_a), (1, self.radius_b, self.point_b))
+        return tuple(
+            (k, shape) for k, r, at in both if r > 0 for shape in solid(r, position=space.in_space(at))
+        )
+
+
+class RigidPlaneContact(AbstractGeometricContact, AbstractPair):
+    """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`,
+    without friction.
+
+    The plane has no end, and the ball is always on the side to which the normal points.
+
+    **Arguments:** `point_a` [m] of the plane; `normal_a`, its normal, fixed in `body_a`, or `normal` in the world at
+    the given poses; `point_b` [m], the centre, fixed in `body_b`; `radius` [m] ≥ 0, default 0; `restitution` from 0 to
+    1, default 0.
+    """
+
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
+    normal_a: fields.Number = fields.axis(body=0, optional=True)
+    normal: fields.Number = fields.axis(body=None, gives=("normal_a",))
+    radius: fields.Number = fields.length(sign="non-negative", default=0.0)
+
+    def gap(self, space, poses):
+        normal = space.direction(poses[0], self.normal_a)
+        return jnp.dot(normal, separation(space, self, poses)) - self.radius
+
+
+class Slack(AbstractGeometricContact, AbstractPair):
+    """A rope between two points, or a coupling with slack: the points are at most `length` apart.
+
+    **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0;
+    `restitution` from 0 to 1, default 0.
+    """
+
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
+    length: fields.Number = fields.length(sign="positive")
+
+    def gap(self, space, poses):
+        d = separation(space, self, poses)
+        # Smooth where the points coincide.
+        return (self.length**2 - jnp.dot(d, d)) / (2 * self.length)
+
+    def path(self, space, poses):
+        return both_points(space, self, poses)
