@@ -18,11 +18,11 @@ from .system.gaps import CLOSED, OPEN
 
 
 class FoundEvents(NamedTuple):
-    """What a run notes of its events: their `count`, and buffers with the `times` of the ends of steps at which they
+    """What a run notes of its events: their `number`, and buffers with the `times` of the ends of steps at which they
     happen, and the raveled `states` before them; `touch`: gaps that count as closed, in units of the system's size.
     """
 
-    count: Int[Array, ""]
+    number: Int[Array, ""]
     times: Float[Array, " events"]
     states: Float[Array, "events n"]
     touch: Float[Array, ""]
@@ -75,9 +75,7 @@ class ContactEvents(eqx.Module):
         return self._rows()[k]
 
     def __str__(self) -> str:
-        rows = [
-            (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}") for e in self._rows()
-        ]
+        rows = [(f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}") for e in self._rows()]
         table = [("time [s]", "part", "kind", "impulse", "energy lost [J]"), *rows]
         widths = [max(len(row[k]) for row in table) for k in range(5)]
         return "\n".join(
@@ -125,7 +123,7 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
 
     def single(k, t, flat):
         # Behind the last event a state is needed that has no failure.
-        taken = k < found.count
+        taken = k < found.number
         flat = jnp.where(taken, flat, found.states[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
         out = guards.impact(field, jnp.where(taken, t, found.times[0]), y)

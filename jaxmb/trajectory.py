@@ -139,7 +139,8 @@ class Trajectory(eqx.Module):
 
     @_of_each_member
     def _events(self):
-        return contact_events(self.system, self.formulation, self.found_events)
+        found: Any = self.found_events
+        return contact_events(self.system, self.formulation, found)
 
     @property
     def error(self) -> "GlobalError":

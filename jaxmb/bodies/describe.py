@@ -3,6 +3,7 @@
 from typing import Any
 
 from ..parts.base import AbstractInertialConstraint
+from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
 from ..system.design_variables import description_rows
 
@@ -12,10 +13,11 @@ def describe_scene(system: Any) -> Description:
     count, kinds = system.layout.bodies, {}
     for g in system.bodies:
         kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
+    is_contact = lambda g: isinstance(g.group.part, AbstractUnilateralConstraint)
     plain = [g for g in system.constraints if not isinstance(g.group.part, AbstractInertialConstraint)]
     joints = [
         (plain, ""),
-        (system.inertial, ", each with a velocity of its own"),
+        ([g for g in system.inertial if not is_contact(g)], ", each with a velocity of its own"),
         (system.free_joints, ", which have coordinates only"),
         (system.velocity_constraints, ", between velocities"),
         (system.servos, ", a program of a Servo"),
@@ -43,6 +45,9 @@ def describe_scene(system: Any) -> Description:
     tables = {
         "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
         "joints": [(kind(g), shorten(g.group.names), f"{g.rows} rows each" + note) for gs, note in joints for g in gs],
+        "contacts": [
+            (kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)
+        ],
         "forces": [
             *gravity,
             *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in system.nonideal),

@@ -9,6 +9,7 @@ from ..bodies import RigidBodySystem
 from ..linalg.rotations import from_matrix
 from ..parts.base import AbstractInertialConstraint
 from ..parts.spatial.kinematics import SPACE
+from ..parts.unilateral import AbstractUnilateralConstraint
 from .description import rotation_of
 from .export_tree import Tree, numbers, parts_of
 from .notes import Notes
@@ -28,7 +29,11 @@ def write_forces(
         if write is None or write(part) is False:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
     for part in parts_of(system, system.constraints, tree.poses):
-        if isinstance(part.part, AbstractInertialConstraint) and not notes.leaves_out("joints", part.name):
+        if not isinstance(part.part, AbstractInertialConstraint) or notes.leaves_out("joints", part.name):
+            continue
+        if isinstance(part.part, AbstractUnilateralConstraint):
+            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
+        else:
             writer.inertia(part)
     for group in system.frames:
         for k, name in enumerate(group.group.names):

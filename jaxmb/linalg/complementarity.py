@@ -15,9 +15,7 @@ _PIVOT = 1e-9
 _APART = 1e-10
 
 
-def positive_components(
-    W: Float[Array, "k k"], b: Float[Array, "k"]
-) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
+def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
     """Which components of the solution are not zero, and whether there is a solution; without derivative.
 
     The columns of W of these components are independent, also where W is singular. For a positive semidefinite W there
@@ -60,16 +58,12 @@ def positive_components(
     table, basis, left = (
         jnp.where(nothing, old, new) for new, old in zip(started, (table, basis, jnp.asarray(2 * k)), strict=True)
     )
-    _, basis, left, solvable, _ = lax.while_loop(
-        proceed, advance, (table, basis, left, jnp.array(True), jnp.array(0))
-    )
+    _, basis, left, solvable, _ = lax.while_loop(proceed, advance, (table, basis, left, jnp.array(True), jnp.array(0)))
     found = jnp.zeros(2 * k + 1, bool).at[basis].set(True)[k : 2 * k]
     return found, solvable & (left == 2 * k)
 
 
-def solved_components(
-    W: Float[Array, "k k"], b: Float[Array, "k"], positive: Bool[Array, "k"]
-) -> Float[Array, "k"]:
+def solved_components(W: Float[Array, "k k"], b: Float[Array, "k"], positive: Bool[Array, "k"]) -> Float[Array, "k"]:
     """x with `W x + b = 0` in these components and zero in the others; differentiable."""
     both = positive[:, None] & positive[None, :]
     matrix = jnp.where(both, W, jnp.eye(b.size, dtype=b.dtype))

@@ -15,7 +15,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -133,9 +132,9 @@ def impact(
 ) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
-    The first gap that closes at a rate v is zero later by `τ = −gap / v`, a small time. The state moves on by τ, changes,
-    and moves back by τ with the new equations. So the state after it is right to the third power of τ, and the
-    derivatives are those of a motion whose event time depends on the state.
+    The first gap that closes at a rate v is zero later by `τ = −gap / v`, a small time. The state moves on by τ,
+    changes, and moves back by τ with the new equations. So the state after it is right to the third power of τ, and
+    the derivatives are those of a motion whose event time depends on the state.
 
     **Arguments:** `field(t, y, None)`: the vector field of `system`; `touch`: gaps down to minus this, in units of the
     system's size, count as zero.

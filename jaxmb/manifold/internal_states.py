@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractManifoldTerm, Block
-from ..system import AbstractSystem
+from ..system import AbstractEquation, AbstractSystem
 from .manifold import VectorField
 
 
@@ -28,7 +28,7 @@ def with_internal_states(term: Any) -> Any:
     return StatefulTerm(term) if field is None else diffrax.ODETerm(StatefulField(field))
 
 
-def equations_of(system: AbstractSystem, formulation: AbstractFormulation) -> Any:
+def equations_of(system: AbstractEquation, formulation: AbstractFormulation) -> Any:
     """The vector field of a system, with its internal states if it has any."""
     field = VectorField(system, formulation)
     return StatefulField(field) if system.nz else field

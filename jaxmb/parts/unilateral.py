@@ -1,8 +1,8 @@
 """Unilateral constraints: gaps that close at an instant, with an impact, and open again.
 
 A gap is a function of the poses of bodies that stays non-negative. Where it is open the part does nothing; where it is
-closed, `gap = 0` is a constraint like that of a joint, whose force pushes and never pulls. `simulate` finds the times of
-impacts and of loss of contact within its steps.
+closed, `gap = 0` is a constraint like that of a joint, whose force pushes and never pulls. `simulate` finds the times
+of impacts and of loss of contact within its steps. Every pair that may touch is named: nothing looks for others.
 """
 
 import abc
@@ -168,9 +168,7 @@ class RigidBallContact(AbstractGeometricContact, AbstractPair):
     def shapes(self, space, size):
         solid = wheel if space.dimension == 2 else marked_ball
         both = ((0, self.radius_a, self.point_a), (1, self.radius_b, self.point_b))
-        return tuple(
-            (k, shape) for k, r, at in both if r > 0 for shape in solid(r, position=space.in_space(at))
-        )
+        return tuple((k, shape) for k, r, at in both if r > 0 for shape in solid(r, position=space.in_space(at)))
 
 
 class RigidPlaneContact(AbstractGeometricContact, AbstractPair):

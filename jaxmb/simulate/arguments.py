@@ -39,9 +39,9 @@ _KINDS: dict[str, tuple[type, str]] = {
 }
 
 
-def check_steps(max_steps: Any) -> None:
-    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
+def check_steps(number: Any, name: str = "max_steps") -> None:
+    if not isinstance(number, int | np.integer) or number < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {number!r}.")
 
 
 def check_kinds(*given: Any) -> None:

@@ -88,6 +88,8 @@ def message_of_failure(system, result, t1, outcome: Outcome, stats, solver, prob
     """Why a simulation with a solver failed; `probe` as in `is_stiff_at_end`."""
     if np.any(outcome.coupling):
         return about_friction(system, outcome.coupling)
+    if result == RESULTS.too_many_events and not is_traced(outcome.t):
+        return f"The motion came to t = {float(outcome.t):.6g} of {float(t1):.6g}. {RESULTS[result]}"
     if result == RESULTS.max_steps_reached and not is_traced((system, outcome, t1)):
         return about_steps(outcome, t1, stats, is_stiff_at_end(probe, stats, solver))
     return reason_of_failure(system, result, t1, outcome)

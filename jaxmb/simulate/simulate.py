@@ -140,6 +140,8 @@ def simulate(
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead, with a `result` that says why; with `True` it is an error there as well, by a call of
         Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`).
+    - `max_events`: the largest number of impacts and other events of contacts (`Stop`, `RigidContact`, …), whose times
+        and states are kept: a motion that has more of them fails.
     - `event`, `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
         some more steps are simulated; not under `jit`, `vmap` or a derivative.
@@ -162,6 +164,12 @@ def simulate(
     event, and, with `Adams`, those of `jumps`. Second derivatives are those of first ones in forward mode
     (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
 
+    Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open at events, at which a step ends: `Trajectory.events`
+    lists them. An event is found to a thousandth of `rtol`, relative to the size of the system; bounces that are lower
+    than a tenth of `rtol` are left out, and the contact stays closed. Derivatives are those of a motion whose events
+    move with the parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
+    After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
+
     A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
     step to step. So a run that is differentiated also controls the error of a tangent of the state, from a start that
     excites all modes, at ten times `rtol`; its values differ within the tolerance from those of the same run without
@@ -179,6 +187,7 @@ def simulate(
     relative, absolute = checked_tolerances(rtol, atol, state)
     times = checked_times(t0, t1, dt0, state.q.dtype)
     check_steps(max_steps)
+    check_steps(max_events, "max_events")
     method = named_solver(solver, state) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     if error:
@@ -215,7 +224,7 @@ def simulate(
         traced=traced,
         moving=(is_traced(times["t0"]), is_traced((times["t1"], first.ts))),
     )
-    problem.check_jumps()
+    problem.check_impulses()
 
     def run(problem):
         if traced:

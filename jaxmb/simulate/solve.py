@@ -13,6 +13,7 @@ from .._results import RESULTS
 from .._types import State
 from ..contact_events import FoundEvents
 from ..formulations import AbstractFormulation
+from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..manifold import (
@@ -50,12 +51,13 @@ _MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
-    **Fields:** `system` and `state` at the start; `formulation` and `manifold`, None for those that suit the `solver`;
-    `controller`, None for that of `rtol` and `atol`, and atol None for running scales; `times`: t0, t1, dt0; `saveat`;
-    `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and `room`: that which
-    the program has room for; `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with
-    changes whose tangent is watched, by name; whether states are `interpolated`; whether anything is `traced`; whether
-    the start, and the end or a saved time, are `moving`.
+    **Fields:** `system` and `state` at the start; `formulation` and `manifold`, None for those that suit the
+    `solver`; `controller`, None for that of `rtol` and `atol`, and atol None for running scales; `times`: t0, t1,
+    dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and
+    `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
+    `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with changes whose tangent is
+    watched, by name; whether states are `interpolated`; whether anything is `traced`; whether the start, and the
+    end or a saved time, are `moving`.
     """
 
     system: AbstractSystem
@@ -90,17 +92,20 @@ class Problem(NamedTuple):
         given = self.formulation
         return self.policy.default_formulation(self.system) if given is None else given
 
-    def check_jumps(self) -> None:
+    def check_impulses(self) -> None:
         """Raise a `ValueError` where the velocities after an impulse would not be known."""
-        if self.restarts is None or self.system.velocity_rows == 0:
+        system, policy, t0, t1 = self.system, self.policy, self.times["t0"], self.times["t1"]
+        jumps = self.restarts is not None and system.velocity_rows > 0
+        if not jumps and system.contacts is None:
             return
-        system, policy = self.system, self.policy
         if not (policy.takes_impulses and system.positive_definite_mass):
+            what = "jumps, or inputs that jump, a constrained system" if jumps else "contacts a system"
             raise ValueError(
-                "With jumps, or inputs that jump, a constrained system needs manifold=Partition() or Projection(), and "
-                f"a mass matrix that has an inverse; got {type(policy).__name__}() and positive_definite_mass = "
-                f"{system.positive_definite_mass}."
+                f"With {what} needs manifold=Partition() or Projection(), and a mass matrix that has an inverse; got "
+                f"{type(policy).__name__}() and positive_definite_mass = {system.positive_definite_mass}."
             )
+        if system.contacts is not None and not is_traced((t0, t1)) and t1 < t0:
+            raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {t0} and {t1}.")
 
     def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for it."""
@@ -191,7 +196,7 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     if valid is not True:
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
     if found is not None:
-        result = RESULTS.where(found.count > problem.max_events, RESULTS.too_many_events, result)
+        result = RESULTS.where(found.number > problem.max_events, RESULTS.too_many_events, result)
     stuck, coupling = has_failed(result) & finite, None
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
@@ -205,6 +210,8 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
     stats |= policy.statistics(solution.solver_state)
+    if found is not None:
+        stats |= {"num_events": found.number}
     motion = saved, solution.interpolation
     failed = has_failed(result)
     if problem.traced:

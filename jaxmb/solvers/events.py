@@ -250,10 +250,14 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
     def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.norm
 
+    def __init__(self, controller: Any, most: int):
+        self.controller = controller
+        self.most = most
+
     def wrap(self, direction):
         return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         flat = ravel(y0)
         # The last entry of the buffers is written where there is no event.

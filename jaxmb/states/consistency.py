@@ -12,6 +12,7 @@ from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.jitted import jitted
 from ..system import AbstractSystem
+from ..system.gaps import contacts_of, gaps
 from ..system.residuals import row_sizes, violations
 
 # The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
@@ -30,9 +31,17 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
         return state
     rows = _violated(*lax.stop_gradient((system, t, state)))
     if is_traced(rows):
-        off = jnp.any(rows[0]) | jnp.any(rows[1])
+        off = jnp.any(rows[0]) | jnp.any(rows[1]) | jnp.any(rows[2])
         return jax.tree.map(lambda x: jnp.where(off, jnp.nan, x), state)
-    positions, velocities = map(np.asarray, rows)
+    positions, velocities, overlaps = map(np.asarray, rows)
+    if np.any(overlaps):
+        names = [name for name, off in zip(contacts_of(system).names, overlaps, strict=True) if off]
+        depths = -np.asarray(gaps(system, t, state.q))[overlaps]
+        listing = ", ".join(f"{name} by {depth:.3g}" for name, depth in zip(names, depths, strict=True))
+        raise ValueError(
+            f"The bodies of contacts are inside each other at t0 = {float(t):g}: {listing}. Give another state, or "
+            f'close the contact: state = jaxmb.assemble(system, state, fix={{"{names[0]}.mode": 1}}).'
+        )
     cure = (
         f"at t0 = {float(t):g}. Other parameters, another system or another time need another state: "
         "state = jaxmb.assemble(system, state, t=t0) makes this one consistent."
@@ -61,15 +70,17 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
     """Whether a state satisfies the constraints; True without any."""
     if system.velocity_rows == 0:
         return True
-    positions, velocities = _violated(*lax.stop_gradient((system, t, state)))
-    return ~(jnp.any(positions) | jnp.any(velocities))
+    positions, velocities, overlaps = _violated(*lax.stop_gradient((system, t, state)))
+    return ~(jnp.any(positions) | jnp.any(velocities) | jnp.any(overlaps))
 
 
 @jitted
 def _violated(system, t, y) -> Any:
     y = dataclasses.replace(y, q=system.normalize(y.q))
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
-    return jax.tree.map(lambda of_rows: of_rows > tol, violations(system, t, y, row_sizes(system, t, y)))
+    positions, velocities = violations(system, t, y, row_sizes(system, t, y))
+    depths = jnp.zeros(0, y.q.dtype) if system.contacts is None else -gaps(system, t, y.q) / system.length
+    return positions > tol, velocities > tol, depths > tol
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:

@@ -45,9 +45,7 @@ def gap_accelerations(
     return _of_contacts(system, system.acceleration_residual(t, with_modes(system, q, CLOSED), u, udot))
 
 
-def gap_gradients(
-    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities
-) -> Float[Array, "contacts nu"]:
+def gap_gradients(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "contacts nu"]:
     """Derivatives of the rates of the gaps with respect to velocities: the rows of A of contacts that are closed."""
     rates, pull = jax.vjp(lambda u: gap_rates(system, t, q, u), u)
     return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
