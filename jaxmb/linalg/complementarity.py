@@ -5,6 +5,7 @@ method).
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -25,7 +26,7 @@ def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[B
     k, dtype = b.size, b.dtype
     scale = jnp.sqrt(jnp.maximum(jnp.diag(W), jnp.finfo(dtype).tiny))
     W, b = W / scale[:, None] / scale[None, :], b / scale
-    right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * (1 + jnp.arange(k)) / k
+    right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * jnp.asarray(np.arange(1, k + 1) / k, dtype)
     # Columns: w, x, the artificial variable, the right-hand side; `basis`: the variable of each row.
     table = jnp.concatenate([jnp.eye(k, dtype=dtype), -W, -jnp.ones((k, 1), dtype), right[:, None]], axis=1)
 

@@ -45,13 +45,13 @@ from .manifold import VectorField
 _NEAR = 1e3
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e2
-# Rates and accelerations of gaps below this fraction of what adds up in them are zero.
+# Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
 _REST = 1e-9
 
 
 class ContactGuards(AbstractGuards):
     """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
-    force.
+    forces.
     """
 
     system: AbstractEquation
@@ -71,7 +71,8 @@ class ContactGuards(AbstractGuards):
         def forces():
             own = system.at(y)
             _, multipliers = accelerations(own, self.formulation, t, q, y.u)
-            largest = jnp.max(jnp.abs(multipliers)) + jnp.finfo(q.dtype).tiny
+            largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(own.force(t, q, y.u)))
+            largest = largest + jnp.finfo(q.dtype).tiny
             return multipliers[jnp.array(contacts.rows)] / largest
 
         closed = modes == CLOSED
@@ -214,9 +215,8 @@ def _at_event(system, formulation, touch, t, y, modes, hit, free):
     bounces = lax.stop_gradient(low & (bounce > 0))
     ratio = jnp.where(bounces, contacts.restitution, 0.0)
     rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
-    forces, closed, held = _complementary(influence, opening, staying)
-    sizes = jnp.abs(rows) @ jnp.abs(udot) + jnp.abs(opening)
-    implied = staying & ~closed & (influence @ forces + opening <= _REST * sizes)
+    _, closed, held = _complementary(influence, opening, staying)
+    implied = staying & ~closed & _is_implied(influence, closed)
     new = lax.stop_gradient(jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))).astype(q.dtype)
 
     after = dataclasses.replace(y, q=with_modes(system, q, new), u=u)
@@ -232,6 +232,15 @@ def _independent(influence, among):
     asked = -jnp.where(both, influence, 0.0) @ (1 + jnp.arange(among.size, dtype=influence.dtype))
     matrix = jnp.where(both, influence, jnp.eye(among.size, dtype=influence.dtype))
     return positive_components(matrix, jnp.where(among, asked, 1.0))[0]
+
+
+def _is_implied(influence, closed):
+    """Which gaps cannot move where some contacts are closed, up to rounding errors."""
+    influence, closed = lax.stop_gradient((influence, closed))
+    columns = jnp.where(closed[:, None], influence, 0.0)
+    matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
+    left = influence - columns.T @ jnp.linalg.solve(matrix, columns)
+    return jnp.diag(left) <= _REST * jnp.diag(influence)
 
 
 def _free_acceleration(system, formulation, projector, t, q, u):

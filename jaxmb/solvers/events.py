@@ -21,6 +21,8 @@ from .manifold_term import AbstractGuards
 
 # A zero is found to this fraction of a step, or in this many evaluations.
 _FRACTION, _EVALUATIONS = 1e-13, 60
+# A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
+_END = 1e-9
 # Where a guard is zero at the start of a step as well, its rise there is looked for down to this power of two.
 _HALVINGS = 30
 
@@ -271,8 +273,9 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, found.error, error_order, before.inner
         )
-        meant = t1 == before.target
-        at_zero = jnp.where(meant, (found.lowest <= found.near) & (found.lowest >= -found.near), found.falling > 0)
+        meant, close = t1 == before.target, (t1 - found.target) <= _END * (t1 - t0)
+        at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
+        at_zero = at_zero | (close & (found.lowest < -found.touch))
         crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
         again, ends = keep & crossed, keep & at_zero & ~crossed
         # The controller inside does not learn of a step that was good but too long.
@@ -283,7 +286,7 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         state = EventState(
             inner,
             target,
-            before.count + ends,
+            before.count + ends.astype(before.count.dtype),
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),
             found.touch,

@@ -59,8 +59,8 @@ def assemble(
     - `system`: a compiled scene, or another system.
     - `guess`: where to start, default the poses and velocities given with the bodies.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
-        of a joint's own; and values of internal states, `{"motor.torque": 2.0}`. Other internal states are those of the
-        guess.
+        of a joint's own; `{"floor.mode": 1}` closes a contact, 0 opens it; and values of internal states,
+        `{"motor.torque": 2.0}`. Other internal states are those of the guess.
     - `rates`: rates that must have these values, by their names or those of their coordinates: `{"crank.angle": 2.0}`
         is `{"crank.angle_rate": 2.0}`, also of a joint's own coordinates, `"hip.angle_rate"`; in space
         `"body.angular_velocity"` (body frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the
@@ -118,6 +118,9 @@ def configuration(
     """
     names = system.coordinate_names()
     q, fixed = prescribe("coordinate", names, {} if fix is None else fix, guess)
+    if system.contacts is not None:
+        # A contact that is open determines its own mode.
+        fixed[np.array(system.contacts.modes)] = False
     if not is_traced(q):
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed)

@@ -1,0 +1,264 @@
+"""Impacts, contacts that close and open, against closed forms: times, heights, forces, energies, derivatives."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.manifold import Projection
+
+G = 9.81
+
+
+def ball(restitution, lower=0.0, **options):
+    return mb.Scene(
+        [planar.Body("ball", mass=2.0, inertia=0.1, position=(0.0, 1.0))],
+        joints=[
+            planar.Prismatic("slide", "ground", "ball", axis=(0.0, 1.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+            mb.Stop("floor", "slide.displacement", lower=lower, restitution=restitution, **options),
+        ],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+
+
+BALL = ball(0.5)
+FALL = np.sqrt(2 / G)
+
+
+def test_bouncing_ball_comes_to_rest():
+    """Twenty impacts, and the sum of all that follow."""
+    motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, saveat=[0.4, 1.0, 1.5, 2.0], rtol=1e-10)
+    events = list(motion.events)
+    impacts = [event for event in events if event.kind != "rest"]
+    k = np.arange(len(impacts))
+    assert len(impacts) >= 18
+    times = FALL * (1 + 2 * np.cumsum(np.append(0.0, 0.5 ** k[1:])))
+    np.testing.assert_allclose([event.time for event in impacts], times, atol=1e-8)
+    np.testing.assert_allclose([event.impulse for event in impacts], 3.0 * G * FALL * 0.5**k, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(sum(event.energy_lost for event in impacts), 2 * G, rtol=1e-9)
+    assert [event.kind for event in events[-2:]] == ["close", "rest"]
+    np.testing.assert_allclose(events[-1].time, 3 * FALL, atol=2e-8)
+    s = 1.0 - 2 * FALL
+    np.testing.assert_allclose(
+        motion["ball"].position[:, 1], [1 - G * 0.4**2 / 2, 0.25 * G * FALL * s - G * s * s / 2, 0.0, 0.0], atol=1e-9
+    )
+    np.testing.assert_allclose(motion.reactions["floor"].force[-1], [0.0, 2 * G], atol=1e-9)
+    assert motion.stats["num_events"] == len(impacts)
+    assert "impact" in str(motion.events)
+
+
+def height(t, restitution, lower, impacts):
+    """Of the ball after a number of impacts."""
+    time, speed = jnp.sqrt(2 * (1 - lower) / G), jnp.sqrt(2 * G * (1 - lower))
+    for k in range(impacts):
+        speed = restitution * speed
+        time = time + (2 * speed / G if k + 1 < impacts else 0.0)
+    return lower + speed * (t - time) - G * (t - time) ** 2 / 2
+
+
+def end(values, t1, **options):
+    system = mb.with_parameters(BALL, {"floor.restitution": values[0], "floor.lower": values[1]})
+    return mb.simulate(system, mb.assemble(BALL), t1=t1, rtol=1e-9, **options)["ball"].position[-1, 1]
+
+
+def test_derivatives_through_impacts():
+    at, t1 = jnp.array([0.8, 0.1]), jnp.array(1.9)
+    exact = lambda values, t1: height(t1, *values, 3)
+    reverse = jit_quickly(jax.value_and_grad(end, argnums=(0, 1)))
+    value, derivatives = reverse(at, t1)
+    np.testing.assert_allclose(value, exact(at, t1), atol=1e-9)
+    for got, known in zip(derivatives, jax.grad(exact, argnums=(0, 1))(at, t1), strict=True):
+        np.testing.assert_allclose(got, known, rtol=1e-7)
+    forward = jit_quickly(jax.jacfwd(end))(at, t1)
+    np.testing.assert_allclose(forward, derivatives[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("options", [{"solver": diffrax.Tsit5()}, {"manifold": Projection()}], ids=["Tsit5", "sparse"])
+def test_other_solvers_and_manifolds(options):
+    at, t1 = jnp.array([0.8, 0.1]), jnp.array(1.9)
+    value, slope = jit_quickly(jax.value_and_grad(lambda at: end(at, t1, **options)))(at)
+    np.testing.assert_allclose(value, height(t1, *at, 3), atol=1e-8)
+    np.testing.assert_allclose(slope, jax.grad(lambda at: height(t1, *at, 3))(at), rtol=1e-6)
+
+
+def test_members_of_a_batch_have_their_own_events():
+    at = jnp.array([[0.0, 0.0], [0.5, 0.0], [0.8, 0.1], [1.0, 0.3]])
+
+    def run(values):
+        system = mb.with_parameters(BALL, {"floor.restitution": values[0], "floor.lower": values[1]})
+        motion = mb.simulate(system, mb.assemble(BALL), t1=1.9, rtol=1e-9)
+        return motion["ball"].position[-1, 1], motion.stats["num_events"], motion.stats["num_steps"]
+
+    together, alone = jit_quickly(jax.vmap(run))(at), jit_quickly(run)
+    for k, values in enumerate(at):
+        for got, known in zip(together, alone(values), strict=True):
+            np.testing.assert_allclose(got[k], known, rtol=1e-12)
+    np.testing.assert_allclose(together[0][2], height(1.9, 0.8, 0.1, 3), atol=1e-9)
+
+
+def test_a_mass_between_two_stops():
+    """Without forces the speed is `restitution` to the number of impacts."""
+    system = mb.Scene(
+        [planar.Body("mass", mass=3.0, inertia=1.0, velocity=(2.0, 0.0))],
+        joints=[
+            planar.Prismatic("slide", "ground", "mass", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+            mb.Stop("ends", "slide.displacement", lower=-0.5, upper=0.5, restitution=0.9),
+        ],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=5.0, rtol=1e-10)
+    times = 0.25 + np.cumsum(np.append(0.0, 0.5 / 0.9 ** np.arange(1, len(motion.events))))
+    assert len(motion.events) > 5
+    np.testing.assert_allclose(motion.events.times, times, atol=1e-9)
+    np.testing.assert_allclose(abs(motion["mass"].velocity[-1, 0]), 2 * 0.9 ** len(times), rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(motion.events.impulses)[:, 0], 6 * 1.9 * 0.9 ** np.arange(len(times)))
+
+
+def test_cradle():
+    """Five balls almost touch: the last one takes all of the velocity of the first."""
+    at = [-0.2, *(0.1 * k + 1e-6 * k for k in range(1, 5))]
+    bodies = [
+        planar.Body(f"b{k}", mass=1.0, inertia=1e-3, position=(x, 0.0), velocity=(float(k == 0), 0.0))
+        for k, x in enumerate(at)
+    ]
+    contacts = [
+        mb.RigidBallContact(f"c{k}", f"b{k}", f"b{k + 1}", radius_a=0.05, radius_b=0.05, restitution=1.0)
+        for k in range(4)
+    ]
+    system = mb.Scene(bodies, joints=contacts).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0, rtol=1e-10)
+    assert [event.part for event in motion.events] == ["c0", "c1", "c2", "c3"]
+    np.testing.assert_allclose([motion[f"b{k}"].velocity[-1, 0] for k in range(5)], [0, 0, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(motion["b4"].position[-1, 0], at[4] + 1.0 - (0.2 + 4e-6), atol=1e-9)
+
+
+def test_a_particle_leaves_a_sphere():
+    """It slides from the top without friction and leaves the sphere at two thirds of its radius above the centre."""
+    start = 0.1
+    system = mb.Scene(
+        [planar.PointMass("p", mass=0.7, position=(np.sin(start), np.cos(start)))],
+        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    state = mb.assemble(system)
+    motion = mb.simulate(system, state, t1=2.0, saveat=diffrax.SaveAt(dense=True), rtol=1e-10)
+    (event,) = motion.events
+    assert event.kind == "open"
+    at = motion.at(event.time)
+    np.testing.assert_allclose(at.q[1], 2 / 3 * np.cos(start), atol=1e-9)
+    # Then it is in free flight.
+    late = motion.at(event.time + 0.2)
+    flight = np.asarray(at.q[:2] + 0.2 * at.u[:2]) + [0.0, -G * 0.02]
+    np.testing.assert_allclose(late.q[:2], flight, atol=1e-9)
+
+
+def test_redundant_contacts_of_a_table():
+    """A table falls flat on four legs: three of the reactions carry it, or two, and the fourth is implied."""
+    table = spatial.Body("table", mass=2.0, inertia=np.diag([0.1, 0.1, 0.15]), position=(0.0, 0.0, 0.5))
+    legs = [(x, y, -0.4) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
+    contacts = [
+        mb.RigidContact(f"leg{k}", "table", terrain=mb.terrain.Flat(), centre=leg) for k, leg in enumerate(legs)
+    ]
+    system = mb.Scene([table], joints=contacts, forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0)
+    assert {event.kind for event in motion.events} == {"close"}
+    np.testing.assert_allclose(motion["table"].position[-1], [0.0, 0.0, 0.4], atol=1e-12)
+    forces = [motion.reactions[f"leg{k}"].force[-1, 2] for k in range(4)]
+    assert np.all(np.array(forces) >= -1e-12)
+    np.testing.assert_allclose(sum(forces), 2 * G, rtol=1e-12)
+    np.testing.assert_allclose(sum(f * leg[0] for f, leg in zip(forces, legs, strict=True)), 0.0, atol=1e-12)
+
+
+def test_a_block_comes_to_rest_on_its_corners():
+    """Its corners strike in turn, infinitely often in a short time; energy is never gained."""
+    block = planar.Body("block", mass=2.0, inertia=0.3, position=(0.0, 0.6), angle=0.05)
+    corners = [
+        mb.RigidContact(name, "block", terrain=mb.terrain.Flat(), centre=(x, -0.4))
+        for name, x in (("left", -0.2), ("right", 0.2))
+    ]
+    system = mb.Scene([block], joints=corners, forces=[mb.Gravity((0.0, -G))]).compile()
+    saveat = np.linspace(0.0, 1.0, 41)
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=saveat, rtol=1e-8)
+    np.testing.assert_allclose(motion["block"].position[-1], [0.0, 0.4], atol=1e-10)
+    assert np.all(np.diff(motion.energy) <= 1e-7) and np.all(np.asarray(motion.events.energy_lost) >= 0)
+    gaps = np.stack([motion[name].gap for name in ("left", "right")])
+    assert np.min(gaps) >= -1e-10
+    forces = [motion.reactions[name].force[-1, 1] for name in ("left", "right")]
+    np.testing.assert_allclose(forces, [G, G], rtol=1e-9)
+
+
+def test_a_rope_tightens():
+    """A free fall until the rope is tight, with the impulse along it."""
+    system = mb.Scene(
+        [planar.PointMass("p", mass=1.5, position=(0.6, 0.0))],
+        joints=[mb.Slack("rope", "ground", "p", length=1.0, restitution=1.0)],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, rtol=1e-10)
+    (event,) = motion.events
+    np.testing.assert_allclose(event.time, np.sqrt(2 * 0.8 / G), atol=1e-10)
+    speed = 0.8 * np.sqrt(2 * G * 0.8)
+    np.testing.assert_allclose(event.impulse, 2 * 1.5 * speed, rtol=1e-9)
+    np.testing.assert_allclose(motion.energy[-1], 0.0, atol=1e-8)
+
+
+def test_a_stop_that_is_only_just_reached():
+    """Steps are long where a spring turns round: the stop is in the middle of one."""
+    system = mb.Scene(
+        [planar.Body("mass", mass=1.0, inertia=1.0, position=(1.0, 0.0))],
+        joints=[
+            planar.Prismatic("slide", "ground", "mass", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+            mb.Stop("end", "slide.displacement", lower=-0.9999, restitution=1.0),
+        ],
+        forces=[mb.JointSpring("spring", "slide.displacement", stiffness=1.0, free=0.0)],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=4.0, rtol=1e-6)
+    (event,) = motion.events
+    np.testing.assert_allclose(event.time, np.arccos(-0.9999), atol=1e-5)
+
+
+def test_motions_that_start_in_contact():
+    closed = mb.assemble(BALL, fix={"floor.mode": 1})
+    np.testing.assert_allclose(closed.q[1], 0.0, atol=1e-15)
+    motion = mb.simulate(BALL, closed, t1=0.1, saveat=[0.0, 0.1])
+    np.testing.assert_allclose(motion.reactions["floor"].force[:, 1], 2 * G)
+    # A motion goes on from a state with its modes.
+    np.testing.assert_allclose(motion["floor"].mode, 1.0)
+    upwards = mb.assemble(BALL, closed, fix={"floor.mode": 0}, rates={"ball.y": 1.0})
+    motion = mb.simulate(BALL, upwards, t1=0.1)
+    np.testing.assert_allclose(motion["ball"].position[-1, 1], 0.1 - G * 0.005, atol=1e-9)
+
+
+def test_refusals():
+    state = mb.assemble(BALL)
+    inside = mb.assemble(BALL, fix={"ball.y": -0.1})
+    with pytest.raises(ValueError, match="inside each other at t0 = 0: floor by 0.1"):
+        mb.simulate(BALL, inside, t1=1.0)
+    with pytest.raises(ValueError, match="Impacts cannot be undone"):
+        mb.simulate(BALL, state, t1=-1.0)
+    with pytest.raises(ValueError, match="max_events must be an integer of at least 1"):
+        mb.simulate(BALL, state, t1=1.0, max_events=0)
+    with pytest.raises(RuntimeError, match="came to t = 1.12.* more impacts and other events of contacts than"):
+        mb.simulate(BALL, state, t1=2.0, max_events=2)
+    with pytest.raises(ValueError, match=r"Partition\(\) or Projection\(\)"):
+        mb.simulate(BALL, state, t1=1.0, manifold=mb.manifold.Baumgarte())
+    pendulum = mb.mechanisms.pendulum()
+    with pytest.raises(ValueError, match="no unilateral constraints"):
+        _ = mb.simulate(pendulum.system, pendulum.state, t1=0.1).events
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"lower": None}, "give lower, upper or both"),
+        ({"upper": -1.0}, "lower must be less than upper"),
+        ({"restitution": 1.5}, "restitution must lie between 0 and 1, got 1.5"),
+        ({"restitution": -0.5}, "restitution must be non-negative"),
+    ],
+)
+def test_bad_stops(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        ball(**({"restitution": 0.5} | wrong))
