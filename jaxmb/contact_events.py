@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from ._types import State
 from .formulations import AbstractFormulation
 from .linalg.jitted import jitted
-from .manifold import contact_guards, equations_of
+from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, OPEN
 
@@ -117,7 +117,7 @@ def contact_events(system: AbstractSystem, formulation: AbstractFormulation, fou
 
 @jitted
 def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
-    guards, field = contact_guards(system, formulation, found.touch), equations_of(system, formulation)
+    guards = contact_guards(system, formulation, found.touch)
     assert guards is not None, "a system without contacts has no events"
     nq, nu = system.nq, system.nu
 
@@ -126,7 +126,7 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
         taken = k < found.number
         flat = jnp.where(taken, flat, found.states[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
-        out = guards.impact(field, jnp.where(taken, t, found.times[0]), y)
+        out = guards.impact(jnp.where(taken, t, found.times[0]), y)
         time = jnp.where(taken, t + out.late, jnp.inf)
         values = out.impulses, out.energy, *out.modes, out.rest
         return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)

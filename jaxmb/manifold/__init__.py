@@ -14,7 +14,6 @@ from .default import Unconstrained as Unconstrained, default_manifold as default
 from .impact import contact_guards as contact_guards
 from .impulse import after_jumps as after_jumps, find_jumps as find_jumps, next_number as next_number
 from .internal_states import (
-    equations_of as equations_of,
     natural_units as natural_units,
     state_blocks as state_blocks,
     with_internal_states as with_internal_states,

@@ -11,12 +11,12 @@ event by that before it is the saltation matrix: P. C. Müller, "Calculation of 
 with discontinuities", Chaos, Solitons & Fractals 5, 1995.
 """
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -38,11 +38,11 @@ from ..system.gaps import (
     with_modes,
 )
 from ..system.residuals import binding_velocities, velocity_rows
+from .constraints import dense, push
 from .impulse import after_impulse
-from .manifold import VectorField
 
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
-_NEAR = 1e3
+_NEAR = 1e2
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e2
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
@@ -70,7 +70,7 @@ class ContactGuards(AbstractGuards):
 
         def forces():
             own = system.at(y)
-            _, multipliers = accelerations(own, self.formulation, t, q, y.u)
+            _, multipliers = _solved(own, self.formulation, t, q, y.u)
             largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(own.force(t, q, y.u)))
             largest = largest + jnp.finfo(q.dtype).tiny
             return multipliers[jnp.array(contacts.rows)] / largest
@@ -79,9 +79,9 @@ class ContactGuards(AbstractGuards):
         held = lax.cond(jnp.any(closed), forces, lambda: jnp.ones_like(free))
         return jnp.where(closed, held, jnp.where(modes == OPEN, free, 1.0))
 
-    def impact(self, field: Callable[[Scalar, State, Any], State], t: Scalar, y: State) -> "Impact":
-        """The event at a state; `field(t, y, None)`: the vector field of the system, of all that y has."""
-        return impact(field, self.system.at(y), self.formulation, self.touch, t, y)
+    def impact(self, t: Scalar, y: State) -> "Impact":
+        """The event at a state."""
+        return impact(self.system.at(y), self.formulation, self.touch, t, y)
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
@@ -103,7 +103,7 @@ def after_jump(term: Any, t: Scalar, y: State) -> State:
     """
     if term.guards is None:
         return after_impulse(term.system, t, y)
-    return term.guards.impact(VectorField(term.system, term.formulation), t, y).after
+    return term.guards.impact(t, y).after
 
 
 class Impact(NamedTuple):
@@ -123,105 +123,195 @@ class Impact(NamedTuple):
     solvable: Bool[Array, ""]
 
 
-def impact(
-    field: Callable[[Scalar, State, Any], State],
-    system: AbstractEquation,
-    formulation: AbstractFormulation,
-    touch: Scalar,
-    t: Scalar,
-    y: State,
-) -> Impact:
+class _Event(NamedTuple):
+    """The numbers of an event, by which its derivative is found as well.
+
+    **Fields:** the time until then, `late`, and which gap is `first`, none where `hits` is false; accelerations before
+    and after; velocities before (`at`) and after (`u`); contacts that are `held` together by the impact, or `low` ones
+    that would bounce lower than can be seen; see `Impact` for the others.
+    """
+
+    late: Float[Array, ""]
+    first: Any
+    hits: Any
+    before: Float[Array, "nu"]
+    after: Float[Array, "nu"]
+    at: Float[Array, "nu"]
+    u: Float[Array, "nu"]
+    held: Bool[Array, "contacts"]
+    low: Bool[Array, "contacts"]
+    impulses: Float[Array, "contacts"]
+    modes: tuple[Float[Array, "contacts"], Float[Array, "contacts"]]
+    rest: Float[Array, "contacts"]
+    energy: Float[Array, ""]
+    solvable: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def impact(system: AbstractEquation, formulation: AbstractFormulation, touch: Scalar, t: Scalar, y: State) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
     The first gap that closes at a rate v is zero later by `τ = −gap / v`, a small time. The state moves on by τ,
-    changes, and moves back by τ with the new equations. So the state after it is right to the third power of τ, and
-    the derivatives are those of a motion whose event time depends on the state.
+    changes, and moves back by τ with the new equations. So the state after it is right to the second power of τ, and
+    the derivative is that of a motion whose event time depends on the state. There is no second derivative.
 
-    **Arguments:** `field(t, y, None)`: the vector field of `system`; `touch`: gaps down to minus this, in units of the
-    system's size, count as zero.
+    **Arguments:** `system`: with the internal states of `y`; `touch`: gaps down to minus this, in units of the system's
+    size, count as zero.
     """
-    contacts, t = contacts_of(system), jnp.asarray(t, y.q.dtype)
-    length = lax.stop_gradient(system.length)
-    modes = lax.stop_gradient(modes_of(system, y.q))
-
-    def moved(carry, at_event):
-        """To the event, and what happens there; or back from it."""
-        y, late, out = carry
-        f, rate = jax.jvp(lambda t, y: field(t, y, None), (t, y), (jnp.ones_like(t), field(t, y, None)))
-        curve = gap_accelerations(system, t, y.q, y.u, f.u)
-        found, hit = _first_zero(system, t, y, modes == OPEN, curve, _NEAR * touch * length)
-        late = jnp.where(at_event, found, -late)
-        y = jax.tree.map(lambda y, f, rate: y + late * f + 0.5 * late**2 * rate, y, f, rate)
-        at = lambda: _at_event(system, formulation, touch * length, t + late, y, modes, hit, lax.stop_gradient(curve))
-        y, out = lax.cond(at_event, at, lambda: (y, out))
-        return (y, jnp.where(at_event, late, -late), out), None
-
-    none = jnp.zeros(len(contacts.names), y.q.dtype)
-    start = y, jnp.zeros_like(t), (none, none, none, jnp.zeros_like(t), jnp.array(True))
-    # A loop, so that the field is compiled once.
-    (after, late, out), _ = lax.scan(moved, start, jnp.array([True, False]))
-    impulses, new, rest, energy, solvable = out
-    return Impact(after, late, impulses, (modes, new), rest, energy, solvable)
+    t = jnp.asarray(t, y.q.dtype)
+    after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype))
+    event = lax.stop_gradient(event)
+    return Impact(after, event.late, event.impulses, event.modes, event.rest, event.energy, event.solvable)
 
 
-def _first_zero(system, t, y, is_open, curve, near):
-    """The time after which the first open gap is zero, zero where none is about to close; and which one it is."""
-    gap, closing = gaps(system, t, y.q), gap_rates(system, t, y.q, y.u)
-    about_to = lax.stop_gradient(is_open & (gap <= near) & (closing < 0))
-    first = jnp.argmin(jnp.where(about_to, -lax.stop_gradient(gap / closing), jnp.inf))
-    any_one = about_to[first]
-    g, v, a = (jnp.where(any_one, x[first], instead) for x, instead in ((gap, 0.0), (closing, -1.0), (curve, 0.0)))
-    return -g / v - 0.5 * a * g**2 / v**3, about_to & (jnp.arange(gap.size) == first)
+@eqx.filter_custom_jvp
+def _impact(system, t, y, formulation, touch):
+    event = _event(system, formulation, touch * system.length, t, y)
+    q = with_modes(system, y.q, event.modes[1])
+    # Velocities move on before the event, and back after it.
+    before, after = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    z = y.z
+    if z is not None:
+        z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
+    return State(q + event.late * (before - after), event.u - event.late * event.after, z), event
 
 
-def _at_event(system, formulation, touch, t, y, modes, hit, free):
-    """The state after an event that happens at a state, with impulses, modes, times of rest, the energy lost, and
-    whether the problems had a solution.
+@_impact.def_jvp
+def _impact_jvp(primals, tangents):
+    system, t, y, *_ = primals
+    dsystem, dt, dy, *_ = tangents
+    after, event = _impact(*primals)
+    _, fixed = _without_second_derivative((system, t, y, event))
+    system, t, y, event = fixed
+    contacts, zero = contacts_of(system), jnp.zeros_like(t)
+    dq, du = dense(dy.q, y.q), dense(dy.u, y.u)
+    dt = zero if dt is None else dt
 
-    **Arguments:** `touch` [m, rad]; `modes` before; which contact is `hit`; `free`: second derivatives of gaps before.
-    """
-    contacts, q = contacts_of(system), y.q
-    touching = (modes != OPEN) | hit | (gaps(system, t, q) <= touch)
-    open_q = with_modes(system, q, OPEN)
-    inertia = system.inertia(t, open_q, y.u)
-    rows = gap_gradients(system, t, q, y.u)
-    jacobian = binding_velocities(system, t, open_q, y.u).selected(system.velocity_rank, system.velocity_scale())
+    # The time of the event changes, and so do time and state there, with the equations before it.
+    gap = push(gaps, (system, t, y.q), (dsystem, dt, dq))[event.first]
+    rate = jnp.where(event.hits, gap_rates(system, t, y.q, event.at)[event.first], 1.0)
+    dlate = jnp.where(event.hits, -gap / rate, 0.0)
+    q = with_modes(system, y.q, event.modes[1])
+    rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
+
+    # Of the impact `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held together are known.
+    held = with_modes(system, y.q, jnp.where(event.held, CLOSED, OPEN).astype(q.dtype))
+    jacobian = binding_velocities(system, t, held, event.u).selected(system.velocity_rank, system.velocity_scale())
+    projector = jacobian.projector(system.inertia(t, held, event.u))
+    change = event.u - event.at
+    _, multipliers = projector.solve(jnp.zeros_like(change), jacobian.product(change))
+
+    def equations(system, t, q, u):
+        unmet = velocity_rows(system, t, q, event.u)
+        bounce = contacts_of(system).restitution * jnp.maximum(-gap_rates(system, t, q, u), 0.0)
+        bounce = jnp.where(event.held & ~event.low, bounce, 0.0)
+        rows = unmet.at[np.array(contacts.rows)].add(-bounce)
+        force = system.inertia(t, q, u).product(event.u - u)
+        return rows, force - system.constraint_force(t, q, event.u, multipliers)
+
+    rows, forces = push(equations, (system, t, held, event.at), (dsystem, dt, dq, du))
+    du, _ = projector.solve(-forces, -rows)
+    dq, du = dq - dlate * rates[1], du - dlate * event.after
+    dq = jnp.where(_are_modes(system), 0.0, dq)
+    dz = None
+    if y.z is not None:
+        jump = system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u)
+        dz = dense(dy.z, y.z) + dlate * jump
+    return (after, event), (State(dq, du, dz), jax.tree.map(lambda _: None, event))
+
+
+def _are_modes(system):
+    """A mask of the modes in q."""
+    return np.isin(np.arange(system.nq), contacts_of(system).modes)
+
+
+@eqx.filter_custom_jvp
+def _without_second_derivative(x):
+    return None, x
+
+
+@_without_second_derivative.def_jvp
+def _without_jvp(primals, tangents):
+    raise ValueError(
+        "Second derivatives through impacts are not supported: their times and states have first derivatives only."
+    )
+
+
+def _event(system, formulation, touch, t, y) -> _Event:
+    """An event at a state; `touch` [m, rad]."""
+    contacts, q, u = contacts_of(system), y.q, y.u
+    modes, open_q = modes_of(system, q), with_modes(system, q, OPEN)
+    inertia = system.inertia(t, open_q, u)
+    rows = gap_gradients(system, t, q, u)
+    jacobian = binding_velocities(system, t, open_q, u).selected(system.velocity_rank, system.velocity_scale())
     projector = jacobian.projector(inertia)
     none = jnp.zeros(system.acceleration_rows, q.dtype)
     # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
     # change that these constraints ask for themselves.
-    unmet = -velocity_rows(system, t, open_q, y.u)
+    unmet = -velocity_rows(system, t, open_q, u)
     forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
     asked = jnp.concatenate([jnp.tile(none, (len(rows), 1)), unmet[None]])
     moves = jax.vmap(lambda force, rows: projector.solve(force, rows)[0])(forces, asked)
-    moves, unbound = moves[:-1], y.u + moves[-1]
+    moves, jump = moves[:-1], moves[-1]
     influence = rows @ moves.T
 
-    before = gap_rates(system, t, q, y.u)
-    bounce = contacts.restitution * jnp.maximum(-before, 0.0)
-    impulses, _, solvable = _complementary(influence, before + rows @ (unbound - y.u) - bounce, touching)
-    struck = unbound + impulses @ moves
-    udot = _free_acceleration(system, formulation, projector, t, open_q, struck)
-    opening, rate = gap_accelerations(system, t, q, struck, udot), gap_rates(system, t, q, struck)
-    sizes = jnp.abs(rows) @ (jnp.abs(struck) + jnp.abs(y.u))
+    def accelerated(u):
+        """Accelerations with open contacts, and those of the gaps."""
+        udot = _free_acceleration(system, formulation, projector, t, open_q, u)
+        return udot, gap_accelerations(system, t, q, u, udot)
+
+    # What is next, of the equations before.
+    udot, opening = accelerated(u)
+    before = udot + solved_components(influence, opening, modes == CLOSED) @ moves
+    gap, closing = gaps(system, t, q), gap_rates(system, t, q, u)
+    about_to = (modes == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
+    first = jnp.argmin(jnp.where(about_to, -gap / closing, jnp.inf))
+    hits = about_to[first]
+    late = jnp.where(hits, -gap[first] / jnp.where(hits, closing[first], 1.0), 0.0)
+    u = u + late * before
+
+    touching = (modes != OPEN) | (about_to & (jnp.arange(gap.size) == first)) | (gap + late * closing <= touch)
+    at = gap_rates(system, t, q, u)
+    bounce = contacts.restitution * jnp.maximum(-at, 0.0)
+    impulses, held, solvable = _complementary(influence, at + rows @ jump - bounce, touching)
+    struck = u + jump + impulses @ moves
+    rate = gap_rates(system, t, q, struck)
+    udot, opening = accelerated(struck)
+    sizes = jnp.abs(rows) @ (jnp.abs(struck) + jnp.abs(u))
     staying = touching & (rate <= _REST * sizes)
     # Contacts that would open by less than can be seen, before they close again, stay closed.
     falls = jnp.where(opening < 0, -opening, 1.0)
     low = touching & ~staying & (opening < 0) & (rate**2 <= 2 * falls * _BOUNCE * touch) & (contacts.restitution < 1)
-    staying = staying | lax.stop_gradient(low)
-    lost = jnp.where(jnp.any(low), solved_components(influence, rate, _independent(influence, staying)), 0.0)
-    u, impulses = struck + lost @ moves, impulses + lost
+    staying, held = staying | low, held | low
+    held = held & _independent(influence, held)
+    lost = jnp.where(jnp.any(low), solved_components(influence, jnp.where(staying, rate, 0.0), held & staying), 0.0)
+    after, impulses = struck + lost @ moves, impulses + lost
     # Each bounce takes `restitution` times the time of the one before.
-    bounces = lax.stop_gradient(low & (bounce > 0))
+    bounces = low & (bounce > 0)
     ratio = jnp.where(bounces, contacts.restitution, 0.0)
     rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
-    _, closed, held = _complementary(influence, opening, staying)
-    implied = staying & ~closed & _is_implied(influence, closed)
-    new = lax.stop_gradient(jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))).astype(q.dtype)
 
-    after = dataclasses.replace(y, q=with_modes(system, q, new), u=u)
-    energy = 0.5 * (jnp.dot(y.u, inertia.product(y.u)) - jnp.dot(u, inertia.product(u)))
-    return after, (impulses, new, lax.stop_gradient(rest), energy, solvable & held)
+    forces, closed, stays = _complementary(influence, opening, staying)
+    implied = staying & ~closed & _is_implied(influence, closed)
+    new = jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN)).astype(q.dtype)
+    energy = 0.5 * (jnp.dot(u, inertia.product(u)) - jnp.dot(after, inertia.product(after)))
+    return _Event(
+        late=late,
+        first=first,
+        hits=hits,
+        before=before,
+        after=udot + forces @ moves,
+        at=u,
+        u=after,
+        held=held,
+        low=low,
+        impulses=impulses,
+        modes=(modes, new),
+        rest=rest,
+        energy=energy,
+        solvable=solvable & stays,
+    )
 
 
 def _independent(influence, among):
@@ -245,10 +335,22 @@ def _is_implied(influence, closed):
 
 def _free_acceleration(system, formulation, projector, t, q, u):
     """The accelerations at coordinates with open contacts, where the projector on the other constraints is known."""
-    if system.ideal and system.acceleration_rows == system.velocity_rows:
-        gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-        return projector.solve(system.force(t, q, u), gamma)[0]
-    return accelerations(system, formulation, t, q, u)[0]
+    if not system.ideal_on_velocities:
+        return accelerations(system, formulation, t, q, u)[0]
+    return _by_projector(system, projector, t, q, u)[0]
+
+
+def _solved(system, formulation, t, q, u):
+    """Accelerations and multipliers at a state, without a search for pivots where that is possible."""
+    if not system.ideal_on_velocities:
+        return accelerations(system, formulation, t, q, u)
+    jacobian = system.structured_jacobian(t, q, u).selected(system.acceleration_rank, system.velocity_scale())
+    return _by_projector(system, jacobian.projector(system.inertia(t, q, u)), t, q, u)
+
+
+def _by_projector(system, projector, t, q, u):
+    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
+    return projector.solve(system.force(t, q, u), gamma)
 
 
 def _complementary(influence, free, among):

@@ -13,10 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..formulations import AbstractFormulation
 from ..solvers import AbstractManifoldTerm, Block
-from ..system import AbstractEquation, AbstractSystem
-from .manifold import VectorField
+from ..system import AbstractSystem
 
 
 def with_internal_states(term: Any) -> Any:
@@ -26,12 +24,6 @@ def with_internal_states(term: Any) -> Any:
     if equation.system.nz == 0:
         return term
     return StatefulTerm(term) if field is None else diffrax.ODETerm(StatefulField(field))
-
-
-def equations_of(system: AbstractEquation, formulation: AbstractFormulation) -> Any:
-    """The vector field of a system, with its internal states if it has any."""
-    field = VectorField(system, formulation)
-    return StatefulField(field) if system.nz else field
 
 
 def _at(equation, y):
@@ -102,7 +94,7 @@ class StatefulTerm(AbstractManifoldTerm):
 
     def after_jump(self, t, y, args):
         if self.guards is not None:
-            return self.guards.impact(equations_of(self.system, self.term.formulation), t, y).after
+            return self.guards.impact(t, y).after
         after = self.term.after_jump(t, _mechanical(y), args)
         return State(after.q, after.u, y.z)
 

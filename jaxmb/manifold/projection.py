@@ -23,7 +23,6 @@ from .constraints import RestoredState, SolvedState, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impact import ContactGuards, after_jump, contact_guards
 from .impulse import after_impulse
-from .internal_states import equations_of
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
@@ -278,4 +277,4 @@ class ProjectedSolver(WrappedSolver):
     def _after_jump(self, t, y):
         if self.guards is None:
             return after_impulse(self.system, t, y)
-        return self.guards.impact(equations_of(self.system, self.guards.formulation), t, y).after
+        return self.guards.impact(t, y).after
