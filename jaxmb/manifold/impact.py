@@ -151,9 +151,9 @@ class _Event(NamedTuple):
 def impact(system: AbstractEquation, formulation: AbstractFormulation, touch: Scalar, t: Scalar, y: State) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
-    The first gap that closes at a rate v is zero later by `τ = −gap / v`, a small time. The state moves on by τ,
-    changes, and moves back by τ with the new equations. So the state after it is right to the second power of τ, and
-    the derivative is that of a motion whose event time depends on the state. There is no second derivative.
+    The first gap that closes is zero later by a small time τ. The state moves on by τ, changes, and moves back by τ
+    with the new equations. So the state after it is right to the second power of τ, and the derivative is that of a
+    motion whose event time depends on the state. There is no second derivative.
 
     **Arguments:** `system`: with the internal states of `y`; `touch`: gaps down to minus this, in units of the system's
     size, count as zero.
@@ -168,8 +168,9 @@ def impact(system: AbstractEquation, formulation: AbstractFormulation, touch: Sc
 def _impact(system, t, y, formulation, touch):
     event = _event(system, formulation, touch * system.length, t, y)
     q = with_modes(system, y.q, event.modes[1])
-    # Velocities move on before the event, and back after it.
-    before, after = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    # The state moves on before the event, and back after it, each at the mean velocity.
+    before = system.rates(t, y.q, event.at - 0.5 * event.late * event.before)
+    after = system.rates(t, q, event.u - 0.5 * event.late * event.after)
     z = y.z
     if z is not None:
         z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
@@ -266,9 +267,12 @@ def _event(system, formulation, touch, t, y) -> _Event:
     before = udot + solved_components(influence, opening, modes == CLOSED) @ moves
     gap, closing = gaps(system, t, q), gap_rates(system, t, q, u)
     about_to = (modes == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
-    first = jnp.argmin(jnp.where(about_to, -gap / closing, jnp.inf))
+    # The first zero of a parabola.
+    curve = gap_accelerations(system, t, q, u, before)
+    until = 2 * gap / (jnp.sqrt(jnp.maximum(closing**2 - 2 * curve * gap, 0.0)) + jnp.where(about_to, -closing, 1.0))
+    first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
     hits = about_to[first]
-    late = jnp.where(hits, -gap[first] / jnp.where(hits, closing[first], 1.0), 0.0)
+    late = jnp.where(hits, until[first], 0.0)
     u = u + late * before
 
     touching = (modes != OPEN) | (about_to & (jnp.arange(gap.size) == first)) | (gap + late * closing <= touch)
@@ -281,8 +285,9 @@ def _event(system, formulation, touch, t, y) -> _Event:
     sizes = jnp.abs(rows) @ (jnp.abs(struck) + jnp.abs(u))
     staying = touching & (rate <= _REST * sizes)
     # Contacts that would open by less than can be seen, before they close again, stay closed.
-    falls = jnp.where(opening < 0, -opening, 1.0)
-    low = touching & ~staying & (opening < 0) & (rate**2 <= 2 * falls * _BOUNCE * touch) & (contacts.restitution < 1)
+    curve = opening + influence @ _complementary(influence, opening, staying)[0]
+    falls = jnp.where(curve < 0, -curve, 1.0)
+    low = touching & ~staying & (curve < 0) & (rate**2 <= 2 * falls * _BOUNCE * touch) & (contacts.restitution < 1)
     staying, held = staying | low, held | low
     held = held & _independent(influence, held)
     lost = jnp.where(jnp.any(low), solved_components(influence, jnp.where(staying, rate, 0.0), held & staying), 0.0)

@@ -177,9 +177,9 @@ class RigidPlaneContact(AbstractGeometricContact, AbstractPair):
 
     The plane has no end, and the ball is always on the side to which the normal points.
 
-    **Arguments:** `point_a` [m] of the plane; `normal_a`, its normal, fixed in `body_a`, or `normal` in the world at
-    the given poses; `point_b` [m], the centre, fixed in `body_b`; `radius` [m] ≥ 0, default 0; `restitution` from 0 to
-    1, default 0.
+    **Arguments:** `point_a` [m] of the plane and `point_b` [m], the centre, body-fixed, default the origins of the
+    frames; `normal_a`, the plane's normal, fixed in `body_a`, or `normal` in the world at the given poses; `radius` [m]
+    ≥ 0, default 0; `restitution` from 0 to 1, default 0.
     """
 
     point_a: fields.Number = fields.point(body=0, default="origin")

@@ -18,8 +18,9 @@ from ..formulations import AbstractFormulation
 from ..linalg.arrays import as_array, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
-from ..solvers import AbstractMultistep, Adams, EventController, MultistepController, RunningScales
+from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
 from ..solvers.closures import opened
+from ..solvers.events import EventController
 from ..solvers.one_step import OneStepController
 from ..system import AbstractSystem
 from ..system.parameters import parameters

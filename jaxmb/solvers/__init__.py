@@ -16,12 +16,7 @@ from .evaluation import (
     ravel as ravel,
     unravel_like as unravel_like,
 )
-from .events import (
-    EventController as EventController,
-    EventState as EventState,
-    crossing as crossing,
-    events_found as events_found,
-)
+from .events import crossing as crossing, events_found as events_found
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
 from .manifold_term import (
     AbstractFieldJacobian as AbstractFieldJacobian,

@@ -6,7 +6,7 @@ that ends at a zero is followed by a restart, as after a jump; what changes ther
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -19,6 +19,11 @@ from .controller import AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 # A zero is found to this fraction of a step, or in this many evaluations.
 _FRACTION, _EVALUATIONS = 1e-13, 60
 # A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
@@ -27,7 +32,13 @@ _END = 1e-9
 _HALVINGS = 30
 
 
-class Crossing(NamedTuple):
+class AbstractErrorWithMore(eqx.Module):
+    """What a solver returns as its `y_error` that holds more than an `error` estimate."""
+
+    error: AbstractVar[PyTree]
+
+
+class Crossing(AbstractErrorWithMore):
     """What a solver tells an `EventController`, as its `y_error`.
 
     **Fields:** the `error` for the controller inside; the `target`: the time of the first zero in the step; one where a
@@ -45,14 +56,15 @@ class Crossing(NamedTuple):
 
 
 def error_of(y_error: Any) -> PyTree:
-    """The error estimate in what a solver returns, which may be a `Crossing`."""
-    # A concrete class, which alone holds another error.
-    return y_error.error if isinstance(y_error, Crossing) else y_error
+    """The error estimate in what a solver returns as its error."""
+    return y_error.error if isinstance(y_error, AbstractErrorWithMore) else y_error
 
 
-def with_error(y_error: Any, error: PyTree) -> Any:
-    """The same with another error estimate."""
-    return y_error._replace(error=error) if isinstance(y_error, Crossing) else error
+def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
+    """What a solver returns as its error, with a function of the error estimate in it."""
+    if not isinstance(y_error, AbstractErrorWithMore):
+        return function(y_error)
+    return eqx.tree_at(lambda y_error: y_error.error, y_error, function(y_error.error), is_leaf=lambda x: x is None)
 
 
 # What the search in a step looks for: whether there is a zero in it, the least value of a guard, a point before the
@@ -234,7 +246,7 @@ class EventState(AbstractControllerState):
 class EventController(diffrax.AbstractAdaptiveStepSizeController):
     """A controller around another one, whose steps end at events; at most `most` of them.
 
-    Too many events end the solve with `diffrax.RESULTS.event_occurred`.
+    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`.
     """
 
     controller: Any
@@ -292,7 +304,7 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
             found.touch,
         )
         full = ends & (before.count >= self.most)
-        result = diffrax.RESULTS.where(full, diffrax.RESULTS.event_occurred, result)
+        result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
         return keep & ~crossed, next_t0, next_t1, made_jump | ends, state, result
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from .._compat import WrappedSolver, with_loops
 from .controller import AbstractControllerState
 from .evaluation import ravel, unravel_like
-from .events import error_of, with_error
+from .events import error_of, map_error
 from .multistep import AbstractMultistep
 from .scales import RunningScales
 from .tangent import Tangent, TangentControl, pushed, pushed_only
@@ -57,11 +57,12 @@ class WithTangents(WrappedSolver):
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
         for tangent, (dy1, derror, _, memory, _) in zip(before, along, strict=True):
-            w, derror = ravel(dy1), error_of(derror)
+            w = ravel(dy1)
             tangents.append(Tangent(w, memory, jnp.maximum(tangent.peak, self.control.largest(w))))
-            errors.append(ravel(derror) / self.control.scale(self.rtol, tangent, w))
-        with_errors = with_error(error, ErrorWithTangents(error_of(error), errors))
-        return y1, with_errors, dense_info, (state, tangents), result
+            scale = self.control.scale(self.rtol, tangent, w)
+            errors.append(ravel(error_of(derror)) / scale)
+        error = map_error(lambda of_state: ErrorWithTangents(of_state, errors), error)
+        return y1, error, dense_info, (state, tangents), result
 
 
 def _step_from(solver, t0, t1, args, made_jump, terms, y0, state):

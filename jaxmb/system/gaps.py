@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._types import Coordinates, Scalar, Velocities
 from .equation import AbstractEquation, Contacts
@@ -21,6 +21,11 @@ def contacts_of(system: AbstractEquation) -> Contacts:
 def modes_of(system: AbstractEquation, q: Coordinates) -> Float[Array, "contacts"]:
     """The modes of the contacts in some coordinates, whole numbers."""
     return jnp.round(q[np.array(contacts_of(system).modes)])
+
+
+def are_open(system: AbstractEquation, q: Coordinates) -> Bool[Array, "contacts"]:
+    """Which contacts are open; of a system without any, none is asked."""
+    return jnp.zeros(0, bool) if system.contacts is None else modes_of(system, q) == OPEN
 
 
 def with_modes(system: AbstractEquation, q: Coordinates, modes: ArrayLike) -> Float[Array, "nq"]:

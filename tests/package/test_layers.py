@@ -20,6 +20,7 @@ LAYERS = [
     ["manifold"],
     ["states"],
     ["bodies", "lagrangian"],
+    ["contact_events"],
     ["trajectory"],
     ["simulate"],
     ["studies", "viz", "mechanisms", "importers"],

@@ -13,6 +13,7 @@ from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem, parameters
+from ...system.gaps import are_open, contacts_of
 from ...system.quantities import component_names, directions
 from .linear_equations import LinearEquations, linear_equations
 from .linearisation import Linearisation
@@ -72,7 +73,8 @@ def linearise(
 
     **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
     constraints, is singular, is no equilibrium or steady motion, with the accelerations that remain; for a motion whose
-    linear equations change with time; and for inputs that move joints. Under a trace the result is NaN instead.
+    linear equations change with time; for contacts that are closed; and for inputs that move joints. Under a trace the
+    result is NaN instead.
     """
     check_system("linearise", system)
     state = checked_guess("linearise", system, state)
@@ -82,11 +84,18 @@ def linearise(
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
+    opens = are_open(system, state.q)
+    if not is_traced(opens) and not np.all(opens):
+        closed = [name for name, is_open in zip(contacts_of(system).names, opens, strict=True) if not is_open]
+        raise ValueError(
+            f"linearise: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
+            "joints."
+        )
     found = linear_equations(system, t, state, names, chosen, observed)
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
     matrices = found.A, found.B, found.C, found.D
     if is_traced((matrices, found.ok)):
-        matrices = nan_where(~found.ok, matrices, (system, state, t))
+        matrices = nan_where(~(found.ok & jnp.all(opens)), matrices, (system, state, t))
     elif not found.ok:
         raise ValueError(_refusal(system, t, state, names, found, labels))
     return Linearisation(

@@ -1,0 +1,61 @@
+"""Every unilateral constraint by itself: its gap, the derivatives of it, its force, its numbers, its words."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from every_contact import CONTACTS, system_of
+
+import jaxmb as mb
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.system import gaps as of
+from jaxmb.system.residuals import displaced
+
+
+@pytest.mark.parametrize("name", CONTACTS)
+def test_gap_and_its_derivatives(name):
+    """Rates and second derivatives are those of the gap along a motion; the row of a closed contact is its gradient."""
+    system = system_of(name)
+    state = mb.assemble(system)
+    t, q, u = jnp.zeros(()), state.q, state.u
+    gap = of.gaps(system, t, q)
+    assert gap.shape == (1,) and gap[0] > 0 and system.contacts.names == ("c",)
+
+    @jax.jit
+    def ahead(s):
+        q_s = displaced(system, t, q, s * u)
+        return of.gaps(system, t, q_s)[0], of.gap_rates(system, t, q_s, u)[0]
+
+    h = 1e-5
+    slope = [(a - b) / (2 * h) for a, b in zip(ahead(h), ahead(-h), strict=True)]
+    np.testing.assert_allclose(of.gap_rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
+    none = jnp.zeros_like(u)
+    np.testing.assert_allclose(of.gap_accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
+    gradient = of.gap_gradients(system, t, q, u)
+    np.testing.assert_allclose(gradient @ u, of.gap_rates(system, t, q, u), rtol=1e-12, atol=1e-15)
+    closed = of.with_modes(system, q, of.CLOSED)
+    rows = system.jacobian(t, closed, u)[np.array(system.contacts.rows)]
+    np.testing.assert_allclose(rows, gradient, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["Stop in the plane", "RigidContact in space", "RigidBallContact"])
+def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
+    system = system_of(name)
+    state = mb.assemble(system)
+    t, u = jnp.zeros(()), jnp.zeros_like(state.u)
+    at = lambda mode: accelerations(system, Multipliers(), t, of.with_modes(system, state.q, mode), u)
+    (free, none), (held, forces) = at(of.OPEN), at(of.CLOSED)
+    (row,) = system.contacts.rows
+    assert none[row] == 0
+    left = of.gap_accelerations(system, t, state.q, u, held)
+    np.testing.assert_allclose(left, 0.0, atol=1e-12)
+    assert (forces[row] > 0) == (of.gap_accelerations(system, t, state.q, u, free)[0] < 0)
+
+
+@pytest.mark.parametrize("name", CONTACTS)
+def test_words_and_numbers(name):
+    system = system_of(name)
+    text = str(system.describe())
+    assert "contacts" in text and "where closed 1 row each" in text
+    assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
+    assert mb.with_parameters(system, {"c.restitution": 0.5}).contacts.restitution == 0.5

@@ -1,0 +1,73 @@
+"""Every unilateral constraint in a small scene, where it is open."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.parts import AbstractGeometricContact, fields, terrain
+
+
+def _body_2d(name, x=0.4, y=0.9):
+    moving = {"velocity": (0.5, -0.7), "angular_velocity": 0.6}
+    return planar.Body(name, mass=1.5, inertia=0.2, position=(x, y), angle=0.2, **moving)
+
+
+def _body_3d(name, x=0.4, z=0.9):
+    moving = {"velocity": (0.5, 0.2, -0.7), "angular_velocity": (0.6, -0.3, 0.2)}
+    return spatial.Body(name, mass=1.5, inertia=(0.2, 0.25, 0.3), position=(x, 0.1, z), **moving)
+
+
+class InsideBowl(AbstractGeometricContact):
+    """A user's own contact: a point stays inside a ball around the origin."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    radius: fields.Number = fields.length(sign="positive")
+    point: fields.Number = fields.point(body=0, default="origin")
+
+    def gap(self, space, poses):
+        x = space.point(poses[0], self.point)
+        return (self.radius**2 - jnp.dot(x, x)) / (2 * self.radius)
+
+
+_GROUND = {"terrain": terrain.Bump(start=0.0, length=2.0, peak=0.2), "radius": 0.1}
+_PIN = planar.Revolute("pin", "ground", "link", point=(0.0, 0.5))
+_HINGE = spatial.Revolute("pin", "ground", "link", point=(0.0, 0.1, 0.5), axis=(0.0, 1.0, 0.0))
+# Parts with their bodies and with other joints.
+CONTACTS = {
+    "Stop in the plane": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.0), [_body_2d("link")], [_PIN]),
+    "Stop in space": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.5), [_body_3d("link")], [_HINGE]),
+    "Stop at one end": (mb.Stop("c", "pin.angle", upper=2.0), [_body_2d("link")], [_PIN]),
+    "RigidContact in the plane": (mb.RigidContact("c", "a", centre=(0.1, 0.2), **_GROUND), [_body_2d("a")], []),
+    "RigidContact in space": (mb.RigidContact("c", "a", centre=(0.1, 0.2, 0.0), **_GROUND), [_body_3d("a")], []),
+    "RigidBallContact": (
+        mb.RigidBallContact("c", "a", "b", radius_a=0.1, radius_b=0.2, point_a=(0.1, 0.0), point_b=(0.0, 0.1)),
+        [_body_2d("a"), _body_2d("b", x=1.5)],
+        [],
+    ),
+    "RigidBallContact in space": (
+        mb.RigidBallContact("c", "ground", "a", radius_a=0.1, radius_b=0.2, point_b=(0.1, 0.0, 0.1)),
+        [_body_3d("a")],
+        [],
+    ),
+    "RigidPlaneContact": (
+        mb.RigidPlaneContact("c", "a", "b", normal=(0.0, 1.0), point_b=(0.1, 0.0), radius=0.1),
+        [_body_2d("a", y=0.0), _body_2d("b")],
+        [],
+    ),
+    "RigidPlaneContact in space": (
+        mb.RigidPlaneContact("c", "a", "b", normal=(0.0, 0.6, 0.8), point_b=(0.1, 0.0, 0.0)),
+        [_body_3d("a", z=0.0), _body_3d("b")],
+        [],
+    ),
+    "Slack": (mb.Slack("c", "a", "b", length=2.0, point_a=(0.1, 0.2)), [_body_2d("a"), _body_2d("b", x=1.5)], []),
+    "Slack in space": (mb.Slack("c", "ground", "a", length=2.0), [_body_3d("a")], []),
+    "a contact of a user": (InsideBowl("c", "a", radius=3.0, point=(0.1, 0.0)), [_body_2d("a")], []),
+}
+
+
+def system_of(name):
+    part, bodies, joints = CONTACTS[name]
+    down = (0.0, -9.81) if isinstance(bodies[0], planar.Body) else (0.0, 0.0, -9.81)
+    return mb.Scene(bodies, joints=[*joints, part], forces=[mb.Gravity(np.array(down))]).compile()
