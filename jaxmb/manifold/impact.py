@@ -44,7 +44,7 @@ from .impulse import after_impulse
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
 _NEAR = 1e2
 # A contact closes where it would bounce no higher than this multiple of it.
-_BOUNCE = 1e2
+_BOUNCE = 1e3
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
 _REST = 1e-9
 

@@ -166,7 +166,7 @@ def simulate(
 
     Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open at events, at which a step ends: `Trajectory.events`
     lists them. An event is found to a thousandth of `rtol`, relative to the size of the system; bounces that are lower
-    than a tenth of `rtol` are left out, and the contact stays closed. Derivatives are those of a motion whose events
+    than `rtol` are left out, and the contact stays closed. Derivatives are those of a motion whose events
     move with the parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
 

@@ -32,7 +32,7 @@ FALL = np.sqrt(2 / G)
 @pytest.mark.always
 def test_bouncing_ball_comes_to_rest():
     """Twenty impacts, and the sum of all that follow."""
-    motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, saveat=[0.4, 1.0, 1.5, 2.0], rtol=1e-10)
+    motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, saveat=[0.4, 1.0, 1.5, 2.0], rtol=1e-12)
     events = list(motion.events)
     impacts = [event for event in events if event.kind != "rest"]
     k = np.arange(len(impacts))
