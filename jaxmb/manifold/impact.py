@@ -174,7 +174,9 @@ def _impact(system, t, y, formulation, touch):
     z = y.z
     if z is not None:
         z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
-    return State(q + event.late * (before - after), event.u - event.late * event.after, z), event
+    # Without a solution the motion ends here.
+    u = jnp.where(event.solvable, event.u - event.late * event.after, jnp.nan)
+    return State(q + event.late * (before - after), u, z), event
 
 
 @_impact.def_jvp
