@@ -184,11 +184,9 @@ def _impact_jvp(primals, tangents):
     system, t, y, *_ = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
-    _, fixed = _without_second_derivative((system, t, y, event))
-    system, t, y, event = fixed
-    contacts, zero = contacts_of(system), jnp.zeros_like(t)
-    dq, du = dense(dy.q, y.q), dense(dy.u, y.u)
-    dt = zero if dt is None else dt
+    system, t, y, event = _without_second_derivative((system, t, y, event))
+    contacts = contacts_of(system)
+    dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
 
     # The time of the event changes, and so do time and state there, with the equations before it.
     gap = push(gaps, (system, t, y.q), (dsystem, dt, dq))[event.first]
@@ -231,7 +229,7 @@ def _are_modes(system):
 
 @eqx.filter_custom_jvp
 def _without_second_derivative(x):
-    return None, x
+    return x
 
 
 @_without_second_derivative.def_jvp
