@@ -1,5 +1,7 @@
 """Impacts, contacts that close and open, against closed forms: times, heights, forces, energies, derivatives."""
 
+import dataclasses
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -83,6 +85,31 @@ def test_forward_mode_is_reverse_mode_through_impacts():
     at = jnp.array([0.7, 0.05])
     forward, reverse = (jit_quickly(mode(lambda at: end(at, 2.0)))(at) for mode in (jax.jacfwd, jax.grad))
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+
+
+@pytest.mark.long
+def test_derivatives_through_closing_sliding_and_opening():
+    """A particle falls on a sphere, slides down and leaves it: both modes, and differences of a tighter solution."""
+    system = mb.Scene(
+        [planar.PointMass("p", mass=0.7, position=(0.3, 1.3))],
+        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    start = mb.assemble(system)
+
+    def run(at, rtol=1e-10):
+        changed = mb.with_parameters(system, {"sphere.radius_a": at[0]})
+        state = dataclasses.replace(start, q=start.q.at[0].set(at[1]))
+        motion = mb.simulate(changed, state, t1=0.9, rtol=rtol, max_steps=400, max_events=16)
+        return motion.ys.q[-1, 0] + 2 * motion.ys.q[-1, 1]
+
+    at, h = jnp.array([1.0, 0.3]), 1e-4
+    reverse, forward = (jit_quickly(mode(run))(at) for mode in (jax.grad, jax.jacfwd))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    value = jit_quickly(lambda at: run(at, 1e-12))
+    for k, step in enumerate(h * jnp.eye(2)):
+        near, far = (value(at + m * step) - value(at - m * step) for m in (1, 2))
+        np.testing.assert_allclose(reverse[k], (8 * near - far) / (12 * h), rtol=1e-6)
 
 
 def test_second_derivatives_through_impacts_are_refused():
