@@ -26,6 +26,7 @@ from .parts.coordinate_parts import (
     JointSpring as JointSpring,
     JointStop as JointStop,
 )
+from .parts.dry_friction import DryFriction as DryFriction
 from .parts.forces import Gravity as Gravity
 from .parts.functions import (
     Constraint as Constraint,

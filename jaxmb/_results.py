@@ -26,6 +26,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "There were more impacts and other events of contacts than `max_events`. With `throw=False` the motion up to "
         "there is kept."
     )
+    contacts_undetermined = (
+        "Contacts and friction have no solution where bodies came to touch, or slip ended (Painlevé's paradox). A "
+        "smaller coefficient of friction, or a compliant contact, has one. With `throw=False` the motion up to there "
+        "is kept."
+    )
     assembly_failed = (
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )

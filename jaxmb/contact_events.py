@@ -1,4 +1,4 @@
-"""Impacts, and contacts that close and open, along a motion."""
+"""Impacts, contacts that close and open, and friction that sticks and slips, along a motion."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,10 @@ from .formulations import AbstractFormulation
 from .linalg.jitted import jitted
 from .manifold import contact_guards
 from .system import AbstractSystem
-from .system.gaps import CLOSED, OPEN
+from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
+
+# Impulses of friction below this fraction of those of contacts are rounding errors.
+_ROUNDING = 1e-12
 
 
 class FoundEvents(NamedTuple):
@@ -29,11 +32,12 @@ class FoundEvents(NamedTuple):
 
 
 class Event(NamedTuple):
-    """An event of one contact.
+    """An event of one contact, or of dry friction.
 
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
-    `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; the `impulse` [N s, N m s]; the kinetic energy
-    [J] that was lost at this time, by all contacts together.
+    `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; of friction `"stick"`, `"slip"`, or `"impact"`
+    for an impulse alone; the `impulse` [N s, N m s]; the kinetic energy [J] that was lost at this time, by all parts
+    together.
     """
 
     time: float
@@ -44,26 +48,29 @@ class Event(NamedTuple):
 
 
 class ContactEvents(eqx.Module):
-    """The events of contacts along a motion, in the order of time; `print(motion.events)` shows a table, and
-    `list(motion.events)` has an `Event` for each contact that takes part in one.
+    """The events of contacts and dry friction along a motion, in the order of time; `print(motion.events)` shows a
+    table, and `list(motion.events)` has an `Event` for each part that takes part in one.
 
     A state that is saved just at an event may be that before it or that after it.
 
-    **Fields:** `times` [s], shape (events,); `impulses` [N s, of angles N m s], shape (events, contacts);
-    `energy_lost` [J], shape (events,): that of the impact; `before` and `after`: modes of the contacts, 0 where it is
-    open, 1 where it is closed, 2 where others imply it; `rest` [s], shape (events, contacts): the time from an event to
+    **Fields:** the `names` of the parts, and how many of them, the first ones, are `contacts`; `times` [s], shape
+    (events,); `impulses` [N s, of angles N m s], shape (events, parts); `energy_lost` [J], shape (events,): that of the
+    impact; `before` and `after`: modes, of a contact 0 where it is open, 1 where it is closed, 2 where others imply it,
+    of friction 1 and -1 where it slips forwards and backwards, 2 where it sticks, 0 where it does nothing; `rest` [s],
+    shape (events, parts): the time from an event to
     the end of the infinitely many bounces that begin with it and are too low to be resolved, after which the contact is
     at rest; zero where there are none. Under `jit` or in a batch there are as many events as `max_events`, with times
     of infinity after the last.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
+    contacts: int = eqx.field(static=True)
     times: Float[Array, "events"]
-    impulses: Float[Array, "events contacts"]
+    impulses: Float[Array, "events parts"]
     energy_lost: Float[Array, "events"]
-    before: Float[Array, "events contacts"]
-    after: Float[Array, "events contacts"]
-    rest: Float[Array, "events contacts"]
+    before: Float[Array, "events parts"]
+    after: Float[Array, "events parts"]
+    rest: Float[Array, "events parts"]
 
     def __len__(self) -> int:
         return len(self._rows())
@@ -94,6 +101,14 @@ class ContactEvents(eqx.Module):
         rows = []
         for k in np.flatnonzero(np.isfinite(times)):
             for i, name in enumerate(self.names):
+                if i >= self.contacts:
+                    changed, impulse = before[k, i] != after[k, i], float(impulses[k, i])
+                    struck = abs(impulse) > _ROUNDING * np.max(impulses[k, : self.contacts], initial=0.0)
+                    kind = "stick" if after[k, i] == STICK else "slip" if after[k, i] != FREE else "impact"
+                    if struck or (changed and after[k, i] != FREE):
+                        kind = kind if changed else "impact"
+                        rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
+                    continue
                 was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
                 impulse = float(impulses[k, i])
                 struck = impulse > 0 and was_open
@@ -107,8 +122,8 @@ class ContactEvents(eqx.Module):
 
 def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
     """The events of a run from what it notes of them."""
-    names = () if system.contacts is None else system.contacts.names
-    out = ContactEvents(names, *_evaluated(system, formulation, found))
+    names, contacts = ((), 0) if system.contacts is None else (names_of(system), counts(system)[0])
+    out = ContactEvents(names, contacts, *_evaluated(system, formulation, found))
     if isinstance(out.times, Tracer):
         return out
     count = int(np.sum(np.isfinite(np.asarray(out.times))))

@@ -132,9 +132,13 @@ class Trajectory(eqx.Module):
 
     @property
     def events(self) -> ContactEvents:
-        """Impacts, and contacts that close and open: a table of times, parts, impulses and energies lost."""
+        """Impacts, contacts that close and open, friction that sticks and slips: a table of times, parts, impulses and
+        energies lost.
+        """
         if self.found_events is None:
-            raise ValueError("There are no events, since the system has no unilateral constraints such as jaxmb.Stop.")
+            raise ValueError(
+                "There are no events, since the system has neither contacts such as jaxmb.Stop nor jaxmb.DryFriction."
+            )
         return self._events()
 
     @_of_each_member

@@ -19,7 +19,7 @@ def describe_scene(system: Any) -> Description:
         (plain, ""),
         ([g for g in system.inertial if not is_contact(g)], ", each with a velocity of its own"),
         (system.free_joints, ", which have coordinates only"),
-        (system.velocity_constraints, ", between velocities"),
+        ([g for g in system.velocity_constraints if not g.joints], ", between velocities"),
         (system.servos, ", a program of a Servo"),
     ]
     grubler = system.nu - system.velocity_rows
@@ -39,14 +39,18 @@ def describe_scene(system: Any) -> Description:
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
     if system.nz:
         facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
-    kind = lambda g: g.group.part.kind
+    kind, frictions = lambda g: g.group.part.kind, system.frictions
     plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
     gravity = [] if system.gravity is None else [("Gravity", system.gravity_name, "")]
     tables = {
         "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
         "joints": [(kind(g), shorten(g.group.names), f"{g.rows} rows each" + note) for gs, note in joints for g in gs],
         "contacts": [
-            (kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)
+            *((kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)),
+            *(
+                (kind(g), shorten(g.group.names), f"of {shorten(g.joints)}, where it sticks 1 row each")
+                for g in frictions
+            ),
         ],
         "forces": [
             *gravity,

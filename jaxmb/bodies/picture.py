@@ -38,7 +38,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in _shapes(part, space, width)
     ]
     # The friction of a joint acts where the joint does.
-    of_laws = {law: joint for g in system.nonideal for law, joint in zip(g.group.names, g.joints, strict=True)}
+    of_laws = {law: joint for g in system.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
     if not system.spatial:
         moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])

@@ -48,6 +48,18 @@ def reaction(
     return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(own))
 
 
+def with_slip(
+    stick: Reaction, laws: Sequence[NonIdealGroup], name: str, poses: BodyPoses, wrenches: Sequence[Array]
+) -> Reaction:
+    """The reaction of dry friction, that of stick and that of slip together, of which one is zero."""
+    force, moment = stick.force, stick.moment
+    for g, values in zip(laws, wrenches, strict=True):
+        k = g.group.names.index(name)
+        f, m = _on_last_body(g.group, k, poses, values[k])
+        force, moment = force + f, moment + m
+    return Reaction(force, moment, stick.multipliers)
+
+
 def _on_last_body(group: Group, k: int, poses: Any, wrenches: Any) -> tuple[Array, Array]:
     layout = group.layout
     bodies = group.bodies[k]

@@ -23,7 +23,7 @@ from ..parts.forces import Gravity
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
-from ..system.equation import Contacts, Ranks
+from ..system.equation import Contacts, Frictions, Ranks
 from ..system.quantities import Quantity
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
@@ -38,6 +38,7 @@ from .groups import (
     FrameGroup,
     NonIdealGroup,
     VelocityConstraintGroup,
+    joint_reactions,
     nonideal_wrenches,
     reaction_wrenches,
 )
@@ -64,7 +65,7 @@ from .parameters import (
     with_signals,
 )
 from .picture import picture
-from .reactions import applied_wrenches, reaction
+from .reactions import applied_wrenches, reaction, with_slip
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
@@ -253,11 +254,25 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def ideal(self) -> bool:
-        return not self.nonideal
+        return not self.laws
+
+    @property
+    def ideal_without_friction(self) -> bool:
+        return not self.nonideal and not self.servos
+
+    @property
+    def frictions(self) -> tuple[VelocityConstraintGroup, ...]:
+        """The groups of dry friction."""
+        return tuple(g for g in self.velocity_constraints if g.joints)
+
+    @property
+    def laws(self) -> tuple[NonIdealGroup, ...]:
+        """The groups of non-ideal laws, with those of dry friction that slips."""
+        return (*self.nonideal, *(g.law for g in self.frictions))
 
     @property
     def friction_parts(self) -> frozenset[str]:
-        return frozenset(name for g in self.nonideal for name in g.joints)
+        return frozenset(name for g in self.laws for name in g.joints)
 
     @property
     def linear(self) -> bool:
@@ -284,7 +299,38 @@ class RigidBodySystem(AbstractSystem):
                 modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
                 restitution.append(g.group.part.restitution)
             first += count
-        return Contacts(tuple(names), tuple(rows), tuple(modes), jnp.concatenate(restitution)) if names else None
+        frictions = self._dry_frictions(names)
+        if not names and frictions is None:
+            return None
+        coefficients = jnp.concatenate([*restitution, jnp.zeros(0, self.length.dtype)])
+        return Contacts(tuple(names), tuple(rows), tuple(modes), coefficients, frictions)
+
+    def _dry_frictions(self, contacts):
+        names, rows, modes, of_contacts, releases, first = [], [], [], [], [], self.position_rows
+        for g in self.velocity_constraints:
+            count = len(g.group.names) * g.rows
+            if g.joints:
+                names += g.group.names
+                rows += range(first, first + count)
+                modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
+                of_contacts += [contacts.index(name) if name in contacts else -1 for name in g.joints]
+                releases += [g.group.part.static_coefficient is not None] * count
+            first += count
+        if not names:
+            return None
+        parts = [g.group.part for g in self.frictions]
+        coefficient, limit = (jnp.concatenate([getattr(p, own) for p in parts]) for own in ("coefficient", "limit"))
+        return Frictions(
+            tuple(names), tuple(rows), tuple(modes), tuple(of_contacts), tuple(releases), coefficient, limit
+        )
+
+    @eqx.filter_jit
+    def friction_reactions(self, t, q, u, multipliers):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        groups = self.frictions
+        reactions = joint_reactions(self.joints, [g.law for g in groups], t, poses, velocities, multipliers)
+        d, both = self.layout.space.dimension, zip(groups, reactions, strict=True)
+        return jnp.concatenate([own[:, g.group.part.last, :d] for g, own in both])
 
     # Scalar coordinates
 
@@ -454,7 +500,12 @@ class RigidBodySystem(AbstractSystem):
     def reaction(self, name, ts, ys, multipliers):
         def single(t, y, own):
             poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
-            return reaction(self.joints, name, t, poses, velocities, own)
+            out = reaction(self.joints, name, t, poses, velocities, own)
+            slips = [g.law for g in self.frictions if name in g.group.names]
+            if not slips:
+                return out
+            wrenches = nonideal_wrenches(self.joints, slips, t, poses, velocities, own)
+            return with_slip(out, slips, name, poses, wrenches)
 
         return jax.vmap(single)(ts, ys, multipliers)
 
@@ -577,8 +628,9 @@ class RigidBodySystem(AbstractSystem):
     @eqx.filter_jit
     def nonideal_force(self, t, q, u, multipliers):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        wrenches = nonideal_wrenches(self.joints, self.nonideal, t, poses, velocities, multipliers)
-        return self._add_up(wrenches, [g.group.body_index for g in self.nonideal], u.dtype)
+        laws = self.laws
+        wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, multipliers)
+        return self._add_up(wrenches, [g.group.body_index for g in laws], u.dtype)
 
     @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
@@ -620,6 +672,8 @@ class RigidBodySystem(AbstractSystem):
         if not self.layout.scalars:
             return self.mass
         found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial]
+        # The mode of friction has a velocity that no force changes.
+        found += [(g.group.body_index[:, -1], jnp.ones_like(g.group.part.coefficient)) for g in self.frictions]
         still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
         order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
         ones = jnp.ones(len(still), self.mass.dtype)

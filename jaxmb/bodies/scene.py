@@ -25,6 +25,7 @@ from ..parts.base import (
     rows_of,
 )
 from ..parts.boundary import check_kernels
+from ..parts.dry_friction import AbstractDryFriction
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
@@ -97,7 +98,8 @@ class Scene(eqx.Module):
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
         joints = {part.name: part for part in self.joints}
-        scalars = {part.name: _call(part, "scalar_coordinates", joints) for part in self.joints}
+        links = [part for part in (*self.joints, *self.forces) if isinstance(part, AbstractLink)]
+        scalars = {part.name: _call(part, "scalar_coordinates", joints) for part in links}
         layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
         index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
         numbers = iter(range(layout.bodies, layout.ground))
@@ -124,16 +126,22 @@ class Scene(eqx.Module):
         def kind(cls, check=check_kernels):
             return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
 
-        constraints, of_joint = kind(AbstractConstraint), {law.name: law.joint for law, _ in laws}
+        def of_joints(group):
+            return tuple(of_joint[name] for name in group.names)
+
+        def between_velocities(group):
+            dry = isinstance(group.part, AbstractDryFriction)
+            return VelocityConstraintGroup(group, of_joints(group) if dry else ())
+
+        own_laws = (*laws, *(entry for entry in parts if isinstance(entry[0], AbstractDryFriction)))
+        constraints, of_joint = kind(AbstractConstraint), {law.name: law.joint for law, _ in own_laws}
         system = RigidBodySystem(
             bodies=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),
             constraints=tuple(ConstraintGroup(own) for own in constraints if own.rows),
-            velocity_constraints=tuple(map(VelocityConstraintGroup, kind(AbstractVelocityConstraint))),
+            velocity_constraints=tuple(map(between_velocities, kind(AbstractVelocityConstraint))),
             servos=tuple(map(servo_group, kind(Servo, _check_program))),
-            nonideal=tuple(
-                NonIdealGroup(g, tuple(of_joint[n] for n in g.names)) for g in stack(laws, layout, check_kernels)
-            ),
+            nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
             forces=tuple(map(ForceGroup, kind(AbstractForce))),
             tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
             free_joints=tuple(CoordinateGroup(own) for own in constraints if not own.rows),
@@ -194,13 +202,13 @@ def _check_kinds(scene: Scene):
                 f"bodies must hold Body or PointMass, got {body!r}; pass the others as joints= and forces=."
             )
     for part in scene.joints:
-        if not (isinstance(part, AbstractLink) and not isinstance(part, AbstractForce)):
+        if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractDryFriction):
             raise ValueError(f"joints must hold constraints, got {part!r}.")
     for part in scene.forces:
         # A concrete class: gravity is of no kind but its own, since it acts on every body.
-        if not isinstance(part, AbstractForce | AbstractNonIdeal | Gravity):
+        if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractDryFriction | Gravity):
             raise ValueError(f"forces must hold force elements, joint friction, or Gravity, got {part!r}.")
-    if sum(not isinstance(part, AbstractForce | AbstractNonIdeal) for part in scene.forces) > 1:
+    if sum(not isinstance(part, AbstractActor) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     for frame in scene.frames:
         if not isinstance(frame, AbstractFrame):

@@ -262,7 +262,7 @@ def _bodies_of_joints(system):
 
 def _check_determined(system, implied):
     """Refuse friction laws of joints whose reaction is indeterminate."""
-    for g in system.nonideal:
+    for g in system.laws:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
             if others:

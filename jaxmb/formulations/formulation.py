@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -165,7 +166,8 @@ def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
     respond = lambda force: formulation.solve(inertia, force, jacobian, none)[1][rows]
     _, pull = jax.vjp(respond, jnp.zeros_like(u))
     (influence,) = jax.vmap(pull)(jnp.eye(rows.size, dtype=u.dtype))
-    return find_multipliers(law, influence, ideal[rows])
+    contacts = () if system.contacts is None else system.contacts.rows
+    return find_multipliers(law, influence, ideal[rows], np.isin(rows, contacts))
 
 
 def friction_coupling(

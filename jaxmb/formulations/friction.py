@@ -12,6 +12,8 @@ The solution is the only one wherever `x ↦ x⁰ + P C(x)` contracts, component
 `|P ∂C/∂x|` is below 1. For one Coulomb law on one row this is exact: at 1, Painlevé's paradox, a solution ceases to
 exist or another one appears (P. Painlevé, "Sur les lois du frottement de glissement", C. R. Acad. Sci. 121, 1895). For
 several it is sufficient, and for laws that are not linear in the size of a single component it holds near the solution.
+A component that cannot change its sign, that of a contact, may weaken itself as much as it likes: there the diagonal
+keeps its sign.
 """
 
 from collections.abc import Callable
@@ -28,12 +30,17 @@ _CORRECTIONS = 16
 
 
 def find_multipliers(
-    law: Callable[[Array], Array], influence: Float[Array, "k n"], start: Float[Array, "k"]
+    law: Callable[[Array], Array],
+    influence: Float[Array, "k n"],
+    start: Float[Array, "k"],
+    pushes: Bool[np.ndarray, "k"],
 ) -> tuple[Float[Array, "k"], Float[Array, "k k"], Bool[Array, ""]]:
     """Solve `x = start + influence law(x)`.
 
-    **Returns:** x; the coupling `|influence ∂law/∂x|` there; and whether the equation failed to have one solution and
-    no other, in which case x is `start`.
+    **Arguments:** `pushes`: components that cannot change their sign.
+
+    **Returns:** x; the coupling `|influence ∂law/∂x|` there, with the sign of what such a component does to itself; and
+    whether the equation failed to have one solution and no other, in which case x is `start`.
     """
     one = jnp.eye(start.size, dtype=start.dtype)
 
@@ -51,13 +58,13 @@ def find_multipliers(
     far = lambda _, size: ~(size <= tol)
     first = start, jnp.zeros_like(one)
     (x, slope), size = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
-    coupling = jnp.abs(slope)
+    coupling = jnp.where(np.diag(pushes), slope, jnp.abs(slope))
     failed = far(x, size) | ~contracts(coupling)
     return jnp.where(failed, start, x), coupling, failed
 
 
 def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
-    """Whether the spectral radius of a matrix T ≥ 0 is below 1."""
+    """Whether the spectral radius of a matrix T ≥ 0 is below 1; its diagonal may be negative."""
     # Only then is I − T an M-matrix: some y > 0 has (I − T) y > 0.
     n = coupling.shape[0]
     y = _solve(jnp.eye(n, dtype=coupling.dtype) - coupling, jnp.ones(n, coupling.dtype))

@@ -1,8 +1,10 @@
 """Linear complementarity problems: `W x + b ≥ 0`, `x ≥ 0`, of which one is zero for each component.
 
-Source: R. W. Cottle, J.-S. Pang and R. E. Stone, "The Linear Complementarity Problem", SIAM, 2009, §4.4 (Lemke's
-method).
+Sources: R. W. Cottle, J.-S. Pang and R. E. Stone, "The Linear Complementarity Problem", SIAM, 2009, §4.4 (Lemke's
+method); for friction F. Pfeiffer and Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, §6.3.
 """
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,9 +25,16 @@ def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[B
     is a solution if any x ≥ 0 has `W x + b ≥ 0`; for others the method may end without one.
     """
     W, b = lax.stop_gradient((W, b))
+    scale = _scale(W)
+    return _lemke(W / scale[:, None] / scale[None, :], b / scale)
+
+
+def _scale(W):
+    return jnp.sqrt(jnp.maximum(jnp.diag(W), jnp.finfo(W.dtype).tiny))
+
+
+def _lemke(W, b):
     k, dtype = b.size, b.dtype
-    scale = jnp.sqrt(jnp.maximum(jnp.diag(W), jnp.finfo(dtype).tiny))
-    W, b = W / scale[:, None] / scale[None, :], b / scale
     right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * jnp.asarray(np.arange(1, k + 1) / k, dtype)
     # Columns: w, x, the artificial variable, the right-hand side; `basis`: the variable of each row.
     table = jnp.concatenate([jnp.eye(k, dtype=dtype), -W, -jnp.ones((k, 1), dtype), right[:, None]], axis=1)
@@ -62,6 +71,106 @@ def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[B
     _, basis, left, solvable, _ = lax.while_loop(proceed, advance, (table, basis, left, jnp.array(True), jnp.array(0)))
     found = jnp.zeros(2 * k + 1, bool).at[basis].set(True)[k : 2 * k]
     return found, solvable & (left == 2 * k)
+
+
+class Dry(NamedTuple):
+    """Laws of dry friction beside those of contacts.
+
+    **Fields:** the number of the contact of each in `contacts`, -1 for one with a normal force of its own; the
+    `coefficient`; where it `slips`, 1 or -1, and 0 where it may stick; the `bound` of the force of those without a
+    contact.
+    """
+
+    contacts: tuple[int, ...]
+    coefficient: Float[Array, "m"]
+    slips: Float[Array, "m"]
+    bound: Float[Array, "m"]
+
+
+class Answers(NamedTuple):
+    """Which laws hold: contacts that are `closed`; friction that `sticks`; the direction in which other friction
+    `slips`, 1 or -1, and 0 where there is no force; whether there is a solution.
+    """
+
+    closed: Bool[Array, "n"]
+    sticks: Bool[Array, "m"]
+    slips: Float[Array, "m"]
+    solvable: Bool[Array, ""]
+
+
+def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among: Bool[Array, "n_m"]) -> Answers:
+    """Which of some contacts with dry friction are closed, stick and slip; without derivative.
+
+    **Arguments:** `W x + b`: accelerations or velocities along the normals and the slips, with their forces or
+    impulses x; `among`: those that may have a force.
+    """
+    W, b, among, *numbers = lax.stop_gradient((W, b, among, *dry[1:]))
+    dry = Dry(dry.contacts, *numbers)
+    m = len(dry.contacts)
+    n, none = b.size - m, jnp.zeros((), b.dtype)
+    scale = jnp.where(among, _scale(W), 1.0)
+    both = among[:, None] & among[None, :]
+    W = jnp.where(both, W / scale[:, None] / scale[None, :], 0.0)
+    b = jnp.where(among, b / scale, 0.0)
+    bound = jnp.where(among[n:], dry.bound * scale[n:], 0.0)
+    size = jnp.max(jnp.abs(jnp.concatenate([b, bound])), initial=0.0)
+    size = jnp.where(size > 0, size, 1.0)
+    b, bound = b / size, bound / size
+    # The force of friction is `right - coefficient normal - bound`, or that of slip, with `right >= 0` and
+    # `left = 2 coefficient normal + 2 bound - right >= 0`; slip accelerates forwards or backwards where one is zero.
+    normal = np.zeros((m, n))
+    for k, contact in enumerate(dry.contacts):
+        if contact >= 0:
+            normal[k, contact] = 1
+    ratio = scale[n:, None] / jnp.where(among[:n], scale[:n], 1.0)[None, :]
+    limits = dry.coefficient[:, None] * normal * ratio
+    may = among[n:] & (dry.slips == 0)
+    sign = jnp.where(dry.slips == 0, 1.0, dry.slips)
+    of_normal, fixed = -sign[:, None] * limits, -sign * bound
+    of_right = jnp.diag(may.astype(b.dtype))
+    to_normal, to_slip = W[:, :n] + W[:, n:] @ of_normal, W[:, n:] @ of_right
+    free = b + W[:, n:] @ fixed
+    idle = ~among[:n]
+    rows_n = jnp.concatenate(
+        [jnp.where(idle[:, None], jnp.eye(n, dtype=b.dtype), to_normal[:n]), to_slip[:n], jnp.zeros((n, m))], axis=1
+    )
+    one = jnp.eye(m, dtype=b.dtype)
+    own = may[:, None]
+    rows_r = jnp.concatenate(
+        [jnp.where(own, to_normal[n:], none), jnp.where(own, to_slip[n:], one), jnp.where(own, one, none)], axis=1
+    )
+    rows_l = jnp.concatenate(
+        [jnp.where(own, 2 * limits, none), jnp.where(own, -one, none), jnp.where(own, none, one)], axis=1
+    )
+    right = jnp.concatenate(
+        [jnp.where(idle, 1.0, free[:n]), jnp.where(may, free[n:], 1.0), jnp.where(may, 2 * bound, 1.0)]
+    )
+    found, solvable = _lemke(jnp.concatenate([rows_n, rows_r, rows_l]), right)
+    closed, inside, backward = found[:n], found[n : n + m], found[n + m :]
+    pressed = jnp.any(closed[None, :] & (normal > 0), axis=1) | (np.array(dry.contacts) < 0)
+    force = among[n:] & pressed
+    sticks = force & may & inside & ~backward
+    direction = jnp.where(may, jnp.where(backward, -1.0, 1.0), dry.slips)
+    return Answers(closed & ~idle, sticks, jnp.where(force & ~sticks, direction, 0.0), solvable)
+
+
+def laws_of(
+    W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, answers: Answers
+) -> tuple[Float[Array, "n_m n_m"], Float[Array, "n_m"]]:
+    """The matrix and the right-hand side of the linear equations for the forces, or impulses, x of contacts and
+    friction of which it is known which laws hold; differentiable.
+
+    **Arguments:** see `frictional`; of `dry` the coefficients and bounds of slip.
+    """
+    m = len(dry.contacts)
+    n = b.size - m
+    held = jnp.concatenate([answers.closed, answers.sticks])
+    law = jnp.eye(n + m, dtype=b.dtype)
+    for k, contact in enumerate(dry.contacts):
+        if contact >= 0:
+            law = law.at[n + k, contact].set(dry.coefficient[k] * answers.slips[k])
+    bounds = jnp.concatenate([jnp.zeros(n, b.dtype), -dry.bound * answers.slips])
+    return jnp.where(held[:, None], W, law), jnp.where(held, -b, bounds)
 
 
 def solved_components(W: Float[Array, "k k"], b: Float[Array, "k"], positive: Bool[Array, "k"]) -> Float[Array, "k"]:

@@ -1,9 +1,11 @@
-"""Impacts and loss of contact: the state after an event of unilateral constraints, and the guards that tell of it.
+"""Impacts, loss of contact, stick and slip: the state after an event of contacts and dry friction.
 
 An impact is Newton's: with the impulses `Λ ≥ 0` of all contacts that touch, `M (u⁺ − u⁻) = Aᵀ Λ`, and a gap that closed
-at a rate v opens at least at `restitution` times v; where it opens faster its impulse is zero. Contacts that do not
-open then stay closed where their forces push: `λ ≥ 0`, the second derivative of the gap `≥ 0`, and one of them zero.
-Both are linear complementarity problems, over the constraints that are always there.
+at a rate v opens at least at `restitution` times v; where it opens faster its impulse is zero. With friction Λ is that
+along slips as well, at most `coefficient` times that of the contact, and against the slip that remains. Contacts that
+do not open then stay closed where their forces push: `λ ≥ 0`, the second derivative of the gap `≥ 0`, and one of them
+zero; friction where slip has ended sticks as long as its force is within its limit. These are linear complementarity
+problems, over the constraints that are always there.
 
 Sources: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", in: Nonsmooth Mechanics and
 Applications, Springer, 1988; Ch. Glocker, "Set-Valued Force Laws", Springer, 2001. The derivative of the state after an
@@ -22,18 +24,34 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation, accelerations
-from ..linalg.complementarity import positive_components, solved_components
+from ..linalg.complementarity import (
+    Answers,
+    Dry,
+    frictional,
+    laws_of,
+    positive_components,
+    solved_components,
+)
+from ..linalg.rotations import norm
 from ..solvers import AbstractGuards
 from ..system import AbstractEquation
 from ..system.gaps import (
     CLOSED,
+    FORWARD,
+    FREE,
     IMPLIED,
     OPEN,
+    STICK,
+    bound,
     contacts_of,
-    gap_accelerations,
-    gap_gradients,
-    gap_rates,
+    counts,
+    direction_accelerations,
+    direction_gradients,
+    direction_rates,
+    direction_rows,
+    frictions_of,
     gaps,
+    mode_places,
     modes_of,
     with_modes,
 )
@@ -47,11 +65,14 @@ _NEAR = 1e2
 _BOUNCE = 1e3
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
 _REST = 1e-9
+# The normal forces of joints, which depend on the friction in them, are found by this many corrections. They, and low
+# bounces, decide on what stays closed and sticks in this many rounds.
+_CORRECTIONS, _ROUNDS = 6, 3
 
 
 class ContactGuards(AbstractGuards):
     """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
-    forces.
+    forces; slips in units of the size per second, and what the forces of stick are below their limits.
     """
 
     system: AbstractEquation
@@ -64,20 +85,31 @@ class ContactGuards(AbstractGuards):
 
     def values(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        contacts, q = contacts_of(system), system.normalize(y.q)
-        t, modes = jnp.asarray(t, q.dtype), modes_of(system, q)
-        free = gaps(system, t, q) / system.length
+        q = system.normalize(y.q)
+        t, (n, _) = jnp.asarray(t, q.dtype), counts(system)
+        modes = modes_of(system, q)
+        free = jnp.where(modes[:n] == OPEN, gaps(system, t, q), system.length)
+        frictions = contacts_of(system).frictions
+        if frictions is None:
+            acts = modes == CLOSED
+        else:
+            acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] == STICK])
+            slips = jnp.abs(modes[n:]) == FORWARD
+            slip = modes[n:] * direction_rates(system, t, q, y.u)[n:]
+            free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
 
         def forces():
             own = system.at(y)
             _, multipliers = _solved(own, self.formulation, t, q, y.u)
             largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(own.force(t, q, y.u)))
             largest = largest + jnp.finfo(q.dtype).tiny
-            return multipliers[jnp.array(contacts.rows)] / largest
+            taken = multipliers[np.array(direction_rows(system))]
+            if frictions is not None:
+                taken = taken.at[n:].set(_reserve(own, t, q, y.u, multipliers))
+            return taken / largest
 
-        closed = modes == CLOSED
-        held = lax.cond(jnp.any(closed), forces, lambda: jnp.ones_like(free))
-        return jnp.where(closed, held, jnp.where(modes == OPEN, free, 1.0))
+        held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
+        return jnp.where(acts, held, free / system.length)
 
     def impact(self, t: Scalar, y: State) -> "Impact":
         """The event at a state."""
@@ -85,9 +117,30 @@ class ContactGuards(AbstractGuards):
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        q = system.normalize(y.q)
-        rates = gap_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
-        return jnp.where(modes_of(system, q) == OPEN, rates, jnp.inf)
+        q, (n, _) = system.normalize(y.q), counts(system)
+        rates = direction_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
+        watched = (modes_of(system, q) == OPEN) & (np.arange(rates.size) < n)
+        return jnp.where(watched, rates, jnp.inf)
+
+
+def _reserve(system, t, q, u, multipliers):
+    """By how much the forces [N] of friction that sticks are within their limits."""
+    frictions = frictions_of(system)
+    normal = norm(system.friction_reactions(t, q, u, multipliers))
+    return frictions.limit * normal - jnp.abs(multipliers[np.array(frictions.rows)])
+
+
+def _coefficients(system, t, q, u):
+    """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact, which is the
+    normal force where the gap grows by one metre a metre.
+    """
+    frictions, contacts = frictions_of(system), contacts_of(system)
+    unit = np.isin(np.arange(system.acceleration_rows), contacts.rows).astype(q.dtype)
+    if min(frictions.contacts) < 0 and not contacts.rows:
+        return frictions.coefficient, frictions.limit
+    sizes = norm(system.friction_reactions(t, bound(system, q), u, jnp.asarray(unit)))
+    sizes = jnp.where(np.array(frictions.contacts) < 0, 1.0, sizes)
+    return frictions.coefficient * sizes, frictions.limit * sizes
 
 
 def contact_guards(
@@ -109,15 +162,17 @@ def after_jump(term: Any, t: Scalar, y: State) -> State:
 class Impact(NamedTuple):
     """An event of contacts.
 
+    Where contacts and friction are listed together, contacts come first.
+
     **Fields:** the state `after` it, at the time that was asked for; the event is `late` after that; `impulses` of
-    contacts; `modes` before and after it; `rest`: the time from the event until the last of infinitely many bounces
-    that are left out, zero for contacts without any; the `energy` lost; whether it is `solvable`.
+    contacts and friction; `modes` before and after it; `rest`: the time from the event until the last of infinitely
+    many bounces that are left out, zero for contacts without any; the `energy` lost; whether it is `solvable`.
     """
 
     after: State
     late: Float[Array, ""]
-    impulses: Float[Array, "contacts"]
-    modes: tuple[Float[Array, "contacts"], Float[Array, "contacts"]]
+    impulses: Float[Array, "laws"]
+    modes: tuple[Float[Array, "laws"], Float[Array, "laws"]]
     rest: Float[Array, "contacts"]
     energy: Float[Array, ""]
     solvable: Bool[Array, ""]
@@ -126,9 +181,10 @@ class Impact(NamedTuple):
 class _Event(NamedTuple):
     """The numbers of an event, by which its derivative is found as well.
 
-    **Fields:** the time until then, `late`, and which gap is `first`, none where `hits` is false; accelerations before
-    and after; velocities before (`at`) and after (`u`); contacts that are `held` together by the impact, or `low` ones
-    that would bounce lower than can be seen; see `Impact` for the others.
+    **Fields:** the time until then, `late`, and which gap or slip is `first` to be zero, none where `hits` is false;
+    accelerations before and after; velocities before (`at`) and after (`u`); contacts and friction that are `held`:
+    the rates of gaps are those of the impact, slips are zero; contacts that are `low`: they would bounce lower than can
+    be seen; the direction in which friction `slips` in the impact, zero without; see `Impact` for the others.
     """
 
     late: Float[Array, ""]
@@ -138,10 +194,11 @@ class _Event(NamedTuple):
     after: Float[Array, "nu"]
     at: Float[Array, "nu"]
     u: Float[Array, "nu"]
-    held: Bool[Array, "contacts"]
+    held: Bool[Array, "laws"]
     low: Bool[Array, "contacts"]
-    impulses: Float[Array, "contacts"]
-    modes: tuple[Float[Array, "contacts"], Float[Array, "contacts"]]
+    slips: Float[Array, "frictions"]
+    impulses: Float[Array, "laws"]
+    modes: tuple[Float[Array, "laws"], Float[Array, "laws"]]
     rest: Float[Array, "contacts"]
     energy: Float[Array, ""]
     solvable: Bool[Array, ""]
@@ -181,38 +238,64 @@ def _impact(system, t, y, formulation, touch):
 
 @_impact.def_jvp
 def _impact_jvp(primals, tangents):
-    system, t, y, *_ = primals
+    system, t, y, formulation, _ = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))
-    contacts = contacts_of(system)
+    n, m = counts(system)
     dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
 
     # The time of the event changes, and so do time and state there, with the equations before it.
-    gap = push(gaps, (system, t, y.q), (dsystem, dt, dq))[event.first]
-    rate = jnp.where(event.hits, gap_rates(system, t, y.q, event.at)[event.first], 1.0)
-    dlate = jnp.where(event.hits, -gap / rate, 0.0)
+    zero = push(gaps, (system, t, y.q), (dsystem, dt, dq))
+    rate = direction_rates(system, t, y.q, event.at)
+    if m:
+        slip = push(direction_rates, (system, t, y.q, y.u), (dsystem, dt, dq, du))[n:]
+        zero = jnp.concatenate([zero, slip])
+        rate = rate.at[n:].set(direction_accelerations(system, t, y.q, event.at, event.before)[n:])
+    dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
+    if m and any(frictions_of(system).releases):
+        dlate = dlate + _release(system, formulation, event, (t, y), (dsystem, dt, dy))
     q = with_modes(system, y.q, event.modes[1])
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
     dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
 
-    # Of the impact `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held together are known.
-    held = with_modes(system, y.q, jnp.where(event.held, CLOSED, OPEN).astype(q.dtype))
-    jacobian = binding_velocities(system, t, held, event.u).selected(system.velocity_rank, system.velocity_scale())
-    projector = jacobian.projector(system.inertia(t, held, event.u))
+    # Of the impact `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held together are known, and slips that end.
+    free = with_modes(system, y.q, 0.0)
+    rows = direction_gradients(system, t, y.q, event.u)
+    jacobian = binding_velocities(system, t, free, event.u).selected(system.velocity_rank, system.velocity_scale())
+    projector = jacobian.projector(system.inertia(t, free, event.u))
     change = event.u - event.at
-    _, multipliers = projector.solve(jnp.zeros_like(change), jacobian.product(change))
+    _, multipliers = projector.solve(event.impulses @ rows, jacobian.product(change))
+    numbers = np.array(direction_rows(system))
+    multipliers = multipliers.at[numbers].set(event.impulses)
 
     def equations(system, t, q, u):
         unmet = velocity_rows(system, t, q, event.u)
-        bounce = contacts_of(system).restitution * jnp.maximum(-gap_rates(system, t, q, u), 0.0)
-        bounce = jnp.where(event.held & ~event.low, bounce, 0.0)
-        rows = unmet.at[np.array(contacts.rows)].add(-bounce)
+        bounce = contacts_of(system).restitution * jnp.maximum(-direction_rates(system, t, q, u)[:n], 0.0)
+        bounce = jnp.where(event.held[:n] & ~event.low, bounce, 0.0)
+        unmet = unmet.at[numbers[:n]].add(-bounce)
         force = system.inertia(t, q, u).product(event.u - u)
-        return rows, force - system.constraint_force(t, q, event.u, multipliers)
+        return unmet, force - system.constraint_force(t, q, event.u, multipliers)
 
-    rows, forces = push(equations, (system, t, held, event.at), (dsystem, dt, dq, du))
-    du, _ = projector.solve(-forces, -rows)
+    unmet, forces = push(equations, (system, t, bound(system, y.q), event.at), (dsystem, dt, dq, du))
+    moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros_like(unmet))[0])(rows)
+    # Rows of modes ask for nothing.
+    plain, _ = projector.solve(-forces, jnp.where(np.isin(np.arange(unmet.size), numbers), 0.0, -unmet))
+    asked = -(unmet[numbers] + rows @ plain)
+    law = jnp.eye(n + m, dtype=q.dtype)
+    more = jnp.zeros(n + m, q.dtype)
+    if m:
+        frictions = frictions_of(system)
+        known, _ = _coefficients(system, t, y.q, event.u)
+        coefficients = lambda system, t, q: _coefficients(system, t, q, event.u)[0]
+        coefficient = push(coefficients, (system, t, y.q), (dsystem, dt, dq))
+        of_contact = np.array(frictions.contacts) >= 0
+        normal = jnp.where(of_contact, event.impulses[np.array(frictions.contacts)], 0.0)
+        more = jnp.concatenate([more[:n], -coefficient * event.slips * normal])
+        for k in np.flatnonzero(of_contact):
+            law = law.at[n + k, frictions.contacts[k]].set(known[k] * event.slips[k])
+    matrix = jnp.where(event.held[:, None], rows @ moves.T, law)
+    du = plain + jnp.linalg.solve(matrix, jnp.where(event.held, asked, more)) @ moves
     dq, du = dq - dlate * rates[1], du - dlate * event.after
     dq = jnp.where(_are_modes(system), 0.0, dq)
     dz = None
@@ -222,9 +305,28 @@ def _impact_jvp(primals, tangents):
     return (after, event), (State(dq, du, dz), jax.tree.map(lambda _: None, event))
 
 
+def _release(system, formulation, event, at, along):
+    """The derivative of the time at which friction that sticks reaches its limit, where slip begins at the event."""
+    n, _ = counts(system)
+    (t, y), (dsystem, dt, dy) = at, along
+    released = (event.modes[0][n:] == STICK) & (event.modes[1][n:] != STICK)
+    own = jnp.argmax(released)
+
+    def reserve(system, t, y):
+        _, multipliers = _solved(system, formulation, t, y.q, y.u)
+        return _reserve(system, t, y.q, y.u, multipliers)[own]
+
+    z = None if y.z is None else system.state_rates(t, y.q, y.u)
+    motion = State(system.rates(t, y.q, y.u), event.before, z)
+    value = push(reserve, (system, t, y), (dsystem, dt, dy))
+    rate = eqx.filter_jvp(lambda t, y: reserve(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
+    at_limit = jnp.any(released) & ~event.hits & ~jnp.any(event.impulses > 0) & (rate < 0)
+    return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
+
+
 def _are_modes(system):
     """A mask of the modes in q."""
-    return np.isin(np.arange(system.nq), contacts_of(system).modes)
+    return np.isin(np.arange(system.nq), mode_places(system))
 
 
 @eqx.filter_custom_jvp
@@ -242,64 +344,107 @@ def _without_jvp(primals, tangents):
 def _event(system, formulation, touch, t, y) -> _Event:
     """An event at a state; `touch` [m, rad]."""
     contacts, q, u = contacts_of(system), y.q, y.u
-    modes, open_q = modes_of(system, q), with_modes(system, q, OPEN)
-    inertia = system.inertia(t, open_q, u)
-    rows = gap_gradients(system, t, q, u)
-    jacobian = binding_velocities(system, t, open_q, u).selected(system.velocity_rank, system.velocity_scale())
+    frictions, (n, m) = contacts.frictions, counts(system)
+    modes, free_q = modes_of(system, q), with_modes(system, q, 0.0)
+    inertia = system.inertia(t, free_q, u)
+    rows = direction_gradients(system, t, q, u)
+    jacobian = binding_velocities(system, t, free_q, u).selected(system.velocity_rank, system.velocity_scale())
     projector = jacobian.projector(inertia)
     none = jnp.zeros(system.acceleration_rows, q.dtype)
     # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
     # change that these constraints ask for themselves.
-    unmet = -velocity_rows(system, t, open_q, u)
+    unmet = -velocity_rows(system, t, free_q, u)
     forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
     asked = jnp.concatenate([jnp.tile(none, (len(rows), 1)), unmet[None]])
-    moves = jax.vmap(lambda force, rows: projector.solve(force, rows)[0])(forces, asked)
-    moves, jump = moves[:-1], moves[-1]
+    moves, answers = jax.vmap(projector.solve)(forces, asked)
+    moves, jump, answers = moves[:-1], moves[-1], answers[:-1]
     influence = rows @ moves.T
+    laws = _Laws(influence, frictions, n, m, *(_coefficients(system, t, q, u) if m else (none, none)))
 
     def accelerated(u):
-        """Accelerations with open contacts, and those of the gaps."""
-        udot = _free_acceleration(system, formulation, projector, t, open_q, u)
-        return udot, gap_accelerations(system, t, q, u, udot)
+        """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
+        that have friction, without forces along these and by a unit of each.
+        """
+        udot, multipliers = _free_acceleration(system, formulation, projector, t, free_q, u)
+        opening = direction_accelerations(system, t, q, u, udot)
+        if not laws.of_joints.any():
+            return udot, opening, None
+        reactions = lambda own: system.friction_reactions(t, q, u, own)
+        return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
 
     # What is next, of the equations before.
-    udot, opening = accelerated(u)
-    before = udot + solved_components(influence, opening, modes == CLOSED) @ moves
-    gap, closing = gaps(system, t, q), gap_rates(system, t, q, u)
-    about_to = (modes == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
+    udot, opening, reactions = accelerated(u)
+    before = udot + laws.forces(opening, reactions, laws.of_modes(modes)) @ moves
+    rates = direction_rates(system, t, q, u)
+    gap, closing = gaps(system, t, q), rates[:n]
+    about_to = (modes[:n] == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
     # The first zero of a parabola.
-    curve = gap_accelerations(system, t, q, u, before)
-    until = 2 * gap / (jnp.sqrt(jnp.maximum(closing**2 - 2 * curve * gap, 0.0)) + jnp.where(about_to, -closing, 1.0))
+    curve = direction_accelerations(system, t, q, u, before)
+    root = jnp.sqrt(jnp.maximum(closing**2 - 2 * curve[:n] * gap, 0.0))
+    until = 2 * gap / (root + jnp.where(about_to, -closing, 1.0))
+    if m:
+        slip, slowing = modes[n:] * rates[n:], modes[n:] * curve[n:]
+        ends = (jnp.abs(modes[n:]) == FORWARD) & (slip <= _NEAR * touch) & (slowing < 0)
+        until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
+        about_to = jnp.concatenate([about_to, ends])
     first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
     hits = about_to[first]
     late = jnp.where(hits, until[first], 0.0)
     u = u + late * before
 
-    touching = (modes != OPEN) | (about_to & (jnp.arange(gap.size) == first)) | (gap + late * closing <= touch)
-    at = gap_rates(system, t, q, u)
-    bounce = contacts.restitution * jnp.maximum(-at, 0.0)
-    impulses, held, solvable = _complementary(influence, at + rows @ jump - bounce, touching)
-    struck = u + jump + impulses @ moves
-    rate = gap_rates(system, t, q, struck)
-    udot, opening = accelerated(struck)
-    sizes = jnp.abs(rows) @ (jnp.abs(struck) + jnp.abs(u))
-    staying = touching & (rate <= _REST * sizes)
-    # Contacts that would open by less than can be seen, before they close again, stay closed.
-    curve = opening + influence @ _complementary(influence, opening, staying)[0]
-    falls = jnp.where(curve < 0, -curve, 1.0)
-    low = touching & ~staying & (curve < 0) & (rate**2 <= 2 * falls * _BOUNCE * touch) & (contacts.restitution < 1)
-    staying, held = staying | low, held | low
-    held = held & _independent(influence, held)
-    lost = jnp.where(jnp.any(low), solved_components(influence, jnp.where(staying, rate, 0.0), held & staying), 0.0)
-    after, impulses = struck + lost @ moves, impulses + lost
+    is_first = jnp.arange(n) == first
+    touching = (modes[:n] != OPEN) | (about_to[:n] & is_first) | (gap + late * closing <= touch)
+    at = direction_rates(system, t, q, u)
+    bounce = contacts.restitution * jnp.maximum(-at[:n], 0.0)
+    approach = (at + rows @ jump).at[:n].add(-bounce)
+    struck, impulses, solvable = laws.impulses(approach, touching)
+    held = struck.closed
+    after = u + jump + impulses @ moves
+    rate = direction_rates(system, t, q, after)
+    udot, opening, reactions = accelerated(after)
+    sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
+    resting = touching & (rate[:n] <= _REST * sizes[:n])
+    # Slip that is not to be seen has ended.
+    ended = (jnp.abs(rate[n:]) <= _REST * sizes[n:]) | (jnp.abs(rate[n:]) <= _NEAR * touch)
+    slips = jnp.where(ended, 0.0, jnp.sign(rate[n:]))
+
+    def decide(k, carry):
+        """Which contacts stay closed, which laws hold then, and with which forces, in the next round."""
+        low, falls, _, forces = carry
+        # Contacts that would open by less than can be seen, before they close again, stay closed: of those that stay
+        # closed in the first round without them.
+        curve = (opening + influence @ forces)[:n]
+        falls = jnp.where(k == 1, jnp.where(curve < 0, -curve, 1.0), falls)
+        opens = rate[:n] ** 2 <= 2 * falls * _BOUNCE * touch
+        bounces = touching & ~resting & (curve < 0) & opens & (contacts.restitution < 1)
+        low = jnp.where(k == 1, bounces, low)
+        answers = laws.decided(opening, reactions, resting | low, slips, modes, forces)
+        return low, falls, answers, laws.forces(opening, reactions, answers)
+
+    # At first all contacts and friction hold that may.
+    every = laws.all_of(resting, slips)
+    none = resting & False, jnp.ones(n, q.dtype), every, laws.forces(opening, reactions, every)
+    low, falls, last, forces = lax.fori_loop(0, _ROUNDS, decide, none)
+    staying, held = resting | low, held | low
     # Each bounce takes `restitution` times the time of the one before.
     bounces = low & (bounce > 0)
     ratio = jnp.where(bounces, contacts.restitution, 0.0)
-    rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
+    rest = jnp.where(bounces, 2 * rate[:n] / (falls * (1 - ratio)), 0.0)
 
-    forces, closed, stays = _complementary(influence, opening, staying)
-    implied = staying & ~closed & _is_implied(influence, closed)
-    new = jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN)).astype(q.dtype)
+    implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
+    new = jnp.where(last.closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
+    new = jnp.concatenate([new, jnp.where(last.sticks, STICK, last.slips)]).astype(q.dtype)
+    if m:
+        # Slips that have ended are zero to all digits.
+        held = jnp.concatenate([held | last.closed, last.sticks | struck.sticks])
+        left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(last.sticks, rate[n:], 0.0)])
+        cancelled = held & jnp.concatenate([staying, last.sticks])
+    else:
+        left, cancelled = jnp.where(staying, rate, 0.0), held & staying & jnp.any(low)
+    held = held & _independent(influence, held)
+    lost = solved_components(influence, left, held & cancelled)
+    after = after + lost @ moves
+    impulses = impulses + jnp.where(jnp.any(low), lost, 0.0)
     energy = 0.5 * (jnp.dot(u, inertia.product(u)) - jnp.dot(after, inertia.product(after)))
     return _Event(
         late=late,
@@ -311,12 +456,107 @@ def _event(system, formulation, touch, t, y) -> _Event:
         u=after,
         held=held,
         low=low,
+        slips=struck.slips,
         impulses=impulses,
         modes=(modes, new),
-        rest=rest,
+        rest=jnp.pad(rest, (0, m)),
         energy=energy,
-        solvable=solvable & stays,
+        solvable=solvable & last.solvable,
     )
+
+
+class _Laws(NamedTuple):
+    """The laws of `n` contacts and `m` dry `frictions` at a state, with the `influence` of their forces, and
+    `_coefficients`.
+    """
+
+    influence: Float[Array, "n_m n_m"]
+    frictions: Any
+    n: int
+    m: int
+    coefficient: Float[Array, "m"]
+    limit: Float[Array, "m"]
+
+    def of_modes(self, modes) -> Answers:
+        """Which laws hold in some modes."""
+        dry = modes[self.n :]
+        slips = jnp.where(jnp.abs(dry) == FORWARD, dry, FREE)
+        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True))
+
+    @property
+    def of_joints(self) -> np.ndarray:
+        """Which friction is that of a joint, whose normal force is the size of its reaction."""
+        return np.array(self.frictions.contacts if self.m else (), int) < 0
+
+    def all_of(self, staying, slips) -> Answers:
+        """All contacts and friction hold that may."""
+        force = self._may(staying)
+        return Answers(staying, force & (slips == 0), jnp.where(force, slips, 0.0), jnp.array(True))
+
+    def forces(self, opening, reactions, answers: Answers):
+        """The forces of laws that hold, from accelerations without them."""
+        if not self.m:
+            return solved_components(self.influence, opening, answers.closed)
+        none = jnp.zeros(self.m, opening.dtype)
+        matrix, right = laws_of(self.influence, opening, self._dry(self.coefficient, none, none), answers)
+        linear = jnp.linalg.solve(matrix, right)
+        if not self.of_joints.any():
+            return linear
+        factor = jnp.where(self.of_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
+
+        def correct(_, forces):
+            # Newton's method: the size of a reaction is not linear.
+            reaction = reactions[0] + jnp.tensordot(forces, reactions[1:], 1)
+            normal = norm(reaction)
+            along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
+            slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
+            own = matrix.at[self.n :].add(factor[:, None] * slope)
+            return jnp.linalg.solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
+
+        return lax.fori_loop(0, _CORRECTIONS, correct, linear)
+
+    def impulses(self, approach, touching):
+        """Which laws hold in an impact, the impulses, and whether there is a solution; `approach`: the rates before it,
+        with those of restitution.
+        """
+        none = jnp.zeros(self.m, approach.dtype)
+        if not self.m:
+            impulses, closed, solvable = _complementary(self.influence, approach, touching)
+            return Answers(closed, none > 0, none, solvable), impulses, solvable
+        if not self.n:
+            answers = Answers(none[:0] > 0, none > 0, none, jnp.array(True))
+            return answers, jnp.zeros_like(approach), jnp.array(True)
+        # Friction in joints has no impulse.
+        among = self._may(touching) & ~self.of_joints
+        dry = self._dry(self.coefficient, none, none)
+        answers = frictional(self.influence, approach, dry, jnp.concatenate([touching, among]))
+        return answers, jnp.linalg.solve(*laws_of(self.influence, approach, dry, answers)), answers.solvable
+
+    def decided(self, opening, reactions, staying, slips, modes, forces) -> Answers:
+        """Which laws hold after an event, of contacts that are `staying`, and of friction that `slips`, or may stick
+        where this is zero; `forces`: nearly those, on which the normal forces of joints depend.
+        """
+        none = jnp.zeros(self.m, opening.dtype)
+        if not self.m:
+            _, closed, solvable = _complementary(self.influence, opening, staying)
+            return Answers(closed, none > 0, none, solvable)
+        # Friction that has just reached its limit is beyond it up to rounding errors.
+        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REST, 1.0)
+        coefficient, bounds = jnp.where(slips == 0, limit, self.coefficient), none
+        if self.of_joints.any():
+            normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
+            bounds = jnp.where(self.of_joints, coefficient * normal, 0.0)
+        among = jnp.concatenate([staying, self._may(staying)])
+        return frictional(self.influence, opening, self._dry(coefficient, slips, bounds), among)
+
+    def _may(self, staying):
+        """Which friction may have a force."""
+        if not self.m:
+            return jnp.zeros(0, bool)
+        return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.frictions.contacts])
+
+    def _dry(self, coefficient, slips, bound) -> Dry:
+        return Dry(self.frictions.contacts, coefficient, slips, bound)
 
 
 def _independent(influence, among):
@@ -339,10 +579,12 @@ def _is_implied(influence, closed):
 
 
 def _free_acceleration(system, formulation, projector, t, q, u):
-    """The accelerations at coordinates with open contacts, where the projector on the other constraints is known."""
-    if not system.ideal_on_velocities:
-        return accelerations(system, formulation, t, q, u)[0]
-    return _by_projector(system, projector, t, q, u)[0]
+    """Accelerations and multipliers at coordinates without contacts and friction, where the projector on the other
+    constraints is known.
+    """
+    if not system.ideal_without_friction:
+        return accelerations(system, formulation, t, q, u)
+    return _by_projector(system, projector, t, q, u)
 
 
 def _solved(system, formulation, t, q, u):

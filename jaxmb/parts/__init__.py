@@ -27,6 +27,7 @@ from .contact import (
     AbstractFrictionLaw as AbstractFrictionLaw,
     AbstractNormalLaw as AbstractNormalLaw,
 )
+from .dry_friction import AbstractDryFriction as AbstractDryFriction
 from .fields import (
     Names as Names,
     Number as Number,
@@ -56,5 +57,6 @@ from .space import (
 from .terrain import AbstractTerrain as AbstractTerrain
 from .unilateral import (
     AbstractGeometricContact as AbstractGeometricContact,
+    AbstractRigidContact as AbstractRigidContact,
     AbstractUnilateralConstraint as AbstractUnilateralConstraint,
 )

@@ -238,6 +238,10 @@ class AbstractActor(AbstractPart):
         seen = self._on_frames(lambda frame, x, v: frame.velocity(space, x, v), poses, velocities)
         return self.seen_poses(space, poses), seen
 
+    def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
+        """The wrenches that the kernels see, from those on the bodies."""
+        return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
+
     def wrenches_on_bodies(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
         """The wrenches on the bodies that are equivalent to those that the kernels return."""
         return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
@@ -517,10 +521,6 @@ class AbstractNonIdeal(AbstractActor):
         """Hook: a copy with omitted numbers computed from its joint; see `filled`."""
         del space, joint, poses
         return self
-
-    def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
-        """The wrenches that the kernel sees, from those on the bodies of the joint."""
-        return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
 
     @abc.abstractmethod
     def wrenches(

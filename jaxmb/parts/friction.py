@@ -6,7 +6,7 @@ import numpy as np
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractNonIdeal, rows_of
+from .base import AbstractInertialConstraint, AbstractNonIdeal, rows_of
 from .smooth import dry_friction
 
 
@@ -15,7 +15,8 @@ class Friction(AbstractNonIdeal):
 
     The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
     ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
-    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude of
+    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest, so that it creeps where
+    `DryFriction` sticks. N is the magnitude of
     the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
     such N exists, or more than one (Painlevé's paradox), the simulation ends with `singular_configuration`.
 
@@ -37,6 +38,8 @@ class Friction(AbstractNonIdeal):
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=1e-4)
 
     def complete(self, space, joint, poses):
+        if isinstance(joint, AbstractInertialConstraint):
+            raise ValueError(f"{self.label}: {joint.label} is no joint with a smooth force; use jaxmb.DryFriction.")
         k = poses.shape[0] - 1
         if k > 1:
             raise ValueError(f"{self.label}: {joint.name!r} connects more than two bodies; use NonIdeal.")

@@ -8,6 +8,7 @@ of impacts and of loss of contact within its steps. Every pair that may touch is
 import abc
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -15,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate
+from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
 from .coordinate_parts import AbstractScalarPart
 from .shapes import Ground, marked_ball, wheel
 from .space import AbstractSpace, both_points, separation
@@ -38,7 +39,7 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     **Fields:** `restitution` from 0 to 1, default 0.
     """
 
-    restitution: fields.Number = fields.parameter(sign="non-negative", default=0.0)
+    restitution: fields.Number = fields.parameter(sign="non-negative", default=0.0, constant=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -117,9 +118,39 @@ class AbstractGeometricContact(AbstractUnilateralConstraint):
         return {"gap": self.gap(space, poses[:-1])}
 
 
-class RigidContact(AbstractGeometricContact):
-    """Rigid contact of a body with a terrain, as a disc (in the plane), a sphere (in space), or a point, without
-    friction.
+class AbstractRigidContact(AbstractGeometricContact):
+    """A unilateral constraint of bodies that touch at a point, in which there may be friction (`DryFriction`).
+
+    Subclasses define where they touch, `touching`, and a `gap` that grows by one metre a metre as the last body moves
+    away.
+    """
+
+    @abc.abstractmethod
+    def touching(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
+        """The world point [m] at which the bodies touch where the gap is zero, from the poses of the bodies."""
+
+    def outward(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
+        """The unit vector along which the contact pushes the last body."""
+        moved = lambda x: self.gap(space, poses.at[-1, : space.dimension].set(x))
+        out = jax.grad(moved)(poses[-1, : space.dimension])
+        return out / norm(out)
+
+    def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, ""]:
+        """The velocity [m/s] of the last body, against that of the other one or of the world, at the point where they
+        touch, along the normal turned clockwise; in the plane.
+        """
+        point, normal = self.touching(space, poses), self.outward(space, poses)
+
+        def velocity(k):
+            return space.point_velocity(poses[k], velocities[k], space.body_point(poses[k], point))
+
+        relative = velocity(-1) - velocity(0) if len(poses) == 2 else velocity(-1)
+        return normal[1] * relative[0] - normal[0] * relative[1]
+
+
+class RigidContact(AbstractRigidContact):
+    """Rigid contact of a body with a terrain, as a disc (in the plane), a sphere (in space), or a point; frictionless
+    without a `DryFriction`.
 
     ```python
     jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
@@ -141,6 +172,9 @@ class RigidContact(AbstractGeometricContact):
     def gap(self, space, poses):
         return distance(self.terrain, space.point(poses[0], self.centre)) - self.radius
 
+    def touching(self, space, poses):
+        return space.point(poses[0], self.centre) - self.radius * self.outward(space, poses)
+
     def shapes(self, space, size):
         solid = wheel if space.dimension == 2 else marked_ball
         out = [(None, Ground(height=self.terrain.height))]
@@ -149,8 +183,9 @@ class RigidContact(AbstractGeometricContact):
         return tuple(out)
 
 
-class RigidBallContact(AbstractGeometricContact, AbstractPair):
-    """Rigid contact of two discs (in the plane) or balls (in space) of different bodies, without friction.
+class RigidBallContact(AbstractRigidContact, AbstractPair):
+    """Rigid contact of two discs (in the plane) or balls (in space) of different bodies; frictionless without a
+    `DryFriction`.
 
     **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
     centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0. The centres must not
@@ -165,15 +200,18 @@ class RigidBallContact(AbstractGeometricContact, AbstractPair):
     def gap(self, space, poses):
         return norm(separation(space, self, poses)) - self.radius_a - self.radius_b
 
+    def touching(self, space, poses):
+        return space.point(poses[1], self.point_b) - self.radius_b * self.outward(space, poses)
+
     def shapes(self, space, size):
         solid = wheel if space.dimension == 2 else marked_ball
         both = ((0, self.radius_a, self.point_a), (1, self.radius_b, self.point_b))
         return tuple((k, shape) for k, r, at in both if r > 0 for shape in solid(r, position=space.in_space(at)))
 
 
-class RigidPlaneContact(AbstractGeometricContact, AbstractPair):
-    """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`,
-    without friction.
+class RigidPlaneContact(AbstractRigidContact, AbstractPair):
+    """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`;
+    frictionless without a `DryFriction`.
 
     The plane has no end, and the ball is always on the side to which the normal points.
 
@@ -191,6 +229,9 @@ class RigidPlaneContact(AbstractGeometricContact, AbstractPair):
     def gap(self, space, poses):
         normal = space.direction(poses[0], self.normal_a)
         return jnp.dot(normal, separation(space, self, poses)) - self.radius
+
+    def touching(self, space, poses):
+        return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
 
 
 class Slack(AbstractGeometricContact, AbstractPair):

@@ -13,7 +13,10 @@ from ..linalg.arrays import is_traced
 from ..manifold import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
+from ..system.gaps import counts, gaps, names_of
 
+# Gaps below this fraction of the system's size are named where contacts have no solution.
+_TOUCH = 1e-6
 # Stiffness is not looked for after fewer steps than this, and found in this number.
 _ENOUGH, _LOOKED = 200, 256
 
@@ -44,6 +47,15 @@ def about_friction(system, coupling) -> str:
         "so much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a "
         "compliant contact has one. With `throw=False` the motion up to there is kept."
     )
+
+
+def about_contacts(system, outcome: Outcome) -> str:
+    """Which bodies touch where no forces of contacts and friction are possible."""
+    q = system.normalize(outcome.y.q)
+    touch = np.asarray(gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
+    touch = np.append(touch, [True] * counts(system)[1])
+    names = ", ".join(repr(name) for name, own in zip(names_of(system), touch, strict=True) if own)
+    return f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
 
 
 def has_failed(result) -> Any:
@@ -88,6 +100,8 @@ def message_of_failure(system, result, t1, outcome: Outcome, stats, solver, prob
     """Why a simulation with a solver failed; `probe` as in `is_stiff_at_end`."""
     if np.any(outcome.coupling):
         return about_friction(system, outcome.coupling)
+    if result == RESULTS.contacts_undetermined and not is_traced((system, outcome)):
+        return about_contacts(system, outcome)
     if result == RESULTS.too_many_events and not is_traced(outcome.t):
         return f"The motion came to t = {float(outcome.t):.6g} of {float(t1):.6g}. {RESULTS[result]}"
     if result == RESULTS.max_steps_reached and not is_traced((system, outcome, t1)):

@@ -164,10 +164,11 @@ def simulate(
     event, and, with `Adams`, those of `jumps`. Second derivatives are those of first ones in forward mode
     (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
 
-    Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open at events, at which a step ends: `Trajectory.events`
-    lists them. An event is found to a thousandth of `rtol`, relative to the size of the system; bounces that are lower
-    than `rtol` are left out, and the contact stays closed. Derivatives are those of a motion whose events
-    move with the parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
+    Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open, and `DryFriction` sticks and slips, at events, at
+    which a step ends: `Trajectory.events` lists them. An event is found to a thousandth of `rtol`, relative to the size
+    of the system; bounces that are lower than `rtol` are left out, and the contact stays closed. Derivatives are those
+    of a motion whose events move with the parameters, while their sequence stays: the time of an impact has a
+    derivative, its number has none.
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
 
     A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from

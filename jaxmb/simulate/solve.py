@@ -237,6 +237,10 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """
     system = problem.system
     result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
+    if system.contacts is not None:
+        term, _ = problem.assembled(system)
+        solvable = lax.cond(stuck, lambda: term.guards.impact(t, y).solvable, lambda: jnp.array(True))
+        result, stuck = RESULTS.where(solvable, result, RESULTS.contacts_undetermined), stuck & solvable
     if not system.friction_parts:
         return result, None
     return diagnose_friction(system, problem.method, t, y, result, stuck)

@@ -285,7 +285,9 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, found.error, error_order, before.inner
         )
-        meant, close = t1 == before.target, (t1 - found.target) <= _END * (t1 - t0)
+        # Compilers round what is computed in two places twice.
+        meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
+        close = (t1 - found.target) <= _END * (t1 - t0)
         at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
         at_zero = at_zero | (close & (found.lowest < -found.touch))
         crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)

@@ -120,7 +120,7 @@ def configuration(
     q, fixed = prescribe("coordinate", names, {} if fix is None else fix, guess)
     if system.contacts is not None:
         # A contact that is open determines its own mode.
-        fixed[np.array(system.contacts.modes)] = False
+        fixed[np.array(system.contacts.modes, int)] = False
     if not is_traced(q):
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed)

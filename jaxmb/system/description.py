@@ -59,7 +59,11 @@ def count_rows(system: AbstractEquation) -> str:
 
 def count_independent(system: AbstractEquation) -> str:
     """The numbers of coordinates and velocities that the constraints leave free."""
-    return f"{system.nq - system.coordinate_rank} coordinates, {system.nu - system.velocity_rank} velocities"
+    # A mode of friction is no coordinate that moves.
+    frictions = None if system.contacts is None else system.contacts.frictions
+    modes = 0 if frictions is None else len(frictions.names)
+    coordinates = system.nq - system.coordinate_rank - modes
+    return f"{coordinates} coordinates, {system.nu - system.velocity_rank} velocities"
 
 
 def specialised_constraints(system: AbstractEquation) -> list[str]:

@@ -40,21 +40,42 @@ class Ranks(eqx.Module):
     acceleration: int = eqx.field(static=True)
 
 
+class Frictions(eqx.Module):
+    """The dry friction of a system, which sticks or slips.
+
+    Each has a row of A and a coordinate of its own, its mode, as a contact has. The row says `slip = 0` where it
+    sticks.
+
+    **Fields:** their `names`; for each the number of its `rows` of A, among those of velocities, the index of its mode
+    in q, `modes`, and the number of its contact in `contacts`, -1 in a joint; the `coefficient` of slip, and the
+    `limit`, that of stick; `releases`: whether these differ, so that accelerations jump where slip begins. Static.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)
+    modes: tuple[int, ...] = eqx.field(static=True)
+    contacts: tuple[int, ...] = eqx.field(static=True)
+    releases: tuple[bool, ...] = eqx.field(static=True)
+    coefficient: Float[Array, "frictions"]
+    limit: Float[Array, "frictions"]
+
+
 class Contacts(eqx.Module):
-    """The unilateral constraints of a system: gaps that stay non-negative.
+    """The unilateral constraints of a system, gaps that stay non-negative, and its dry friction.
 
     Each has a row of A and a coordinate of its own, its mode. The row says `gap = 0` where the contact is closed, and
     otherwise that the mode stays what it is. So the number and the rank of rows never change, and the mode, which no
     force acts on, is a number of the state like any other.
 
     **Fields:** their `names`; for each the number of its `rows` of A, among those of positions, and the index of its
-    mode in q, `modes`; coefficients of `restitution`.
+    mode in q, `modes`; coefficients of `restitution`; the `frictions`, None without any.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     rows: tuple[int, ...] = eqx.field(static=True)
     modes: tuple[int, ...] = eqx.field(static=True)
     restitution: Float[Array, "contacts"]
+    frictions: Frictions | None = None
 
 
 class AbstractEquation(eqx.Module):
@@ -249,6 +270,11 @@ class AbstractEquation(eqx.Module):
         return self.ideal and self.acceleration_rows == self.velocity_rows
 
     @property
+    def ideal_without_friction(self) -> bool:
+        """The same, where no dry friction slips."""
+        return self.ideal_on_velocities
+
+    @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
         """Numbers of the rows of A that C depends on the multipliers of."""
         return np.zeros(0, int)
@@ -264,8 +290,15 @@ class AbstractEquation(eqx.Module):
 
     @property
     def contacts(self) -> Contacts | None:
-        """The unilateral constraints; None without any."""
+        """The unilateral constraints and dry friction; None without any."""
         return None
+
+    def friction_reactions(
+        self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
+    ) -> Float[Array, "frictions d"]:
+        """The reaction forces [N] of the joints or contacts that have dry friction, without it."""
+        del t, q, multipliers
+        return jnp.zeros((0, 0), u.dtype)
 
     # Implicit methods
 

@@ -1,4 +1,9 @@
-"""Gaps of the unilateral constraints of a system, also of those that are closed, with their derivatives."""
+"""Gaps and slips of the unilateral constraints and dry friction of a system, also of those that are closed or stick,
+with their derivatives.
+
+Where contacts and friction are listed together, contacts come first. Their directions are those along which their
+forces act: normal to a contact, along the slip of friction.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,58 +11,102 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._types import Coordinates, Scalar, Velocities
-from .equation import AbstractEquation, Contacts
+from .equation import AbstractEquation, Contacts, Frictions
 
 # Modes of a contact: open; closed; closed, where others that are closed as well imply it and take the force.
 OPEN, CLOSED, IMPLIED = 0, 1, 2
+# Modes of dry friction: without a force; slip along its direction, and against it; stick.
+FREE, FORWARD, BACKWARD, STICK = 0, 1, -1, 2
 
 
 def contacts_of(system: AbstractEquation) -> Contacts:
-    """The unilateral constraints of a system that has some."""
+    """The unilateral constraints and dry friction of a system that has some."""
     assert system.contacts is not None
     return system.contacts
 
 
-def modes_of(system: AbstractEquation, q: Coordinates) -> Float[Array, "contacts"]:
-    """The modes of the contacts in some coordinates, whole numbers."""
-    return jnp.round(q[np.array(contacts_of(system).modes)])
+def frictions_of(system: AbstractEquation) -> Frictions:
+    """The dry friction of a system that has some."""
+    frictions = contacts_of(system).frictions
+    assert frictions is not None
+    return frictions
+
+
+def counts(system: AbstractEquation) -> tuple[int, int]:
+    """The numbers of contacts and of dry frictions."""
+    contacts = contacts_of(system)
+    return len(contacts.names), 0 if contacts.frictions is None else len(contacts.frictions.names)
+
+
+def names_of(system: AbstractEquation) -> tuple[str, ...]:
+    """The names of contacts and friction."""
+    contacts = contacts_of(system)
+    return contacts.names + (() if contacts.frictions is None else contacts.frictions.names)
+
+
+def mode_places(system: AbstractEquation) -> np.ndarray:
+    """The indices in q of the modes of contacts and friction."""
+    contacts = contacts_of(system)
+    return np.array(contacts.modes + (() if contacts.frictions is None else contacts.frictions.modes), int)
+
+
+def modes_of(system: AbstractEquation, q: Coordinates) -> Float[Array, "laws"]:
+    """The modes of contacts and friction in some coordinates, whole numbers."""
+    return jnp.round(q[mode_places(system)])
 
 
 def are_open(system: AbstractEquation, q: Coordinates) -> Bool[Array, "contacts"]:
     """Which contacts are open; of a system without any, none is asked."""
-    return jnp.zeros(0, bool) if system.contacts is None else modes_of(system, q) == OPEN
+    if system.contacts is None:
+        return jnp.zeros(0, bool)
+    return modes_of(system, q)[: counts(system)[0]] == OPEN
 
 
 def with_modes(system: AbstractEquation, q: Coordinates, modes: ArrayLike) -> Float[Array, "nq"]:
     """The coordinates with other modes."""
-    return q.at[np.array(contacts_of(system).modes)].set(modes)
+    return q.at[mode_places(system)].set(modes, unique_indices=True)
 
 
 def gaps(system: AbstractEquation, t: Scalar, q: Coordinates) -> Float[Array, "contacts"]:
     """The gaps [m, rad], negative where bodies are inside each other."""
-    return _of_contacts(system, system.position_residual(t, with_modes(system, q, CLOSED)))
+    rows = contacts_of(system).rows
+    return _taken(system.position_residual(t, bound(system, q)), rows)
 
 
-def gap_rates(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "contacts"]:
-    """The rates of the gaps."""
-    return _of_contacts(system, system.velocity_residual(t, with_modes(system, q, CLOSED), u))
+def direction_rates(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws"]:
+    """The rates of the gaps, and the velocities of slip."""
+    return _taken(system.velocity_residual(t, bound(system, q), u), direction_rows(system))
 
 
-def gap_accelerations(
+def direction_accelerations(
     system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
-) -> Float[Array, "contacts"]:
-    """The second derivatives of the gaps."""
-    return _of_contacts(system, system.acceleration_residual(t, with_modes(system, q, CLOSED), u, udot))
+) -> Float[Array, "laws"]:
+    """The second derivatives of the gaps, and the derivatives of the velocities of slip."""
+    return _taken(system.acceleration_residual(t, bound(system, q), u, udot), direction_rows(system))
 
 
-def gap_gradients(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "contacts nu"]:
-    """Derivatives of the rates of the gaps with respect to velocities: the rows of A of contacts that are closed."""
-    rates, pull = jax.vjp(lambda u: gap_rates(system, t, q, u), u)
+def direction_gradients(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws nu"]:
+    """Derivatives of the rates with respect to velocities: the rows of A of contacts that are closed, and of friction
+    that sticks.
+    """
+    rates, pull = jax.vjp(lambda u: direction_rates(system, t, q, u), u)
     return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
 
 
-def _of_contacts(system, values):
+def direction_rows(system: AbstractEquation) -> tuple[int, ...]:
+    """The numbers of the rows of A of contacts and friction."""
+    contacts = contacts_of(system)
+    return contacts.rows + (() if contacts.frictions is None else contacts.frictions.rows)
+
+
+def bound(system: AbstractEquation, q: Coordinates) -> Float[Array, "nq"]:
+    """The coordinates with all contacts closed and all friction sticking."""
+    n, m = counts(system)
+    return with_modes(system, q, np.array([CLOSED] * n + [STICK] * m, float))
+
+
+def _taken(values, numbers):
     # Slices of rows that follow one another, so that the compiler leaves out those of other parts.
-    rows = np.array(contacts_of(system).rows)
-    runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1))
-    return jnp.concatenate([values[run[0] : run[-1] + 1] for run in runs])
+    rows = np.array(numbers, int)
+    runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1)) if rows.size else []
+    return jnp.concatenate([*(values[run[0] : run[-1] + 1] for run in runs), values[:0]])

@@ -17,6 +17,7 @@ import pytest
 from derivative_checks import Case, Machine, check
 from driven_arm import driven_arm
 from every_contact import CONTACTS
+from every_dry_friction import FRICTIONS
 from every_part import EXAMPLES, FUNCTIONS, Example, hold_2d, pin_2d, rubbing_3d
 from exports import OF_SCENES, exported
 from laws import FRICTION, LAWS, TERRAINS
@@ -555,8 +556,9 @@ def left_out(module, kinds, found):
 def test_every_part_and_law_stands_in_a_scene():
     examples = [example for own, _ in [*GROUPS.values(), *INSTANTS.values()] for example in own]
     found = kinds_within([[e.part, e.bodies, e.joints, e.forces] for e in examples]) | {mb.Gravity}
-    # Derivatives through contacts are those of `tests/simulate/test_contacts.py`.
-    found |= {type(part) for part, _, _ in CONTACTS.values()}
+    # Derivatives through contacts and dry friction are those of `tests/simulate/test_contacts.py` and
+    # `test_dry_friction.py`.
+    found |= {type(part) for part, _, _ in CONTACTS.values()} | {type(part) for *_, part in FRICTIONS.values()}
     for module in (planar, spatial, mb):
         assert left_out(module, OF_SCENES, found) == set()
     for module, kind in ((contact, AbstractNormalLaw), (contact, AbstractFrictionLaw), (terrain, AbstractTerrain)):

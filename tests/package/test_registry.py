@@ -6,6 +6,7 @@ import typing
 import diffrax
 import pytest
 from every_contact import CONTACTS
+from every_dry_friction import FRICTIONS
 from every_formulation import FORMULATIONS
 from every_part import EXAMPLES, METHODS
 from exports import OF_SCENES, exported, missing
@@ -45,7 +46,7 @@ def examples(space):
 def test_every_part_stands_in_a_scene(module, name):
     # Every one of these scenes has gravity. Friction in the plane stands among the functions and laws of joints.
     laws = examples("functions") if module is planar else []
-    contacts = [part for part, _, _ in CONTACTS.values()]
+    contacts = [part for part, _, _ in CONTACTS.values()] + [part for *_, part in FRICTIONS.values()]
     assert missing(module, OF_SCENES, examples(name), laws, contacts, ["Gravity"]) == set()
 
 

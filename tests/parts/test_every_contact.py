@@ -24,15 +24,15 @@ def test_gap_and_its_derivatives(name):
     @jax.jit
     def ahead(s):
         q_s = displaced(system, t, q, s * u)
-        return of.gaps(system, t, q_s)[0], of.gap_rates(system, t, q_s, u)[0]
+        return of.gaps(system, t, q_s)[0], of.direction_rates(system, t, q_s, u)[0]
 
     h = 1e-5
     slope = [(a - b) / (2 * h) for a, b in zip(ahead(h), ahead(-h), strict=True)]
-    np.testing.assert_allclose(of.gap_rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(of.direction_rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
     none = jnp.zeros_like(u)
-    np.testing.assert_allclose(of.gap_accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
-    gradient = of.gap_gradients(system, t, q, u)
-    np.testing.assert_allclose(gradient @ u, of.gap_rates(system, t, q, u), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
+    gradient = of.direction_gradients(system, t, q, u)
+    np.testing.assert_allclose(gradient @ u, of.direction_rates(system, t, q, u), rtol=1e-12, atol=1e-15)
     closed = of.with_modes(system, q, of.CLOSED)
     rows = system.jacobian(t, closed, u)[np.array(system.contacts.rows)]
     np.testing.assert_allclose(rows, gradient, rtol=1e-12, atol=1e-14)
@@ -47,9 +47,9 @@ def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
     (free, none), (held, forces) = at(of.OPEN), at(of.CLOSED)
     (row,) = system.contacts.rows
     assert none[row] == 0
-    left = of.gap_accelerations(system, t, state.q, u, held)
+    left = of.direction_accelerations(system, t, state.q, u, held)
     np.testing.assert_allclose(left, 0.0, atol=1e-12)
-    assert (forces[row] > 0) == (of.gap_accelerations(system, t, state.q, u, free)[0] < 0)
+    assert (forces[row] > 0) == (of.direction_accelerations(system, t, state.q, u, free)[0] < 0)
 
 
 @pytest.mark.parametrize("name", CONTACTS)

@@ -73,8 +73,8 @@ def linearise(
 
     **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
     constraints, is singular, is no equilibrium or steady motion, with the accelerations that remain; for a motion whose
-    linear equations change with time; for contacts that are closed; and for inputs that move joints. Under a trace the
-    result is NaN instead.
+    linear equations change with time; for contacts that are closed, and dry friction; and for inputs that move joints.
+    Under a trace the result is NaN instead.
     """
     check_system("linearise", system)
     state = checked_guess("linearise", system, state)
@@ -84,6 +84,9 @@ def linearise(
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
+    if system.contacts is not None and system.contacts.frictions is not None:
+        names = ", ".join(system.contacts.frictions.names)
+        raise ValueError(f"linearise: {names} may stick or slip, which no linear equation describes. Remove it.")
     opens = are_open(system, state.q)
     if not is_traced(opens) and not np.all(opens):
         closed = [name for name, is_open in zip(contacts_of(system).names, opens, strict=True) if not is_open]

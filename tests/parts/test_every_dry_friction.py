@@ -1,0 +1,129 @@
+"""Dry friction in every kind of joint and contact by itself: its constraint, its force, its numbers, its words."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from every_dry_friction import FRICTIONS, friction_scene
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.parts import terrain
+from jaxmb.system import gaps as of
+
+
+def state_of(system):
+    """A state with velocities, in which contacts are closed."""
+    return mb.assemble(system, fix={"joint.mode": 1} if system.contacts.names else {})
+
+
+@pytest.mark.parametrize("name", FRICTIONS)
+def test_stick_is_a_constraint_and_slip_a_force(name):
+    system = friction_scene(name)
+    state = state_of(system)
+    t, q, u = jnp.zeros(()), state.q, state.u
+    modes = of.modes_of(system, q)
+    at = lambda mode: of.with_modes(system, q, modes.at[-1].set(mode))
+    slip = of.direction_rates(system, t, q, u)[-1]
+    assert abs(slip) > 1e-3
+
+    # Where it sticks, its row is that of the slip.
+    udot, multipliers = accelerations(system, Multipliers(), t, at(of.STICK), u)
+    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, udot)[-1], 0.0, atol=1e-11)
+    row = system.contacts.frictions.rows[0]
+    np.testing.assert_allclose(of.direction_gradients(system, t, q, u)[-1] @ u, slip, rtol=1e-12)
+    assert name in ("pin", "two discs", "point on a plane that moves") or multipliers[row] != 0
+
+    # Where it slips, it takes μ N |s|, and N is the force of the joint.
+    mode = of.FORWARD if slip > 0 else of.BACKWARD
+    udot, multipliers = accelerations(system, Multipliers(), t, at(mode), u)
+    assert multipliers[row] == 0
+    times, states = t[None], mb.State(at(mode)[None], u[None])
+    reaction = system.reaction("joint", times, states, multipliers[None])
+    normal = np.linalg.norm(reaction.force[0])
+    if system.contacts.names:
+        # That of a contact has a sign, so that the law is smooth where an iteration passes through zero.
+        normal = normal * np.sign(multipliers[system.contacts.rows[0]])
+    power = jnp.dot(system.nonideal_force(t, at(mode), u, multipliers), u)
+    np.testing.assert_allclose(power, -0.3 * normal * abs(slip), rtol=1e-10)
+    reactions = system.friction_reactions(t, q, u, multipliers)
+    np.testing.assert_allclose(jnp.linalg.norm(reactions), abs(normal), rtol=1e-10)
+    residual = system.inertia(t, q, u).product(udot) - system.force(t, q, u)
+    force = system.constraint_force(t, at(mode), u, multipliers) + system.nonideal_force(t, at(mode), u, multipliers)
+    np.testing.assert_allclose(residual, force, atol=1e-10)
+
+    # And otherwise nothing.
+    assert jnp.all(system.nonideal_force(t, at(of.FREE), u, multipliers) == 0)
+
+
+def test_words_and_numbers():
+    system = friction_scene("pin")
+    text = str(system.describe())
+    assert "DryFriction  rub  of joint, where it sticks 1 row each" in text
+    assert "3 coordinates, 3 velocities" not in text and "4 coordinates, 4 velocities" in text
+    assert "rub.mode" in system.coordinate_names()
+    assert {"rub.coefficient", "rub.static_coefficient", "rub.radius"} <= set(mb.parameters(system))
+    changed = mb.with_parameters(system, {"rub.coefficient": 0.1, "rub.static_coefficient": 0.2})
+    assert changed.contacts.frictions.coefficient == 0.1 and changed.contacts.frictions.limit == 0.2
+    # Without a coefficient of stick that of slip holds.
+    changed = mb.with_parameters(friction_scene("slide"), {"rub.coefficient": 0.1})
+    assert changed.contacts.frictions.limit == 0.1
+
+
+BODY = planar.Body("a", mass=1.0, inertia=1.0)
+SLIDE = planar.Prismatic("joint", "ground", "a", axis=(1.0, 0.0), point=(0.0, 0.0))
+PIN = planar.Revolute("joint", "ground", "a", point=(0.0, 0.5))
+FLOOR = mb.RigidContact("joint", "a", terrain=terrain.Flat(), radius=0.1)
+BAD = {
+    "a negative coefficient": (BODY, [SLIDE], {"coefficient": -0.1}, "coefficient must be non-negative, got -0.1"),
+    "a limit below it": (
+        BODY,
+        [SLIDE],
+        {"coefficient": 0.3, "static_coefficient": 0.2},
+        "static_coefficient must not be less than coefficient, got 0.2 and 0.3",
+    ),
+    "a pin without radius": (BODY, [PIN], {"coefficient": 0.3}, "turns: give the radius of its pin"),
+    "a slide with radius": (BODY, [SLIDE], {"coefficient": 0.3, "radius": 0.1}, "slides and has no radius"),
+    "a floor with radius": (BODY, [FLOOR], {"coefficient": 0.3, "radius": 0.1}, "slides and has no radius"),
+    "two coordinates": (
+        spatial.Body("a", mass=1.0, inertia=(1.0, 1.0, 1.0)),
+        [spatial.Cylindrical("joint", "ground", "a", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))],
+        {"coefficient": 0.3},
+        "must have one coordinate, a number, as a pin or a slide has; it has",
+    ),
+    "a rope": (BODY, [mb.Slack("joint", "ground", "a", length=2.0)], {"coefficient": 0.3}, "has no point at which"),
+    "space": (
+        spatial.Body("a", mass=1.0, inertia=(1.0, 1.0, 1.0)),
+        [FLOOR],
+        {"coefficient": 0.3},
+        "friction of rigid contacts is planar; use a compliant contact in space",
+    ),
+    "no such joint": (BODY, [PIN.named("other")], {"coefficient": 0.3}, "joint"),
+    "a redundant joint": (
+        BODY,
+        [SLIDE, planar.Prismatic("twin", "ground", "a", axis=(1.0, 0.0), point=(0.0, 0.0))],
+        {"coefficient": 0.3},
+        "needs the force of 'joint', which is not determined",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name):
+    body, joints, options, message = BAD[name]
+    with pytest.raises(ValueError, match="DryFriction 'rub'") as caught:
+        mb.Scene([body], joints=joints, forces=[mb.DryFriction("rub", "joint", **options)]).compile()
+    assert message in str(caught.value)
+
+
+def test_what_needs_smooth_forces_refuses_it():
+    system = friction_scene("slide")
+    with pytest.raises(ValueError, match="rub may stick or slip"):
+        mb.linearise(system, mb.assemble(system))
+    with pytest.raises(ValueError, match="remove friction"):
+        mb.equilibrium(system)
+    with pytest.raises(ValueError, match="joints must hold constraints"):
+        mb.Scene([BODY], joints=[SLIDE, mb.DryFriction("rub", "joint", coefficient=0.3)])
+    with pytest.raises(ValueError, match="coefficient' must be constant"):
+        series = mb.Series([0.0, 1.0], [0.1, 0.2])
+        mb.simulate(system, mb.assemble(system), t1=1.0, inputs={"rub.coefficient": series})

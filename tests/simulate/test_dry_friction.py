@@ -1,0 +1,284 @@
+"""Dry friction that sticks and slips, against closed forms: times, motions, impulses, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+from scipy.integrate import quad
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.parts import terrain
+from jaxmb.solvers import Adams
+
+G = 9.81
+DOWN = mb.Gravity((0.0, -G))
+
+
+def slider(angle=0.0, velocity=3.0, **coefficients):
+    """A block on an incline, along which it moves."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    rail = planar.Prismatic("rail", "ground", "block", axis=along, point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    return mb.Scene(
+        [planar.Body("block", mass=2.0, inertia=0.1, velocity=velocity * along)],
+        joints=[rail],
+        forces=[DOWN, mb.DryFriction("rub", "rail", **coefficients)],
+    ).compile()
+
+
+@pytest.mark.always
+def test_a_block_slides_stops_and_stays():
+    system = slider(coefficient=0.3)
+    motion = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=[0.5, 2.0], rtol=1e-10)
+    (stop,) = motion.events
+    np.testing.assert_allclose(stop.time, 3.0 / (0.3 * G), rtol=1e-11)
+    assert (stop.part, stop.kind, stop.impulse) == ("rub", "stick", 0.0)
+    x = [3.0 * 0.5 - 0.15 * G * 0.25, 9.0 / (0.6 * G)]
+    np.testing.assert_allclose(motion["block"].position[:, 0], x, rtol=1e-11)
+    np.testing.assert_array_equal(motion["block"].velocity[1], [0.0, 0.0])
+    np.testing.assert_allclose(motion.reactions["rub"].force, [[-0.6 * G, 0.0], [0.0, 0.0]], atol=1e-12)
+    # A motion goes on from where another one ended.
+    end = jax.tree.map(lambda y: y[-1], motion.ys)
+    after = mb.simulate(system, end, t0=2.0, t1=3.0, saveat=[2.5, 3.0], rtol=1e-10)
+    np.testing.assert_array_equal(after["block"].position[:, 0], end.q[0])
+    assert len(after.events) == 0
+
+
+@pytest.mark.parametrize("tan, time", [(0.29, None), (0.31, 0.7)])
+def test_a_block_stays_on_an_incline_within_the_cone(tan, time):
+    """Below the angle of friction nothing moves, above it the block slides down; forces are those of statics."""
+    angle = np.arctan(tan)
+    system = slider(angle, 0.0, coefficient=0.3)
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=[0.5, 1.0], rtol=1e-10)
+    along = motion["block"].position @ np.array([np.cos(angle), np.sin(angle)])
+    slides = 0.0 if time is None else G * (np.sin(angle) - 0.3 * np.cos(angle))
+    np.testing.assert_allclose(along, -0.5 * slides * np.array([0.25, 1.0]), rtol=1e-9, atol=1e-15)
+    held = 2.0 * G * (np.sin(angle) if time is None else 0.3 * np.cos(angle))
+    np.testing.assert_allclose(np.linalg.norm(motion.reactions["rub"].force, axis=1), held, rtol=1e-10)
+
+
+@pytest.mark.parametrize("space", ["planar", "spatial"])
+def test_a_wheel_on_a_pin_stops(space):
+    if space == "planar":
+        wheel = planar.Body("wheel", mass=2.0, inertia=0.3, angular_velocity=4.0)
+        pin = planar.Revolute("pin", "ground", "wheel", point=(0.0, 0.0))
+        gravity = DOWN
+    else:
+        wheel = spatial.Body("wheel", mass=2.0, inertia=(0.2, 0.3, 0.2), angular_velocity=(0.0, 4.0, 0.0))
+        pin = spatial.Revolute("pin", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+        gravity = mb.Gravity((0.0, 0.0, -G))
+    rub = mb.DryFriction("rub", "pin", coefficient=0.4, radius=0.05)
+    system = mb.Scene([wheel], joints=[pin], forces=[gravity, rub]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=4.0, rtol=1e-9)
+    (stop,) = motion.events
+    np.testing.assert_allclose(stop.time, 0.3 * 4.0 / (0.4 * 2.0 * G * 0.05), rtol=1e-9)
+
+
+MASS, STIFFNESS, SPEED, SLIP, STICK = 2.0, 50.0, 0.5, 0.2, 0.35
+
+
+def belt():
+    """A block on a spring, on a belt that moves: it sticks and slips by turns."""
+    bodies = [planar.Body(name, mass=MASS, inertia=0.1, velocity=(SPEED, 0.0)) for name in ("belt", "block")]
+    joints = [
+        planar.Prismatic("rail", "ground", "belt", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+        planar.Prismatic("slide", "belt", "block", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+        mb.JointDriver("drive", "rail.displacement", rate=SPEED),
+    ]
+    spring = planar.SpringDamper("spring", "ground", "block", stiffness=STIFFNESS, free_length=0.0)
+    rub = mb.DryFriction("rub", "slide", coefficient=SLIP, static_coefficient=STICK)
+    return mb.Scene(bodies, joints=joints, forces=[DOWN, spring, rub]).compile()
+
+
+def test_stick_slip_on_a_belt():
+    system = belt()
+    motion = mb.simulate(system, mb.assemble(system), t1=6.0, rtol=1e-10)
+    further, w = (STICK - SLIP) * MASS * G / STIFFNESS, np.sqrt(STIFFNESS / MASS)
+    first = STICK * MASS * G / STIFFNESS / SPEED
+    period = 2 * further / SPEED + (2 * np.pi - 2 * np.arctan(further * w / SPEED)) / w
+    assert [event.kind for event in motion.events] == ["slip", "stick"] * 4 + ["slip"]
+    np.testing.assert_allclose(
+        [event.time for event in motion.events][::2], first + period * np.arange(5.0), rtol=1e-10
+    )
+
+
+def ramp():
+    """A block that slides to a stop, and is set in motion again by a force that grows."""
+    push = mb.Force(
+        "push", ["block"], lambda x, v, t, p: jnp.stack([p["rate"] * t, 0 * t, 0 * t])[None], parameters={"rate": 4.0}
+    )
+    rail = planar.Prismatic("rail", "ground", "block", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    block = planar.Body("block", mass=2.0, inertia=0.1, velocity=(1.0, 0.0))
+    rub = mb.DryFriction("rub", "rail", coefficient=0.3, static_coefficient=0.4)
+    return mb.Scene([block], joints=[rail], forces=[DOWN, rub, push]).compile()
+
+
+RAMP = ramp()
+RAMPED = {
+    name: mb.parameters(RAMP)[name] for name in ("rub.coefficient", "rub.static_coefficient", "block.mass", "push.rate")
+}
+
+
+def ramped(p):
+    """Its displacement after 3 s, in closed form."""
+    rate, slow = p["push.rate"] / p["block.mass"], p["rub.coefficient"] * G
+    stops = (slow - jnp.sqrt(slow**2 - 2 * rate)) / rate
+    first = stops + rate * stops**3 / 6 - slow * stops**2 / 2
+    begins = p["rub.static_coefficient"] * G / rate
+    further = rate * ((3.0**3 - begins**3) / 6 - begins**2 * (3.0 - begins) / 2)
+    return first + further - slow * (3.0 - begins) ** 2 / 2
+
+
+def test_derivatives_through_stick_and_slip():
+    """In reverse and forwards, against the closed form; the times of both events depend on the parameters."""
+
+    def block(p):
+        system = mb.with_parameters(RAMP, p)
+        motion = mb.simulate(system, mb.assemble(system), t1=3.0, saveat=[3.0], rtol=1e-10)
+        return motion["block"].position[-1, 0]
+
+    value, exact = jax.value_and_grad(ramped)(RAMPED)
+    found, gradient = jit_quickly(jax.value_and_grad(block))(RAMPED)
+    np.testing.assert_allclose(found, value, rtol=1e-9)
+    for name in RAMPED:
+        np.testing.assert_allclose(gradient[name], exact[name], rtol=1e-7, err_msg=name)
+    ahead = {name: jnp.ones_like(value) for name, value in RAMPED.items()}
+    along = jit_quickly(lambda p: jax.jvp(block, (p,), (ahead,))[1])(RAMPED)
+    np.testing.assert_allclose(along, sum(gradient.values()), rtol=1e-9)
+
+
+RADIUS = 0.2
+
+
+def disc(coefficient=0.2, height=RADIUS, velocity=3.0, spin=0.0, restitution=0.0):
+    body = planar.Body(
+        "disc",
+        mass=1.5,
+        inertia=0.5 * 1.5 * RADIUS**2,
+        position=(0.0, height),
+        velocity=(velocity, 0.0),
+        angular_velocity=spin,
+    )
+    floor = mb.RigidContact("floor", "disc", terrain=terrain.Flat(), radius=RADIUS, restitution=restitution)
+    rub = mb.DryFriction("rub", "floor", coefficient=coefficient)
+    return mb.Scene([body], joints=[floor], forces=[DOWN, rub]).compile()
+
+
+DISC = disc()
+
+
+def test_a_disc_rolls_after_slipping():
+    motion = mb.simulate(DISC, mb.assemble(DISC), t1=1.0, saveat=[0.3, 1.0], rtol=1e-10)
+    stick = motion.events[-1]
+    np.testing.assert_allclose(stick.time, 3.0 / (3 * 0.2 * G), rtol=1e-10)
+    assert stick.kind == "stick"
+    np.testing.assert_allclose(motion["disc"].velocity[:, 0], [3.0 - 0.2 * G * 0.3, 2.0], rtol=1e-10)
+    np.testing.assert_allclose(
+        motion["disc"].angular_velocity, [-2 * 0.2 * G * 0.3 / RADIUS, -2.0 / RADIUS], rtol=1e-10
+    )
+    np.testing.assert_allclose(motion.reactions["rub"].force, [[-0.2 * 1.5 * G, 0.0], [0.0, 0.0]], atol=1e-10)
+
+
+@pytest.mark.parametrize("coefficient, spin", [(0.2, 0.0), (0.05, 0.0), (0.2, -40.0)])
+def test_friction_has_an_impulse(coefficient, spin):
+    """That of a disc that bounces: in the cone, against the slip that remains, or such that none remains."""
+    system = disc(coefficient, 1.0, 2.0, spin, 0.5)
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=[0.5], rtol=1e-10)
+    falls = np.sqrt(2 * (1.0 - RADIUS) * G)
+    normal = 1.5 * 1.5 * falls
+    # The slip of the rim is that of the disc and of its spin, and changes by 3 / m for each unit of impulse.
+    slip = 2.0 + RADIUS * spin
+    impulse = np.clip(-1.5 * slip / 3, -coefficient * normal, coefficient * normal)
+    floor, rub = motion.events
+    assert (floor.kind, rub.kind, rub.part) == ("impact", "impact", "rub")
+    np.testing.assert_allclose([floor.impulse, rub.impulse], [normal, impulse], rtol=1e-9)
+    np.testing.assert_allclose(motion["disc"].velocity[-1, 0], 2.0 + impulse / 1.5, rtol=1e-9)
+    np.testing.assert_allclose(motion["disc"].angular_velocity[-1], spin + 2 * impulse / 1.5 / RADIUS, rtol=1e-9)
+
+
+def test_derivatives_through_an_impact_with_friction():
+    """Of a bounce whose slip remains, and of one whose slip ends, and of rolling after slipping."""
+
+    bouncing = disc(0.1, 1.0, 2.0, 0.0, 0.5)
+
+    def after(p):
+        system = mb.with_parameters(bouncing, {"rub.coefficient": p[0], "floor.restitution": p[1]})
+        motion = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=[0.7, 1.0], rtol=1e-10)
+        return motion["disc"].position[:, 0]
+
+    def exact(p):
+        time = jnp.sqrt(2 * (1.0 - RADIUS) / G)
+        first = p[0] * G * time * (1 + p[1])
+        # The second change of velocity is less where slip ends.
+        second = jnp.minimum(first * p[1], (2.0 - 3 * first) / 3)
+        again = time * (1 + 2 * p[1])
+        return jnp.stack([2.0 * t - first * (t - time) - second * jnp.maximum(t - again, 0.0) for t in (0.7, 1.0)])
+
+    p = jnp.array([0.05, 0.5])
+    np.testing.assert_allclose(jit_quickly(after)(p), exact(p), rtol=1e-9)
+    reverse, forward = jit_quickly(jax.jacrev(after))(p), jit_quickly(jax.jacfwd(after))(p)
+    np.testing.assert_allclose(reverse, jax.jacobian(exact)(p), rtol=1e-7)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+
+
+HALF, TALL = 0.1, 0.4
+
+
+def test_a_rocking_block():
+    """Housner's: between impacts a pendulum about a corner, and at each impact the angular velocity falls by
+    `1 - 1.5 sin² α`. Source: G. W. Housner, Bull. Seism. Soc. Am. 53, 1963.
+    """
+    reach, alpha, mass = np.hypot(HALF, TALL), np.arctan(HALF / TALL), 2.0
+    own = mass * (HALF**2 + TALL**2) / 3
+    about = own + mass * reach**2
+
+    def quarter(angle):
+        rate = lambda now: np.sqrt(2 * mass * G * reach / about * (np.cos(alpha - angle) - np.cos(alpha - now)))
+        return quad(lambda r: 2 * r / rate(angle - r * r), 0.0, np.sqrt(angle), epsabs=1e-13, epsrel=1e-13)[0]
+
+    start = angle = 0.5 * alpha
+    times, now = [], 0.0
+    for _ in range(4):
+        times.append(now + quarter(angle))
+        kinetic = (np.cos(alpha - angle) - np.cos(alpha)) * (1 - 1.5 * np.sin(alpha) ** 2) ** 2
+        angle = alpha - np.arccos(np.cos(alpha) + kinetic)
+        now = times[-1] + quarter(angle)
+
+    c, s = np.cos(start), np.sin(start)
+    position = (c * HALF - s * TALL, s * HALF + c * TALL)
+    corners = {"left": (-HALF, -TALL), "right": (HALF, -TALL)}
+    floors = [mb.RigidContact(own, "block", terrain=terrain.Flat(), centre=at) for own, at in corners.items()]
+    rubs = [mb.DryFriction(f"rub {own}", own, coefficient=0.8) for own in corners]
+    block = planar.Body("block", mass=mass, inertia=own, position=position, angle=start)
+    system = mb.Scene([block], joints=floors, forces=[DOWN, *rubs]).compile()
+    state = mb.assemble(system, fix={"left.mode": 1})
+    motion = mb.simulate(system, state, t1=now, saveat=[now], rtol=1e-10)
+    closes = [event for event in motion.events if event.kind == "close"]
+    np.testing.assert_allclose([event.time for event in closes], times, rtol=1e-9)
+    assert [event.part for event in closes] == ["right", "left"] * 2
+    np.testing.assert_allclose(motion["block"].angle[-1], angle, rtol=1e-9)
+
+
+def painleve(angle, velocity, coefficient):
+    """A rod whose end slides on the ground."""
+    centre = (-np.cos(angle), np.sin(angle))
+    rod = planar.Body("rod", mass=1.0, inertia=1 / 3, position=centre, angle=-angle, velocity=(velocity, 0.0))
+    tip = mb.RigidContact("tip", "rod", terrain=terrain.Flat(), centre=(1.0, 0.0))
+    rub = mb.DryFriction("rub", "tip", coefficient=coefficient)
+    return mb.Scene([rod], joints=[tip], forces=[DOWN, rub]).compile()
+
+
+def test_a_rod_that_jams():
+    """Painlevé's: pushed along its lean it has no solution with much friction; pulled it has one."""
+    system = painleve(1.2, 5.0, 2.0)
+    with pytest.raises(RuntimeError, match=r"Painlevé's paradox.* These are 'tip', 'rub', at t = 0\."):
+        mb.simulate(system, mb.assemble(system, fix={"tip.mode": 1}), t1=0.2)
+    state = mb.assemble(painleve(1.2, -5.0, 2.0), fix={"tip.mode": 1})
+    motion = mb.simulate(system, state, t1=0.1, saveat=[0.1], rtol=1e-10, solver=Adams())
+    # Newton's and Euler's equations of the rod by themselves, with the force at the tip in its cone.
+    reaction, angle = motion.reactions["tip"].force[0, 1], -motion["rod"].angle[0]
+    assert reaction > 0
+    np.testing.assert_allclose(motion.reactions["rub"].force[0], [2.0 * reaction, 0.0], rtol=1e-9, atol=1e-12)
+    turn = reaction * np.cos(angle) + 2.0 * reaction * np.sin(angle)
+    np.testing.assert_allclose(motion.accelerations[0, 2], 3.0 * turn, rtol=1e-8)
