@@ -16,8 +16,8 @@ from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
 
-# Impulses of friction below this fraction of those of contacts are rounding errors.
-_ROUNDING = 1e-12
+# Impulses below this fraction of the largest one are rounding errors.
+_ROUNDING = 1e-10
 
 
 class FoundEvents(NamedTuple):
@@ -100,10 +100,12 @@ class ContactEvents(eqx.Module):
         )
         rows = []
         for k in np.flatnonzero(np.isfinite(times)):
+            # What an impulse must exceed: those that are less are rounding errors, also beside those of other events.
+            least = _ROUNDING * np.max(impulses[:, : self.contacts], initial=0.0)
             for i, name in enumerate(self.names):
                 if i >= self.contacts:
                     changed, impulse = before[k, i] != after[k, i], float(impulses[k, i])
-                    struck = abs(impulse) > _ROUNDING * np.max(impulses[k, : self.contacts], initial=0.0)
+                    struck = abs(impulse) > least
                     kind = "stick" if after[k, i] == STICK else "slip" if after[k, i] != FREE else "impact"
                     if struck or (changed and after[k, i] != FREE):
                         kind = kind if changed else "impact"
@@ -111,7 +113,7 @@ class ContactEvents(eqx.Module):
                     continue
                 was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
                 impulse = float(impulses[k, i])
-                struck = impulse > 0 and was_open
+                struck = impulse > least and was_open
                 kind = "impact" if struck and is_open else "close" if was_open and not is_open else "open"
                 if struck or was_open != is_open:
                     rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))

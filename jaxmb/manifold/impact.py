@@ -67,7 +67,7 @@ _BOUNCE = 1e3
 _REST = 1e-9
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections. They, and low
 # bounces, decide on what stays closed and sticks in this many rounds.
-_CORRECTIONS, _ROUNDS = 6, 3
+_CORRECTIONS, _ROUNDS = 6, 4
 
 
 class ContactGuards(AbstractGuards):
@@ -350,16 +350,16 @@ def _event(system, formulation, touch, t, y) -> _Event:
     rows = direction_gradients(system, t, q, u)
     jacobian = binding_velocities(system, t, free_q, u).selected(system.velocity_rank, system.velocity_scale())
     projector = jacobian.projector(inertia)
-    none = jnp.zeros(system.acceleration_rows, q.dtype)
+    zero = jnp.zeros(system.acceleration_rows, q.dtype)
     # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
     # change that these constraints ask for themselves.
     unmet = -velocity_rows(system, t, free_q, u)
     forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
-    asked = jnp.concatenate([jnp.tile(none, (len(rows), 1)), unmet[None]])
+    asked = jnp.concatenate([jnp.tile(zero, (len(rows), 1)), unmet[None]])
     moves, answers = jax.vmap(projector.solve)(forces, asked)
     moves, jump, answers = moves[:-1], moves[-1], answers[:-1]
     influence = rows @ moves.T
-    laws = _Laws(influence, frictions, n, m, *(_coefficients(system, t, q, u) if m else (none, none)))
+    laws = _Laws(influence, frictions, n, m, *(_coefficients(system, t, q, u) if m else (zero, zero)))
 
     def accelerated(u):
         """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
@@ -396,40 +396,44 @@ def _event(system, formulation, touch, t, y) -> _Event:
     touching = (modes[:n] != OPEN) | (about_to[:n] & is_first) | (gap + late * closing <= touch)
     at = direction_rates(system, t, q, u)
     bounce = contacts.restitution * jnp.maximum(-at[:n], 0.0)
-    approach = (at + rows @ jump).at[:n].add(-bounce)
-    struck, impulses, solvable = laws.impulses(approach, touching)
-    held = struck.closed
-    after = u + jump + impulses @ moves
-    rate = direction_rates(system, t, q, after)
-    udot, opening, reactions = accelerated(after)
-    sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
-    resting = touching & (rate[:n] <= _REST * sizes[:n])
-    # Slip that is not to be seen has ended.
-    ended = (jnp.abs(rate[n:]) <= _REST * sizes[n:]) | (jnp.abs(rate[n:]) <= _NEAR * touch)
-    slips = jnp.where(ended, 0.0, jnp.sign(rate[n:]))
 
-    def decide(k, carry):
-        """Which contacts stay closed, which laws hold then, and with which forces, in the next round."""
-        low, falls, _, forces = carry
-        # Contacts that would open by less than can be seen, before they close again, stay closed: of those that stay
-        # closed in the first round without them.
-        curve = (opening + influence @ forces)[:n]
-        falls = jnp.where(k == 1, jnp.where(curve < 0, -curve, 1.0), falls)
-        opens = rate[:n] ** 2 <= 2 * falls * _BOUNCE * touch
-        bounces = touching & ~resting & (curve < 0) & opens & (contacts.restitution < 1)
-        low = jnp.where(k == 1, bounces, low)
-        answers = laws.decided(opening, reactions, resting | low, slips, modes, forces)
-        return low, falls, answers, laws.forces(opening, reactions, answers)
+    def settle(k, before):
+        """The impact, the contacts that stay closed, and the laws that hold then with their forces, in a further round,
+        in which other contacts may bounce too low to be seen.
+        """
+        # Contacts that would open by less than can be seen, before they close again, stay closed: of those that open in
+        # the first round.
+        curve = (before.opening + influence @ before.forces)[:n]
+        falls = jnp.where(curve < 0, -curve, 1.0)
+        opens = before.rate[:n] ** 2 <= 2 * falls * _BOUNCE * touch
+        bounces = touching & ~before.resting & (curve < 0) & opens & (contacts.restitution < 1)
+        low = jnp.where(k == 1, bounces, before.low)
+        # Each bounce takes `restitution` times the time of the one before.
+        ratio = jnp.where(low & (bounce > 0), contacts.restitution, 0.0)
+        rest = jnp.where(low & (bounce > 0), 2 * before.rate[:n] / (falls * (1 - ratio)), 0.0)
+        rest = jnp.where(k == 1, rest, before.rest)
 
-    # At first all contacts and friction hold that may.
-    every = laws.all_of(resting, slips)
-    none = resting & False, jnp.ones(n, q.dtype), every, laws.forces(opening, reactions, every)
-    low, falls, last, forces = lax.fori_loop(0, _ROUNDS, decide, none)
-    staying, held = resting | low, held | low
-    # Each bounce takes `restitution` times the time of the one before.
-    bounces = low & (bounce > 0)
-    ratio = jnp.where(bounces, contacts.restitution, 0.0)
-    rest = jnp.where(bounces, 2 * rate[:n] / (falls * (1 - ratio)), 0.0)
+        approach = (at + rows @ jump).at[:n].add(-jnp.where(low, 0.0, bounce))
+        struck, impulses, solvable = laws.impulses(approach, touching)
+        after = u + jump + impulses @ moves
+        rate = direction_rates(system, t, q, after)
+        udot, opening, reactions = accelerated(after)
+        sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
+        resting = touching & ((rate[:n] <= _REST * sizes[:n]) | low)
+        # Slip that is not to be seen has ended.
+        ended = (jnp.abs(rate[n:]) <= _REST * sizes[n:]) | (jnp.abs(rate[n:]) <= _NEAR * touch)
+        slips = jnp.where(ended, 0.0, jnp.sign(rate[n:]))
+        answers = laws.decided(opening, reactions, resting, slips, modes, before.forces)
+        forces = laws.forces(opening, reactions, answers)
+        ok = solvable & answers.solvable
+        return _Settled(low, rest, struck, impulses, after, rate, udot, opening, resting, answers, forces, ok)
+
+    none = jnp.zeros(n + m, q.dtype)
+    no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True))
+    nothing = _Settled(none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, no, none, jnp.array(True))
+    settled = lax.fori_loop(0, _ROUNDS, settle, nothing)
+    low, rest, struck, impulses, after, rate, udot, _, staying, last, forces, solvable = settled
+    held = struck.closed | low
 
     implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
     new = jnp.where(last.closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
@@ -440,11 +444,10 @@ def _event(system, formulation, touch, t, y) -> _Event:
         left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(last.sticks, rate[n:], 0.0)])
         cancelled = held & jnp.concatenate([staying, last.sticks])
     else:
-        left, cancelled = jnp.where(staying, rate, 0.0), held & staying & jnp.any(low)
+        left, cancelled = jnp.where(staying, rate, 0.0), held & low
     held = held & _independent(influence, held)
-    lost = solved_components(influence, left, held & cancelled)
+    lost = jnp.where(held & cancelled, solved_components(influence, left, held & cancelled), 0.0)
     after = after + lost @ moves
-    impulses = impulses + jnp.where(jnp.any(low), lost, 0.0)
     energy = 0.5 * (jnp.dot(u, inertia.product(u)) - jnp.dot(after, inertia.product(after)))
     return _Event(
         late=late,
@@ -461,8 +464,25 @@ def _event(system, formulation, touch, t, y) -> _Event:
         modes=(modes, new),
         rest=jnp.pad(rest, (0, m)),
         energy=energy,
-        solvable=solvable & last.solvable,
+        solvable=solvable,
     )
+
+
+class _Settled(NamedTuple):
+    """What happens in an event in one round of `_event`; see there."""
+
+    low: Bool[Array, "contacts"]
+    rest: Float[Array, "contacts"]
+    struck: Answers
+    impulses: Float[Array, "laws"]
+    after: Float[Array, "nu"]
+    rate: Float[Array, "laws"]
+    udot: Float[Array, "nu"]
+    opening: Float[Array, "laws"]
+    resting: Bool[Array, "contacts"]
+    answers: Answers
+    forces: Float[Array, "laws"]
+    solvable: Bool[Array, ""]
 
 
 class _Laws(NamedTuple):
@@ -487,11 +507,6 @@ class _Laws(NamedTuple):
     def of_joints(self) -> np.ndarray:
         """Which friction is that of a joint, whose normal force is the size of its reaction."""
         return np.array(self.frictions.contacts if self.m else (), int) < 0
-
-    def all_of(self, staying, slips) -> Answers:
-        """All contacts and friction hold that may."""
-        force = self._may(staying)
-        return Answers(staying, force & (slips == 0), jnp.where(force, slips, 0.0), jnp.array(True))
 
     def forces(self, opening, reactions, answers: Answers):
         """The forces of laws that hold, from accelerations without them."""
@@ -530,7 +545,10 @@ class _Laws(NamedTuple):
         among = self._may(touching) & ~self.of_joints
         dry = self._dry(self.coefficient, none, none)
         answers = frictional(self.influence, approach, dry, jnp.concatenate([touching, among]))
-        return answers, jnp.linalg.solve(*laws_of(self.influence, approach, dry, answers)), answers.solvable
+        impulses = jnp.linalg.solve(*laws_of(self.influence, approach, dry, answers))
+        # Others are zero to all digits.
+        act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
+        return answers, jnp.where(act, impulses, 0.0), answers.solvable
 
     def decided(self, opening, reactions, staying, slips, modes, forces) -> Answers:
         """Which laws hold after an event, of contacts that are `staying`, and of friction that `slips`, or may stick

@@ -34,7 +34,8 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     it. By name the mode is `"stop.mode"`: `assemble(system, fix={"stop.mode": 1})` closes the gap.
 
     An impact is Newton's: the gap opens at `restitution` times the rate at which it closed. Contacts that are closed
-    at the same time share the impulse.
+    at the same time share the impulse. With friction, or with several coefficients at once, Newton's law may give a
+    little energy back: `energy_lost` of the event is negative then.
 
     **Fields:** `restitution` from 0 to 1, default 0.
     """

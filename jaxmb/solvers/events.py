@@ -28,6 +28,8 @@ else:
 _FRACTION, _EVALUATIONS = 1e-13, 60
 # A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
 _END = 1e-9
+# After an event that follows another one at once the next step is this fraction of the last one that was tried.
+_SHORTER = 1e-2
 # Where a guard is zero at the start of a step as well, its rise there is looked for down to this power of two.
 _HALVINGS = 30
 
@@ -228,11 +230,13 @@ class EventState(AbstractControllerState):
     """The state of `EventController`.
 
     **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
-    `count` of events, their `times` and the raveled `states` before them, in buffers; `touch` of the guards.
+    `length` that it had before it was made to end there; the `count` of events, their `times` and the raveled `states`
+    before them, in buffers; `touch` of the guards.
     """
 
     inner: Any
     target: Any
+    length: Any
     count: Any
     times: Float[Array, " events"]
     states: Float[Array, "events n"]
@@ -278,7 +282,8 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         times = jnp.full(self.most + 1, jnp.inf, t0.dtype)
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
         touch = jnp.zeros((), flat.dtype)
-        return first, EventState(inner, jnp.asarray(jnp.inf, t0.dtype), jnp.array(0), times, states, touch)
+        none = jnp.asarray(jnp.inf, t0.dtype), jnp.zeros((), t0.dtype), jnp.array(0)
+        return first, EventState(inner, *none, times, states, touch)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         before, found = controller_state, y_error
@@ -286,20 +291,25 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
             t0, t1, y0, y1_candidate, args, found.error, error_order, before.inner
         )
         # Compilers round what is computed in two places twice.
-        meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
+        meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(before.target.dtype).eps * jnp.abs(t1)
         close = (t1 - found.target) <= _END * (t1 - t0)
         at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
         at_zero = at_zero | (close & (found.lowest < -found.touch))
         crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
         again, ends = keep & crossed, keep & at_zero & ~crossed
-        # The controller inside does not learn of a step that was good but too long.
-        inner = jax.tree.map(lambda new, old: jnp.where(again, old, new), inner, before.inner)
+        # The controller inside does not learn of a step that was good but too long, nor of one without a length, where
+        # one event follows another at once.
+        empty = t1 <= t0
+        inner = jax.tree.map(lambda new, old: jnp.where(again | empty, old, new), inner, before.inner)
         next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, found.target, next_t1)
+        length = jnp.where(jnp.isinf(before.target), t1 - t0, before.length)
+        next_t1 = jnp.where(empty & ~again, t1 + _SHORTER * length, next_t1)
         target = jnp.where(again, found.target, jnp.inf)
         place = jnp.where(ends, jnp.minimum(before.count, self.most), self.most)
         state = EventState(
             inner,
             target,
+            length,
             before.count + ends.astype(before.count.dtype),
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),

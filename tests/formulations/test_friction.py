@@ -198,9 +198,8 @@ def test_equation_of_several_multipliers():
         radii = np.max(np.abs(np.linalg.eigvals(np.abs(slopes))), axis=1)
         sizes = np.tile([0.4, 0.99, 1.01, 3.0], 10) / radii
         slopes = jnp.asarray(slopes * sizes[:, None, None])
-        x, _, failed = jax.vmap(lambda slope, start: find_multipliers(jnp.abs, slope, start))(
-            slopes, jnp.asarray(starts)
-        )
+        solve = lambda slope, start: find_multipliers(jnp.abs, slope, start, np.zeros(start.size, bool))
+        x, _, failed = jax.vmap(solve)(slopes, jnp.asarray(starts))
         np.testing.assert_array_equal(failed, sizes * radii > 1)
         left = x - starts - jnp.einsum("bij,bj->bi", slopes, jnp.abs(x))
         np.testing.assert_allclose(left[~failed], 0.0, atol=1e-12)
