@@ -61,6 +61,8 @@ from .impulse import after_impulse
 
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
 _NEAR = 1e2
+# The state moves by less than this multiple of it until then.
+_FAR = 1e6
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e3
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
@@ -68,6 +70,8 @@ _REST = 1e-9
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections. They, and low
 # bounces, decide on what stays closed and sticks in this many rounds.
 _CORRECTIONS, _ROUNDS = 6, 4
+# Rebounds at which no energy is gained are found in this many trials.
+_TRIALS = 40
 
 
 class ContactGuards(AbstractGuards):
@@ -184,7 +188,8 @@ class _Event(NamedTuple):
     **Fields:** the time until then, `late`, and which gap or slip is `first` to be zero, none where `hits` is false;
     accelerations before and after; velocities before (`at`) and after (`u`); contacts and friction that are `held`:
     the rates of gaps are those of the impact, slips are zero; contacts that are `low`: they would bounce lower than can
-    be seen; the direction in which friction `slips` in the impact, zero without; see `Impact` for the others.
+    be seen; the direction in which friction `slips` in the impact, zero without; the `share` of the rebounds at which
+    no energy is gained; see `Impact` for the others.
     """
 
     late: Float[Array, ""]
@@ -202,6 +207,7 @@ class _Event(NamedTuple):
     rest: Float[Array, "contacts"]
     energy: Float[Array, ""]
     solvable: Bool[Array, ""]
+    share: Float[Array, ""]
 
 
 @eqx.filter_jit
@@ -272,7 +278,7 @@ def _impact_jvp(primals, tangents):
     def equations(system, t, q, u):
         unmet = velocity_rows(system, t, q, event.u)
         bounce = contacts_of(system).restitution * jnp.maximum(-direction_rates(system, t, q, u)[:n], 0.0)
-        bounce = jnp.where(event.held[:n] & ~event.low, bounce, 0.0)
+        bounce = jnp.where(event.held[:n] & ~event.low, event.share * bounce, 0.0)
         unmet = unmet.at[numbers[:n]].add(-bounce)
         force = system.inertia(t, q, u).product(event.u - u)
         return unmet, force - system.constraint_force(t, q, event.u, multipliers)
@@ -295,7 +301,11 @@ def _impact_jvp(primals, tangents):
         for k in np.flatnonzero(of_contact):
             law = law.at[n + k, frictions.contacts[k]].set(known[k] * event.slips[k])
     matrix = jnp.where(event.held[:, None], rows @ moves.T, law)
-    du = plain + jnp.linalg.solve(matrix, jnp.where(event.held, asked, more)) @ moves
+    impulses = jnp.linalg.solve(matrix, jnp.where(event.held, asked, more))
+    change = plain + impulses @ moves
+    du = change + _less_rebound(
+        event, (system, t, y.q), (dsystem, dt, dq), (du, change, impulses), (rows, moves, matrix)
+    )
     dq, du = dq - dlate * rates[1], du - dlate * event.after
     dq = jnp.where(_are_modes(system), 0.0, dq)
     dz = None
@@ -303,6 +313,23 @@ def _impact_jvp(primals, tangents):
         jump = system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u)
         dz = dense(dy.z, y.z) + dlate * jump
     return (after, event), (State(dq, du, dz), jax.tree.map(lambda _: None, event))
+
+
+def _less_rebound(event, at, along, tangents, known):
+    """The change of velocities by the derivative of the share of the rebounds at which no energy is gained."""
+    (system, t, q), (before, after, impulses), (rows, moves, matrix) = at, tangents, known
+    n, m = counts(system)
+    first, last = direction_rates(system, t, q, event.at), direction_rates(system, t, q, event.u)
+    changed = push(direction_rates, (*at, event.at), (*along, before))
+    changed = changed + push(direction_rates, (*at, event.u), (*along, after))
+    both = first + last
+    gained = jnp.dot(impulses, both) + jnp.dot(event.impulses, changed)
+    bounce = contacts_of(system).restitution * jnp.maximum(-first[:n], 0.0)
+    right = jnp.pad(jnp.where(event.held[:n] & ~event.low, bounce, 0.0), (0, m))
+    by_share = jnp.linalg.solve(matrix, right)
+    slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, rows @ (by_share @ moves))
+    less = event.share < 1
+    return jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * (by_share @ moves)
 
 
 def _release(system, formulation, event, at, along):
@@ -387,6 +414,9 @@ def _event(system, formulation, touch, t, y) -> _Event:
         ends = (jnp.abs(modes[n:]) == FORWARD) & (slip <= _NEAR * touch) & (slowing < 0)
         until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
         about_to = jnp.concatenate([about_to, ends])
+    # A zero that is far off in time, since rates are rounding errors, is none.
+    speed = jnp.max(jnp.maximum(jnp.abs(u), jnp.abs(before)) / system.velocity_scale()) * system.length
+    about_to = about_to & (jnp.abs(until) * speed <= _FAR * touch)
     first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
     hits = about_to[first]
     late = jnp.where(hits, until[first], 0.0)
@@ -413,10 +443,14 @@ def _event(system, formulation, touch, t, y) -> _Event:
         rest = jnp.where(low & (bounce > 0), 2 * before.rate[:n] / (falls * (1 - ratio)), 0.0)
         rest = jnp.where(k == 1, rest, before.rest)
 
-        approach = (at + rows @ jump).at[:n].add(-jnp.where(low, 0.0, bounce))
+        # Where the impact would give energy back, rebounds are less.
+        trial = before.trial
+        approach = (at + rows @ jump).at[:n].add(-jnp.where(low, 0.0, trial.share * bounce))
         struck, impulses, solvable = laws.impulses(approach, touching)
         after = u + jump + impulses @ moves
         rate = direction_rates(system, t, q, after)
+        gained, size = jnp.dot(impulses, at + rate), jnp.dot(jnp.abs(impulses), jnp.abs(at) + jnp.abs(rate))
+        trial = _next_trial(trial, gained, size, k)
         udot, opening, reactions = accelerated(after)
         sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
         resting = touching & ((rate[:n] <= _REST * sizes[:n]) | low)
@@ -426,13 +460,20 @@ def _event(system, formulation, touch, t, y) -> _Event:
         answers = laws.decided(opening, reactions, resting, slips, modes, before.forces)
         forces = laws.forces(opening, reactions, answers)
         ok = solvable & answers.solvable
-        return _Settled(low, rest, struck, impulses, after, rate, udot, opening, resting, answers, forces, ok)
+        share = before.trial.share
+        return _Settled(
+            low, rest, struck, impulses, after, rate, udot, opening, resting, answers, forces, ok, trial, share
+        )
 
     none = jnp.zeros(n + m, q.dtype)
     no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True))
-    nothing = _Settled(none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, no, none, jnp.array(True))
-    settled = lax.fori_loop(0, _ROUNDS, settle, nothing)
-    low, rest, struck, impulses, after, rate, udot, _, staying, last, forces, solvable = settled
+    one, yes = jnp.ones((), q.dtype), jnp.array(True)
+    trial = _Trial(one, 0 * one, one, 0 * one, one, jnp.array(False))
+    nothing = _Settled(none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, no, none, yes, trial, one)
+    going = lambda carry: (carry[0] < _ROUNDS) | (carry[1].trial.again & (carry[0] < _ROUNDS + _TRIALS))
+    advance = lambda carry: (carry[0] + 1, settle(*carry))
+    _, settled = lax.while_loop(going, advance, (jnp.array(0), nothing))
+    low, rest, struck, impulses, after, rate, udot, _, staying, last, forces, solvable, _, share = settled
     held = struck.closed | low
 
     implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
@@ -465,7 +506,41 @@ def _event(system, formulation, touch, t, y) -> _Event:
         rest=jnp.pad(rest, (0, m)),
         energy=energy,
         solvable=solvable,
+        share=share,
     )
+
+
+class _Trial(NamedTuple):
+    """The search for the largest `share` of the rebounds at which an impact gives no energy back: it is between `a`, at
+    which some is lost, and `b`, with what is gained at both; whether it goes on `again`.
+    """
+
+    share: Float[Array, ""]
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    of_a: Float[Array, ""]
+    of_b: Float[Array, ""]
+    again: Bool[Array, ""]
+
+
+def _next_trial(trial: _Trial, gained, size, k) -> _Trial:
+    """What is tried next, after the first rounds, in which the whole rebound was, and gained some energy."""
+    first = k == _ROUNDS - 1
+    found = jnp.abs(gained) <= _REST * 1e-3 * size
+    again = jnp.where(first, gained > _REST * size, trial.again & ~found)
+    same = gained > 0
+    start = first | (k == _ROUNDS)
+    # Without a rebound energy is lost; then the Illinois method.
+    a, of_a = jnp.where(same, trial.a, trial.share), jnp.where(same, jnp.where(start, 1.0, 0.5) * trial.of_a, gained)
+    b, of_b = jnp.where(same, trial.share, trial.b), jnp.where(same, gained, jnp.where(start, 1.0, 0.5) * trial.of_b)
+    slope = jnp.where(of_b == of_a, 1.0, of_b - of_a)
+    secant = (a * of_b - b * of_a) / slope
+    inside = (secant > a) & (secant < b)
+    share = jnp.where(first, 0.0, jnp.where(inside, secant, 0.5 * (a + b)))
+    share = jnp.where(again, share, trial.share)
+    keep = k < _ROUNDS - 1
+    new = _Trial(share, a, b, of_a, of_b, again)
+    return jax.tree.map(lambda old, new: jnp.where(keep, old, new), trial, new)
 
 
 class _Settled(NamedTuple):
@@ -483,6 +558,8 @@ class _Settled(NamedTuple):
     answers: Answers
     forces: Float[Array, "laws"]
     solvable: Bool[Array, ""]
+    trial: _Trial
+    share: Float[Array, ""]
 
 
 class _Laws(NamedTuple):

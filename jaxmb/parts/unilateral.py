@@ -34,8 +34,9 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     it. By name the mode is `"stop.mode"`: `assemble(system, fix={"stop.mode": 1})` closes the gap.
 
     An impact is Newton's: the gap opens at `restitution` times the rate at which it closed. Contacts that are closed
-    at the same time share the impulse. With friction, or with several coefficients at once, Newton's law may give a
-    little energy back: `energy_lost` of the event is negative then.
+    at the same time share the impulse. With friction, or with several coefficients at once, Newton's law may give
+    energy back (T. R. Kane and D. A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): the rebounds of such an impact are
+    all less, by the share at which no energy is gained.
 
     **Fields:** `restitution` from 0 to 1, default 0.
     """

@@ -89,16 +89,13 @@ def test_random_motions(name):
         start = mb.assemble(own, mb.State(state.q, speeds[k]))
         motion = mb.simulate(own, start, t1=END, saveat=TIMES, rtol=1e-8, max_events=400, throw=False)
         if motion.result != mb.RESULTS.successful:
-            assert motion.result == mb.RESULTS.contacts_undetermined
             failed += 1
             continue
         energy = np.asarray(motion.energy)
         assert np.all(np.isfinite(energy))
         size = np.ptp(energy) + 1.0
         assert np.max(np.diff(energy)) <= 1e-7 * size
-        # Newton's restitution gives energy back in a few impacts, where contacts with several coefficients meet.
-        lost = motion.events.energy_lost
-        assert -np.sum(np.minimum(lost, 0.0)) <= 1e-9 * size + 1e-2 * np.sum(np.maximum(lost, 0.0))
+        assert np.min(motion.events.energy_lost, initial=0.0) >= -1e-9 * size
         gaps = [motion[part].gap for part in own.contacts.names if "stop" not in part]
         assert np.min(gaps) >= -1e-10 * float(system.length)
-    assert failed <= MEMBERS // 10
+    assert failed <= MEMBERS // 20
