@@ -9,8 +9,10 @@ from scipy.integrate import quad
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.manifold.impact import impact
 from jaxmb.parts import terrain
 from jaxmb.solvers import Adams
+from jaxmb.system.gaps import direction_rates
 
 G = 9.81
 DOWN = mb.Gravity((0.0, -G))
@@ -282,3 +284,49 @@ def test_a_rod_that_jams():
     np.testing.assert_allclose(motion.reactions["rub"].force[0], [2.0 * reaction, 0.0], rtol=1e-9, atol=1e-12)
     turn = reaction * np.cos(angle) + 2.0 * reaction * np.sin(angle)
     np.testing.assert_allclose(motion.accelerations[0, 2], 3.0 * turn, rtol=1e-8)
+
+
+def falling_chain():
+    """A double pendulum whose end meets the floor with much friction: Kane's and Levinson's example."""
+    links = [
+        planar.Body(name, mass=1.0, inertia=0.03, position=(x, 0.7)) for name, x in (("upper", 0.3), ("lower", 0.9))
+    ]
+    joints = [
+        planar.Revolute("hip", "ground", "upper", point=(0.0, 0.7)),
+        planar.Revolute("knee", "upper", "lower", point=(0.6, 0.7)),
+        mb.RigidContact("floor", "lower", terrain=terrain.Flat(), centre=(0.3, 0.0), restitution=0.9),
+    ]
+    rub = mb.DryFriction("rub", "floor", coefficient=0.5)
+    return mb.Scene(links, joints=joints, forces=[DOWN, rub]).compile()
+
+
+def test_an_impact_gives_no_energy_back():
+    """Where the whole rebound would, it is less, and the derivative of the state after it is that of this rule."""
+    system = falling_chain()
+    state = mb.assemble(system, rates={"upper.angle": -1.5, "lower.angle": -3.0})
+    motion = mb.simulate(system, state, t1=0.5, rtol=1e-9)
+    floor, rub = list(motion.events)[:2]
+    assert (floor.kind, rub.kind) == ("impact", "impact") and abs(floor.energy_lost) < 1e-8
+    found = motion.found_events
+    t, flat, nq = found.times[0], found.states[0], system.nq
+    q, u = flat[:nq], flat[nq : nq + system.nu]
+
+    @jax.jit
+    def after(p, step):
+        own = mb.with_parameters(system, p)
+        return impact(own, motion.formulation, found.touch, t, mb.State(q, u * (1 + step))).after.u
+
+    given = {name: mb.parameters(system)[name] for name in ("lower.mass", "rub.coefficient", "floor.restitution")}
+    u_after = after(given, 0.0)
+    rate = lambda u: direction_rates(system, t, q, u)[0]
+    # Less than the whole rebound, of which the energy would be more than before.
+    assert 0 < rate(u_after) < 0.9 * -rate(u) * (1 - 1e-3)
+    for name in given:
+        along = {key: jnp.asarray(1.0 if key == name else 0.0) for key in given}
+        slope = jax.jvp(lambda p: after(p, 0.0), (given,), (along,))[1]
+        h = 1e-6
+        ahead, back = (after(given | {name: given[name] + s * h}, 0.0) for s in (1, -1))
+        np.testing.assert_allclose(slope, (ahead - back) / (2 * h), atol=1e-6 * np.max(np.abs(u_after)), err_msg=name)
+    slope = jax.jvp(lambda step: after(given, step), (0.0,), (1.0,))[1]
+    difference = (after(given, 1e-6) - after(given, -1e-6)) / 2e-6
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * np.max(np.abs(u_after)))
