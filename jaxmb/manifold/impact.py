@@ -13,6 +13,7 @@ event by that before it is the saltation matrix: P. C. Müller, "Calculation of 
 with discontinuities", Chaos, Solitons & Fractals 5, 1995.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -105,8 +106,7 @@ class ContactGuards(AbstractGuards):
         def forces():
             own = system.at(y)
             _, multipliers = _solved(own, self.formulation, t, q, y.u)
-            largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(own.force(t, q, y.u)))
-            largest = largest + jnp.finfo(q.dtype).tiny
+            largest = _largest_force(own, t, dataclasses.replace(y, q=q), multipliers)
             taken = multipliers[np.array(direction_rows(system))]
             if frictions is not None:
                 taken = taken.at[n:].set(_reserve(own, t, q, y.u, multipliers))
@@ -125,6 +125,12 @@ class ContactGuards(AbstractGuards):
         rates = direction_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
         watched = (modes_of(system, q) == OPEN) & (np.arange(rates.size) < n)
         return jnp.where(watched, rates, jnp.inf)
+
+
+def _largest_force(system, t, y, multipliers):
+    """What forces are compared with."""
+    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, y.q, y.u)))
+    return largest + jnp.finfo(largest.dtype).tiny
 
 
 def _reserve(system, t, q, u, multipliers):
@@ -244,7 +250,7 @@ def _impact(system, t, y, formulation, touch):
 
 @_impact.def_jvp
 def _impact_jvp(primals, tangents):
-    system, t, y, formulation, _ = primals
+    system, t, y, formulation, touch = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))
@@ -260,7 +266,7 @@ def _impact_jvp(primals, tangents):
         rate = rate.at[n:].set(direction_accelerations(system, t, y.q, event.at, event.before)[n:])
     dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
     if m and any(frictions_of(system).releases):
-        dlate = dlate + _release(system, formulation, event, (t, y), (dsystem, dt, dy))
+        dlate = dlate + _release(system, formulation, touch, event, (t, y), (dsystem, dt, dy))
     q = with_modes(system, y.q, event.modes[1])
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
     dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
@@ -332,7 +338,7 @@ def _less_rebound(event, at, along, tangents, known):
     return jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * (by_share @ moves)
 
 
-def _release(system, formulation, event, at, along):
+def _release(system, formulation, touch, event, at, along):
     """The derivative of the time at which friction that sticks reaches its limit, where slip begins at the event."""
     n, _ = counts(system)
     (t, y), (dsystem, dt, dy) = at, along
@@ -347,7 +353,11 @@ def _release(system, formulation, event, at, along):
     motion = State(system.rates(t, y.q, y.u), event.before, z)
     value = push(reserve, (system, t, y), (dsystem, dt, dy))
     rate = eqx.filter_jvp(lambda t, y: reserve(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
-    at_limit = jnp.any(released) & ~event.hits & ~jnp.any(event.impulses > 0) & (rate < 0)
+    # Friction that an impact sets in motion is not at its limit before.
+    _, multipliers = _solved(system, formulation, t, y.q, y.u)
+    left = jnp.abs(_reserve(system, t, y.q, y.u, multipliers)[own])
+    is_zero = left <= _NEAR * touch * _largest_force(system, t, y, multipliers)
+    at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
     return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
 
 

@@ -330,3 +330,32 @@ def test_an_impact_gives_no_energy_back():
     slope = jax.jvp(lambda step: after(given, step), (0.0,), (1.0,))[1]
     difference = (after(given, 1e-6) - after(given, -1e-6)) / 2e-6
     np.testing.assert_allclose(slope, difference, atol=1e-6 * np.max(np.abs(u_after)))
+
+
+def test_the_time_of_release_has_a_derivative_in_a_contact():
+    """Of a disc that rolls until the force on it is too large for stick, also where a closed contact has a rounding
+    error for a rate.
+    """
+    push = lambda x, v, t, p: jnp.stack([p["rate"] * t, 0 * t, 0 * t])[None]
+    body = planar.Body("disc", mass=1.5, inertia=0.5 * 1.5 * RADIUS**2, position=(0.0, RADIUS))
+    floor = mb.RigidContact("floor", "disc", terrain=terrain.Flat(), radius=RADIUS)
+    rub = mb.DryFriction("rub", "floor", coefficient=0.2, static_coefficient=0.3)
+    forces = [DOWN, rub, mb.Force("push", ["disc"], push, parameters={"rate": 10.0})]
+    system = mb.Scene([body], joints=[floor], forces=forces).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=2.0, rtol=1e-10)
+    (event,) = motion.events
+    # Stick takes a third of the force.
+    np.testing.assert_allclose(event.time, 3 * 0.3 * 1.5 * G / 10.0, rtol=1e-9)
+    found = motion.found_events
+    t, q, u = found.times[0], found.states[0][: system.nq], found.states[0][system.nq :]
+    # Velocities before and after differ by their accelerations times the time by which it is later.
+    later = 3 * 1.5 * G / 10.0
+    slower = (0.3 - 0.2) * G
+    for rounding in (0.0, -1e-16, 1e-16, -1e-14):
+
+        def after(limit, rounding=rounding):
+            own = mb.with_parameters(system, {"rub.static_coefficient": limit})
+            return impact(own, motion.formulation, found.touch, t, mb.State(q, u.at[1].add(rounding))).after.u[0]
+
+        slope = jax.jvp(after, (jnp.asarray(0.3),), (jnp.asarray(1.0),))[1]
+        np.testing.assert_allclose(slope, -slower * later, rtol=1e-7)
