@@ -35,6 +35,7 @@ from ..linalg.complementarity import (
 )
 from ..linalg.rotations import norm
 from ..solvers import AbstractGuards
+from ..solvers.events import narrowed
 from ..system import AbstractEquation
 from ..system.gaps import (
     CLOSED,
@@ -71,8 +72,8 @@ _REST = 1e-9
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections. They, and low
 # bounces, decide on what stays closed and sticks in this many rounds.
 _CORRECTIONS, _ROUNDS = 6, 4
-# Rebounds at which no energy is gained are found in this many trials.
-_TRIALS = 40
+# Rebounds at which no energy is gained are found in this many trials, to this fraction of what adds up in it.
+_TRIALS, _GAIN = 40, 1e-12
 
 
 class ContactGuards(AbstractGuards):
@@ -536,21 +537,12 @@ class _Trial(NamedTuple):
 def _next_trial(trial: _Trial, gained, size, k) -> _Trial:
     """What is tried next, after the first rounds, in which the whole rebound was, and gained some energy."""
     first = k == _ROUNDS - 1
-    found = jnp.abs(gained) <= _REST * 1e-3 * size
-    again = jnp.where(first, gained > _REST * size, trial.again & ~found)
-    same = gained > 0
-    start = first | (k == _ROUNDS)
-    # Without a rebound energy is lost; then the Illinois method.
-    a, of_a = jnp.where(same, trial.a, trial.share), jnp.where(same, jnp.where(start, 1.0, 0.5) * trial.of_a, gained)
-    b, of_b = jnp.where(same, trial.share, trial.b), jnp.where(same, gained, jnp.where(start, 1.0, 0.5) * trial.of_b)
-    slope = jnp.where(of_b == of_a, 1.0, of_b - of_a)
-    secant = (a * of_b - b * of_a) / slope
-    inside = (secant > a) & (secant < b)
-    share = jnp.where(first, 0.0, jnp.where(inside, secant, 0.5 * (a + b)))
-    share = jnp.where(again, share, trial.share)
-    keep = k < _ROUNDS - 1
+    again = jnp.where(first, gained > _REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
+    a, b, of_a, of_b, share = narrowed((trial.a, trial.b, trial.of_a, trial.of_b), trial.share, gained, k % 3 == 2)
+    # Without a rebound energy is lost.
+    share = jnp.where(again, jnp.where(first, 0.0, share), trial.share)
     new = _Trial(share, a, b, of_a, of_b, again)
-    return jax.tree.map(lambda old, new: jnp.where(keep, old, new), trial, new)
+    return jax.tree.map(lambda old, new: jnp.where(k < _ROUNDS - 1, old, new), trial, new)
 
 
 class _Settled(NamedTuple):

@@ -211,19 +211,30 @@ def _is_short(search: _Search):
 
 
 def _narrowed(search: _Search, value):
-    """The shorter interval with a value at `s` in it, and where the next one is asked for.
+    """The shorter interval with a value at `s` in it, and where the next one is asked for."""
+    # Every third interval is halved, so that the number of evaluations is bounded.
+    bisects = search.count % 3 == 2
+    a, b, of_a, of_b, s = narrowed((search.a, search.b, search.of_a, search.of_b), search.s, value, bisects)
+    return search._replace(a=a, b=b, of_a=of_a, of_b=of_b, s=s)
+
+
+def narrowed(interval: tuple[Any, Any, Any, Any], s: Any, value: Any, bisects: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """An interval in which a function changes its sign, with a further value of it in it, and where the next one is
+    asked for.
 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
     1971 (the Illinois method).
+
+    **Arguments:** `interval`: its ends, and the values there; `value` at `s`; `bisects`: whether its middle is next.
     """
-    same = jnp.sign(value) == jnp.sign(search.of_b)
-    a, of_a = jnp.where(same, search.a, search.s), jnp.where(same, 0.5 * search.of_a, value)
-    b, of_b = jnp.where(same, search.s, search.b), jnp.where(same, value, 0.5 * search.of_b)
+    a, b, of_a, of_b = interval
+    same = jnp.sign(value) == jnp.sign(of_b)
+    a, of_a = jnp.where(same, a, s), jnp.where(same, 0.5 * of_a, value)
+    b, of_b = jnp.where(same, s, b), jnp.where(same, value, 0.5 * of_b)
     slope = (of_b - of_a).astype(a.dtype)
     secant = (a * of_b.astype(a.dtype) - b * of_a.astype(a.dtype)) / jnp.where(slope == 0, 1.0, slope)
-    # Every third interval is halved, so that the number of evaluations is bounded.
-    good = (secant > a) & (secant < b) & (slope != 0) & (search.count % 3 != 2)
-    return search._replace(a=a, b=b, of_a=of_a, of_b=of_b, s=jnp.where(good, secant, 0.5 * (a + b)))
+    good = (secant > a) & (secant < b) & (slope != 0) & ~bisects
+    return a, b, of_a, of_b, jnp.where(good, secant, 0.5 * (a + b))
 
 
 class EventState(AbstractControllerState):
