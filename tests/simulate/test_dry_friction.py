@@ -1,5 +1,6 @@
 """Dry friction that sticks and slips, against closed forms: times, motions, impulses, derivatives."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +10,10 @@ from scipy.integrate import quad
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.manifold import Projection
 from jaxmb.manifold.impact import impact
 from jaxmb.parts import terrain
-from jaxmb.solvers import Adams
+from jaxmb.solvers import Adams, Hermite
 from jaxmb.system.gaps import direction_rates
 
 G = 9.81
@@ -45,6 +47,41 @@ def test_a_block_slides_stops_and_stays():
     after = mb.simulate(system, end, t0=2.0, t1=3.0, saveat=[2.5, 3.0], rtol=1e-10)
     np.testing.assert_array_equal(after["block"].position[:, 0], end.q[0])
     assert len(after.events) == 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"manifold": Projection(), "solver": diffrax.Tsit5()},
+        {"manifold": Projection()},
+        {"solver": Hermite()},
+    ],
+    ids=["Tsit5", "Projection", "Hermite"],
+)
+def test_other_solvers_and_manifolds(options):
+    system = slider(coefficient=0.3)
+    motion = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=[0.5, 2.0], rtol=1e-9, **options)
+    np.testing.assert_allclose([event.time for event in motion.events], [3.0 / (0.3 * G)], rtol=1e-9)
+    x = [3.0 * 0.5 - 0.15 * G * 0.25, 9.0 / (0.6 * G)]
+    np.testing.assert_allclose(motion["block"].position[:, 0], x, rtol=1e-9)
+
+
+def test_a_batch_whose_members_stop_at_other_times():
+    """One of them does not move at all, one does not stop; values and derivatives are those of each alone."""
+    system = slider(coefficient=0.3)
+    state = mb.assemble(system)
+
+    def end(speed):
+        start = mb.State(state.q, state.u.at[0].set(speed))
+        return mb.simulate(system, start, t1=1.0, saveat=[1.0], rtol=1e-9)["block"].position[-1, 0]
+
+    speeds = jnp.array([0.0, 1.0, -2.0, 5.0])
+    slow = 0.3 * G
+    exact = [0.0, 1.0 / (2 * slow), -4.0 / (2 * slow), 5.0 - slow / 2]
+    found, slopes = jit_quickly(jax.vmap(lambda v: jax.jvp(end, (v,), (jnp.ones_like(v),))))(speeds)
+    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
+    # At rest the displacement grows with the square of the speed.
+    np.testing.assert_allclose(slopes, [0.0, 1.0 / slow, 2.0 / slow, 1.0], rtol=1e-8, atol=1e-12)
 
 
 @pytest.mark.parametrize("tan, time", [(0.29, None), (0.31, 0.7)])
