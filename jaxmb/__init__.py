@@ -39,6 +39,7 @@ from .parts.series import Series as Series
 from .parts.servo import Servo as Servo
 from .parts.unilateral import (
     RigidBallContact as RigidBallContact,
+    RigidBoxContact as RigidBoxContact,
     RigidContact as RigidContact,
     RigidPlaneContact as RigidPlaneContact,
     Slack as Slack,

@@ -51,16 +51,16 @@ class ContactEvents(eqx.Module):
     """The events of contacts and dry friction along a motion, in the order of time; `print(motion.events)` shows a
     table, and `list(motion.events)` has an `Event` for each part that takes part in one.
 
-    A state that is saved just at an event may be that before it or that after it.
+    A state that is saved just at an event may be that before it or that after it. Times, impulses and energies have
+    first derivatives; `rest` counts as a constant.
 
     **Fields:** the `names` of the parts, and how many of them, the first ones, are `contacts`; `times` [s], shape
     (events,); `impulses` [N s, of angles N m s], shape (events, parts); `energy_lost` [J], shape (events,): that of the
     impact; `before` and `after`: modes, of a contact 0 where it is open, 1 where it is closed, 2 where others imply it,
     of friction 1 and -1 where it slips forwards and backwards, 2 where it sticks, 0 where it does nothing; `rest` [s],
-    shape (events, parts): the time from an event to
-    the end of the infinitely many bounces that begin with it and are too low to be resolved, after which the contact is
-    at rest; zero where there are none. Under `jit` or in a batch there are as many events as `max_events`, with times
-    of infinity after the last.
+    shape (events, parts): the time from an event to the end of the infinitely many bounces that begin with it and are
+    too low to be resolved, after which the contact is at rest; zero where there are none. Under `jit` or in a batch
+    there are as many events as `max_events`, with times of infinity after the last.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -143,7 +143,7 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
         taken = k < found.number
         flat = jnp.where(taken, flat, found.states[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
-        out = guards.impact(jnp.where(taken, t, found.times[0]), y)
+        out = guards.impact(jnp.where(taken, t, found.times[0]), y, dated=True)
         time = jnp.where(taken, t + out.late, jnp.inf)
         values = out.impulses, out.energy, *out.modes, out.rest
         return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)

@@ -89,7 +89,7 @@ class Dry(NamedTuple):
 
 class Answers(NamedTuple):
     """Which laws hold: contacts that are `closed`; friction that `sticks`; the direction in which other friction
-    `slips`, 1 or -1, and 0 where there is no force; whether there is a solution.
+    `slips`, 1 or -1, and 0 where there is no force; whether there is a solution, and no contact that slips has two.
     """
 
     closed: Bool[Array, "n"]
@@ -129,6 +129,10 @@ def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, amo
     of_normal, fixed = -sign[:, None] * limits, -sign * bound
     of_right = jnp.diag(may.astype(b.dtype))
     to_normal, to_slip = W[:, :n] + W[:, n:] @ of_normal, W[:, n:] @ of_right
+    # A normal force whose own friction draws the bodies together more than it pushes them apart, in Painlevé's paradox,
+    # has no value or two.
+    of_itself = jnp.diag(W[:n, :n] + W[:n, n:] @ jnp.where(may[:, None], 0.0, of_normal))
+    unique = jnp.all(of_itself >= -_PIVOT)
     free = b + W[:, n:] @ fixed
     idle = ~among[:n]
     rows_n = jnp.concatenate(
@@ -151,7 +155,7 @@ def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, amo
     force = among[n:] & pressed
     sticks = force & may & inside & ~backward
     direction = jnp.where(may, jnp.where(backward, -1.0, 1.0), dry.slips)
-    return Answers(closed & ~idle, sticks, jnp.where(force & ~sticks, direction, 0.0), solvable)
+    return Answers(closed & ~idle, sticks, jnp.where(force & ~sticks, direction, 0.0), solvable & unique)
 
 
 def laws_of(

@@ -116,9 +116,9 @@ class ContactGuards(AbstractGuards):
         held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
         return jnp.where(acts, held, free / system.length)
 
-    def impact(self, t: Scalar, y: State) -> "Impact":
-        """The event at a state."""
-        return impact(self.system.at(y), self.formulation, self.touch, t, y)
+    def impact(self, t: Scalar, y: State, dated: bool = False) -> "Impact":
+        """The event at a state; see `impact`."""
+        return impact(self.system.at(y), self.formulation, self.touch, t, y, dated)
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
@@ -218,24 +218,33 @@ class _Event(NamedTuple):
 
 
 @eqx.filter_jit
-def impact(system: AbstractEquation, formulation: AbstractFormulation, touch: Scalar, t: Scalar, y: State) -> Impact:
+def impact(
+    system: AbstractEquation,
+    formulation: AbstractFormulation,
+    touch: Scalar,
+    t: Scalar,
+    y: State,
+    dated: bool = False,
+) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
     The first gap that closes is zero later by a small time τ. The state moves on by τ, changes, and moves back by τ
     with the new equations. So the state after it is right to the second power of τ, and the derivative is that of a
-    motion whose event time depends on the state. There is no second derivative.
+    motion whose event time depends on the state. `late`, `impulses` and the `energy` have derivatives as well, `rest`
+    has none. There is no second derivative.
 
     **Arguments:** `system`: with the internal states of `y`; `touch`: gaps down to minus this, in units of the system's
-    size, count as zero.
+    size, count as zero; `dated`: whether `late` has its derivative also where the state after the event does not depend
+    on it, as where a contact opens.
     """
     t = jnp.asarray(t, y.q.dtype)
-    after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype))
-    event = lax.stop_gradient(event)
+    after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype), dated)
     return Impact(after, event.late, event.impulses, event.modes, event.rest, event.energy, event.solvable)
 
 
 @eqx.filter_custom_jvp
-def _impact(system, t, y, formulation, touch):
+def _impact(system, t, y, formulation, touch, dated):
+    del dated
     event = _event(system, formulation, touch * system.length, t, y)
     q = with_modes(system, y.q, event.modes[1])
     # The state moves on before the event, and back after it, each at the mean velocity.
@@ -251,7 +260,7 @@ def _impact(system, t, y, formulation, touch):
 
 @_impact.def_jvp
 def _impact_jvp(primals, tangents):
-    system, t, y, formulation, touch = primals
+    system, t, y, formulation, touch, dated = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))
@@ -266,7 +275,7 @@ def _impact_jvp(primals, tangents):
         zero = jnp.concatenate([zero, slip])
         rate = rate.at[n:].set(direction_accelerations(system, t, y.q, event.at, event.before)[n:])
     dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
-    if m and any(frictions_of(system).releases):
+    if dated or (m and any(frictions_of(system).releases)):
         dlate = dlate + _release(system, formulation, touch, event, (t, y), (dsystem, dt, dy))
     q = with_modes(system, y.q, event.modes[1])
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
@@ -310,20 +319,23 @@ def _impact_jvp(primals, tangents):
     matrix = jnp.where(event.held[:, None], rows @ moves.T, law)
     impulses = jnp.linalg.solve(matrix, jnp.where(event.held, asked, more))
     change = plain + impulses @ moves
-    du = change + _less_rebound(
-        event, (system, t, y.q), (dsystem, dt, dq), (du, change, impulses), (rows, moves, matrix)
-    )
-    dq, du = dq - dlate * rates[1], du - dlate * event.after
+    at, along = (system, t, y.q), (dsystem, dt, dq)
+    less = _less_rebound(event, at, along, (du, change, impulses), (rows, moves, matrix))
+    impulses, change = impulses + less, change + less @ moves
+    kinetic = lambda system, t, q, u: 0.5 * jnp.dot(u, system.inertia(t, q, u).product(u))
+    energy = push(kinetic, (*at, event.at), (*along, du)) - push(kinetic, (*at, event.u), (*along, change))
+    dq, du = dq - dlate * rates[1], change - dlate * event.after
     dq = jnp.where(_are_modes(system), 0.0, dq)
     dz = None
     if y.z is not None:
         jump = system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u)
         dz = dense(dy.z, y.z) + dlate * jump
-    return (after, event), (State(dq, du, dz), jax.tree.map(lambda _: None, event))
+    devent = jax.tree.map(lambda _: None, event)._replace(late=dlate, impulses=impulses, energy=energy)
+    return (after, event), (State(dq, du, dz), devent)
 
 
 def _less_rebound(event, at, along, tangents, known):
-    """The change of velocities by the derivative of the share of the rebounds at which no energy is gained."""
+    """The change of the impulses by the derivative of the share of the rebounds at which no energy is gained."""
     (system, t, q), (before, after, impulses), (rows, moves, matrix) = at, tangents, known
     n, m = counts(system)
     first, last = direction_rates(system, t, q, event.at), direction_rates(system, t, q, event.u)
@@ -336,28 +348,37 @@ def _less_rebound(event, at, along, tangents, known):
     by_share = jnp.linalg.solve(matrix, right)
     slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, rows @ (by_share @ moves))
     less = event.share < 1
-    return jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * (by_share @ moves)
+    return jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * by_share
 
 
 def _release(system, formulation, touch, event, at, along):
-    """The derivative of the time at which friction that sticks reaches its limit, where slip begins at the event."""
-    n, _ = counts(system)
+    """The derivative of the time at which a force reaches its limit: that of a contact that opens, which is zero, or of
+    friction that sticks, where slip begins at the event.
+    """
+    n, m = counts(system)
     (t, y), (dsystem, dt, dy) = at, along
-    released = (event.modes[0][n:] == STICK) & (event.modes[1][n:] != STICK)
-    own = jnp.argmax(released)
+    before, after = event.modes
+    released = jnp.concatenate(
+        [(before[:n] == CLOSED) & (after[:n] == OPEN), (before[n:] == STICK) & (after[n:] != STICK)]
+    )
 
-    def reserve(system, t, y):
+    def reserves(system, t, y):
+        """What the forces are within their limits, and what they are compared with."""
         _, multipliers = _solved(system, formulation, t, y.q, y.u)
-        return _reserve(system, t, y.q, y.u, multipliers)[own]
+        own = multipliers[np.array(direction_rows(system))]
+        if m:
+            own = own.at[n:].set(_reserve(system, t, y.q, y.u, multipliers))
+        return own, _largest_force(system, t, y, multipliers)
 
+    left, largest = reserves(system, t, y)
+    own = jnp.argmin(jnp.where(released, jnp.abs(left), jnp.inf))
+    reserve = lambda system, t, y: reserves(system, t, y)[0][own]
     z = None if y.z is None else system.state_rates(t, y.q, y.u)
     motion = State(system.rates(t, y.q, y.u), event.before, z)
     value = push(reserve, (system, t, y), (dsystem, dt, dy))
     rate = eqx.filter_jvp(lambda t, y: reserve(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
-    # Friction that an impact sets in motion is not at its limit before.
-    _, multipliers = _solved(system, formulation, t, y.q, y.u)
-    left = jnp.abs(_reserve(system, t, y.q, y.u, multipliers)[own])
-    is_zero = left <= _NEAR * touch * _largest_force(system, t, y, multipliers)
+    # What an impact opens, or sets in motion, is not at its limit before.
+    is_zero = jnp.abs(left[own]) <= _NEAR * touch * largest
     at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
     return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
 

@@ -18,7 +18,7 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
 from .coordinate_parts import AbstractScalarPart
-from .shapes import Ground, marked_ball, wheel
+from .shapes import Box, Ground, marked_ball, wheel
 from .space import AbstractSpace, both_points, separation
 from .terrain import AbstractTerrain, distance
 
@@ -234,6 +234,46 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPair):
 
     def touching(self, space, poses):
         return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
+
+
+class RigidBoxContact(AbstractRigidContact, AbstractPair):
+    """Rigid contact of a disc or ball of `body_b` with a rectangle (in the plane) or a box of `body_a`, at its faces,
+    edges and corners; frictionless without a `DryFriction`.
+
+    ```python
+    jaxmb.RigidBoxContact("step", "ground", "wheel", size=(1.0, 0.2), point_a=(2.0, 0.1), radius=0.3)
+    ```
+
+    The ball rolls or slides from a face over an edge without an event; where it does, its acceleration jumps.
+
+    **Arguments:** `size` [m], the lengths of the box along the axes of the frame of `body_a`; `radius` [m] > 0;
+    `point_a` and `point_b` [m], the centres of the box and of the ball, body-fixed, default the origins of the frames;
+    `restitution` from 0 to 1, default 0. The ball's centre stays outside of the box.
+    """
+
+    size: fields.Number = fields.parameter(shape=("d",), unit="m", sign="positive")
+    radius: fields.Number = fields.length(sign="positive")
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
+
+    def gap(self, space, poses):
+        return norm(self._outside(space, poses)) - self.radius
+
+    def touching(self, space, poses):
+        return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
+
+    def _outside(self, space, poses):
+        """From the nearest point of the box to the centre of the ball, in the axes of the box."""
+        centre = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
+        return centre - jnp.clip(centre, -0.5 * self.size, 0.5 * self.size)
+
+    def shapes(self, space, size):
+        solid = wheel if space.dimension == 2 else marked_ball
+        extent = space.in_space(self.size)
+        # A rectangle is as thick as a disc.
+        extent = np.where(np.arange(3) < space.dimension, extent, self.radius / 3)
+        box = Box(extent, position=space.in_space(self.point_a))
+        return ((0, box), *((1, shape) for shape in solid(self.radius, position=space.in_space(self.point_b))))
 
 
 class Slack(AbstractGeometricContact, AbstractPair):

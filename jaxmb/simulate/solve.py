@@ -208,8 +208,11 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     if lost is not None:
         result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
     stats = dict(solution.stats) | {"max_steps": problem.limit}
+    linearised = False
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
+        linearised = problem.adjoint is None and solver.linear_steps(False) is not None
+    stats |= {"linearised_steps": jnp.array(linearised)}
     stats |= policy.statistics(solution.solver_state)
     if found is not None:
         stats |= {"num_events": found.number}

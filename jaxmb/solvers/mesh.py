@@ -20,6 +20,7 @@ from jaxtyping import Array, PyTree
 from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
 from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
+from .events import events_found
 from .linear_map import filled, linear_map
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
@@ -34,11 +35,13 @@ class Row(NamedTuple):
     """What is stored of a step.
 
     **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
-    before the first; the `end` of this one; what its linearisation needs, its `own`.
+    before the first; the `end` of this one; whether it ended at an event (`AbstractGuards`), None in a run that looks
+    for none; what its linearisation needs, its `own`.
     """
 
     since: Any
     end: Any
+    at_event: Any
     own: Any
 
 
@@ -46,14 +49,22 @@ class Saved(eqx.Module):
     """A series of saved states.
 
     **Fields:** whether it begins with the `start`; its `times`, or None; after how many `steps` each a state is saved,
-    or 0; its `length`; how many states, and how many of the times, were `passed`.
+    or 0; whether it is saved before each of the `events`; its `length`; how many states, and how many of the times,
+    were `passed`.
     """
 
     start: bool = eqx.field(static=True)
     times: Any
     steps: int = eqx.field(static=True)
+    events: bool = eqx.field(static=True)
     length: int = eqx.field(static=True)
     passed: Any
+
+    def takes(self, k: Any, row: "Row") -> Any:
+        """Whether the state at the end of the step k is saved; False of a series without such states."""
+        if self.events:
+            return row.at_event
+        return (k + 1) % self.steps == 0 if self.steps else False
 
 
 class Tangents(NamedTuple):
@@ -183,12 +194,12 @@ class Mesh(eqx.Module):
             after = w, memory
             if rows:
                 own = self.steps.row_tangent(row.own, self.like, before, after)
-                along = self.layout.packed_tangent(row, Row(None, None, own))
+                along = self.layout.packed_tangent(row, Row(None, None, None, own))
                 rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
-            new = [_saved(series, table, place, k, row.end, after[0], ddense, step.at) for series, table, place in each]
+            new = [_saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in each]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
             return k + 1, after, saved, places, rows, dense, ddense if self.event else None
 
@@ -238,7 +249,7 @@ class Mesh(eqx.Module):
                 )
             left = []
             for series, table, place in zip(self.saved, cotangents.saved, places, strict=True):
-                lw, ldense, place = _unsaved(series, table, place, k, row.since, lw, ldense, step.at)
+                lw, ldense, place = _unsaved(series, table, place, k, row, lw, ldense, step.at)
                 left.append(place)
             dmoved, lw, lmemory = jax.linear_transpose(step.push, nothing, lw, lmemory)((lw, lmemory, ldense))
             return k, lw, lmemory, tuple(left), jax.tree.map(jnp.add, total, dmoved)
@@ -252,14 +263,14 @@ def _tables(carry):
     return saved, rows, dense
 
 
-def _saved(series: Saved, table, place, k, end, w, dense, at):
+def _saved(series: Saved, table, place, k, row, w, dense, at):
     """The table of a series of saved states with those of a step, and where the series is after it."""
     if series.times is not None:
         times = series.times
 
         def more(carry):
             _, place = carry
-            return (place[1] < times.size) & (times[jnp.minimum(place[1], times.size - 1)] <= end)
+            return (place[1] < times.size) & (times[jnp.minimum(place[1], times.size - 1)] <= row.end)
 
         def save(carry):
             table, place = carry
@@ -267,19 +278,19 @@ def _saved(series: Saved, table, place, k, end, w, dense, at):
 
         carry = table, place
         table, place = while_loop(more, save, carry, max_steps=None, buffers=lambda carry: carry[0], kind="lax")
-    if series.steps:
-        here = (k + 1) % series.steps == 0
+    here = series.takes(k, row)
+    if here is not False:
         table = buffer_set(table, place[0], w, here)
         place = place.at[0].add(here.astype(place.dtype))
     return table, place
 
 
-def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
+def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     """The transpose: cotangents of the end of a step and of its dense output with those of the states that were saved
-    in it, `since` a time, and where the series is before it.
+    in it, and where the series is before it.
     """
-    if series.steps:
-        here = (k + 1) % series.steps == 0
+    here = series.takes(k, row)
+    if here is not False:
         place = place.at[0].add(-here.astype(place.dtype))
         if table is not None:
             lw = lw + jnp.where(here, table[place[0]], 0.0)
@@ -288,7 +299,7 @@ def _unsaved(series: Saved, table, place, k, since, lw, ldense, at):
 
         def more(carry):
             _, place = carry
-            return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > since)
+            return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > row.since)
 
         def unsave(carry):
             ldense, place = carry
@@ -446,7 +457,9 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
 
 def _row(steps, terms, since, old, new) -> Row:
     """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
-    return Row(since, old.tnext, steps.row(terms, old, new))
+    before, after = events_found(old.controller_state), events_found(new.controller_state)
+    at_event = None if before is None or after is None else after.count > before.count
+    return Row(since, old.tnext, at_event, steps.row(terms, old, new))
 
 
 def _step_with_row(body_fun, steps, terms, layout):
@@ -539,9 +552,12 @@ def _recorded_jvp(primals, tangents):
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
     saved = tuple(
-        Saved(sub.t0, sub.ts, sub.steps, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
+        Saved(sub.t0, sub.ts, sub.steps, False, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
         for sub, state in zip(series, save_states(final), strict=True)
     )
+    events = events_found(final.controller_state)
+    if events is not None:
+        saved += (Saved(False, None, 0, True, len(events.states), jnp.stack([events.count, jnp.array(0)])),)
     row = lambda a, b: _row(steps, equations[0], b.tprev, a, b)
     layout = Layout(eqx.filter_eval_shape(row, init_state, final))
     mesh = Mesh(
@@ -575,14 +591,16 @@ def _segments(starts, of_rows, final, init_state, fixed, max_steps):
 def _of_loop(final, along: Tangents, like):
     """The tangent of the last state of diffrax's loop."""
     state = lambda flat: unravel_like(like, flat)
-    none = jax.tree.map(lambda _: None, final)
+    none, of_events = jax.tree.map(lambda _: None, final), events_found(final.controller_state) is not None
     parts = lambda final: (
         final.y,
         final.dense_infos,
         final.event_dense_info,
         *(saved.ys for saved in save_states(final)),
+        *([events_found(final.controller_state).states] if of_events else []),
     )
-    new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in along.saved)
+    tables, events = (along.saved[:-1], along.saved[-1:]) if of_events else (along.saved, ())
+    new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in tables), *events
     return eqx.tree_at(parts, none, new, is_leaf=_is_none)
 
 

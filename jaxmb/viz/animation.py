@@ -21,6 +21,8 @@ Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
 
 # A motion that lasts for less or more than this [s] is not shown in real time.
 _SHORTEST, _LONGEST = 2.0, 60.0
+# An event is named for this long [s] of playing; of those that are to be seen at once at most this many are.
+_SEEN, _AT_ONCE = 0.5, 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +119,10 @@ def show(
     still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
     notes += [f"arrows {square:g} N a square"] if square else []
-    played += [(np.zeros(1), still), ((clock - first) / speed, [scenery.clock(clock, notes, view)])]
+    played += [
+        (np.zeros(1), still),
+        ((clock - first) / speed, [scenery.clock(clock, notes, _marks(motions, clock, speed), view)]),
+    ]
     return MovingPicture(page(played, view.camera), height, max(own.times.size for own in motions))
 
 
@@ -144,6 +149,21 @@ def _named(trajectory: Motions) -> dict[str, Trajectory]:
         if not (hasattr(own, "system") and hasattr(own, "ts")):
             raise ValueError(f"show takes motions as simulate returns them, got {type(own).__name__}.")
     return motions
+
+
+def _marks(motions: Sequence[Motion], clock: np.ndarray, speed: float) -> list[str]:
+    """The events that are named at each time."""
+    found = [
+        (event.time, f"{own.name} {event.part}: {event.kind}".strip())
+        for own in motions
+        if own.trajectory.found_events is not None
+        for event in own.trajectory.events
+    ]
+    out = []
+    for t in clock:
+        own = dict.fromkeys(text for time, text in found if time <= t < time + _SEEN * speed)
+        out.append(", ".join(list(own)[-_AT_ONCE:]))
+    return out
 
 
 def _arrows(own: Motion, reactions: Sequence[str], forces: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

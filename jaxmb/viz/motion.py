@@ -59,7 +59,8 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     By default all that moves is shown: positions and velocities of the mass centres of the bodies; angles and angular
     velocities, in the plane of the bodies, in space of the joints; displacements of sliding joints; the coordinates of
     a system without bodies and their rates q̇; with the energy and the residuals of constraints. A component that stays
-    at one value, such as the height of a trolley on a level rail, is left out.
+    at one value, such as the height of a trolley on a level rail, is left out. Events of contacts and dry friction are
+    vertical lines, solid at impacts and dotted where there is no impulse.
 
     **Arguments:**
 
@@ -85,6 +86,7 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
         panels = _panels(trajectory, _quantities(trajectory.system, [name for name in given if name not in checks]))
     figure, places = _places(len(panels) + len(checks))
     t = np.asarray(trajectory.ts)
+    _draw_events(places, t, trajectory)
     for axes, (kind, lines) in zip(places, panels.items(), strict=False):
         _draw(axes, t, lines)
         _finish(axes, _LABELS.get(kind, kind.replace("_", " ")))
@@ -190,6 +192,25 @@ def _draw(axes: "Axes", t: np.ndarray, lines: Sequence[_Line]) -> None:
         style = ("-", "--", ":")[drawn.index(k or 0) % 3]
         letter = "" if k is None else f" {'xyz'[k] if k < 3 else k + 1}"
         axes.plot(t, values, color=colors[name], linestyle=style, label=name + letter)
+
+
+def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory) -> None:
+    """Vertical lines in all panels, which the legend of the first one names."""
+    from matplotlib.collections import LineCollection
+
+    found = [] if trajectory.found_events is None else trajectory.events
+    for style, struck in (("-", True), (":", False)):
+        own = [event for event in found if (event.impulse != 0) == struck and t[0] <= event.time <= t[-1]]
+        kinds = ", ".join(sorted({event.kind for event in own}))
+        lines = [[(event.time, 0.0), (event.time, 1.0)] for event in own]
+        for k, axes in enumerate(places if own else ()):
+            # In units of the panel upwards, so that its limits stay those of the motion.
+            across = axes.get_xaxis_transform()
+            label = kinds if k == 0 else None
+            marks = LineCollection(
+                lines, transform=across, colors="0.55", linestyles=style, linewidths=0.8, zorder=0.5, label=label
+            )
+            axes.add_collection(marks, autolim=False)
 
 
 def _draw_energy(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None:

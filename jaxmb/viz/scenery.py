@@ -138,11 +138,13 @@ def _ball(name, position, radius, color):
     return stage.SceneNode(lambda scene: scene.add_icosphere(name, radius, color, position=position, cast_shadow=False))
 
 
-def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], view: View) -> stage.SceneNode:
-    """A label with the time of the motion, the size of the grid, and notes."""
+def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], marks: Sequence[str], view: View) -> stage.SceneNode:
+    """A label with the time of the motion, the size of the grid, notes, and a mark at each time, which may be empty."""
     digits = max(0, 2 - int(np.floor(np.log10(times[-1] - times[0]))))
     rest = "".join(f"  ·  {note}" for note in (f"grid {view.cell:g} m", *notes))
-    return stage.label("/clock", [f"t = {t:.{digits}f} s{rest}" for t in times], view.camera.bottom)
+    marks = [f"  ·  {mark}" if mark else "" for mark in marks]
+    texts = [f"t = {t:.{digits}f} s{rest}{mark}" for t, mark in zip(times, marks, strict=True)]
+    return stage.label("/clock", texts, view.camera.bottom)
 
 
 def _mesh(ground, own, planar):

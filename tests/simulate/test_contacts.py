@@ -112,6 +112,45 @@ def test_derivatives_through_closing_sliding_and_opening():
         np.testing.assert_allclose(reverse[k], (8 * near - far) / (12 * h), rtol=1e-6)
 
 
+def test_events_have_derivatives():
+    """Times, impulses and energies lost, in both modes, against closed forms."""
+
+    def events(at):
+        system = mb.with_parameters(BALL, {"floor.restitution": at[0], "floor.lower": at[1]})
+        found = mb.simulate(system, mb.assemble(BALL), t1=2.0, rtol=1e-9, max_steps=300, max_events=16).events
+        return found.times[:3], found.impulses[:3, 0], found.energy_lost[:3]
+
+    def exact(at):
+        speed, time, out = jnp.sqrt(2 * G * (1 - at[1])), jnp.sqrt(2 * (1 - at[1]) / G), []
+        for _ in range(3):
+            out.append((time, 2.0 * (1 + at[0]) * speed, speed**2 * (1 - at[0] ** 2)))
+            speed = at[0] * speed
+            time = time + 2 * speed / G
+        return jax.tree.map(lambda *x: jnp.stack(x), *out)
+
+    at = jnp.array([0.8, 0.1])
+    forward, reverse = (jit_quickly(mode(events))(at) for mode in (jax.jacfwd, jax.jacrev))
+    for one, other, known in zip(forward, reverse, jax.jacfwd(exact)(at), strict=True):
+        np.testing.assert_allclose(one, known, rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
+
+
+def test_the_time_of_opening_has_a_derivative():
+    """A particle that slides down a sphere from rest leaves it later where there is less gravity, `t² g` is constant."""
+    system = mb.Scene(
+        [planar.PointMass("p", mass=0.7, position=(0.6, 0.8))],
+        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+
+    def opens(strength):
+        changed = mb.with_parameters(system, {"gravity.acceleration": jnp.stack([0.0 * strength, -strength])})
+        return mb.simulate(changed, mb.assemble(system), t1=1.0, rtol=1e-9, max_steps=300, max_events=8).events.times[0]
+
+    time, slope = jit_quickly(lambda x: jax.jvp(opens, (x,), (jnp.ones_like(x),)))(jnp.array(G))
+    np.testing.assert_allclose(slope, -time / (2 * G), rtol=1e-7)
+
+
 def test_second_derivatives_through_impacts_are_refused():
     with pytest.raises(ValueError, match="Second derivatives through impacts are not supported"):
         jax.hessian(lambda at: end(at, 0.6))(jnp.array([0.8, 0.1]))
@@ -229,6 +268,25 @@ def test_a_block_comes_to_rest_on_its_corners():
     assert np.min(gaps) >= -1e-10
     forces = [motion.reactions[name].force[-1, 1] for name in ("left", "right")]
     np.testing.assert_allclose(forces, [G, G], rtol=1e-9)
+
+
+def test_a_ball_bounces_off_the_edge_of_a_box():
+    """It is reflected along the line from the edge to its centre."""
+    radius, beyond, restitution = 0.1, 0.06, 0.7
+    system = mb.Scene(
+        [planar.Body("ball", mass=1.3, inertia=0.01, position=(0.5 + beyond, 1.0))],
+        joints=[mb.RigidBoxContact("c", "ground", "ball", size=(1.0, 0.4), radius=radius, restitution=restitution)],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=[0.5], rtol=1e-10)
+    height = 0.2 + np.sqrt(radius**2 - beyond**2)
+    time, normal = np.sqrt(2 * (1.0 - height) / G), np.array([beyond, height - 0.2]) / radius
+    (event,) = motion.events
+    np.testing.assert_allclose(event.time, time, rtol=1e-10)
+    before, left = np.array([0.0, -G * time]), 0.5 - time
+    after = before - (1 + restitution) * (before @ normal) * normal
+    end = np.array([0.5 + beyond, height]) + after * left - np.array([0.0, G / 2]) * left**2
+    np.testing.assert_allclose(motion["ball"].position[-1], end, rtol=1e-9)
 
 
 def test_a_rope_tightens():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -160,13 +160,13 @@ RAMPED = {
 
 
 def ramped(p):
-    """Its displacement after 3 s, in closed form."""
+    """Its displacement after 3 s, and the times at which it stops and begins to move again, in closed form."""
     rate, slow = p["push.rate"] / p["block.mass"], p["rub.coefficient"] * G
     stops = (slow - jnp.sqrt(slow**2 - 2 * rate)) / rate
     first = stops + rate * stops**3 / 6 - slow * stops**2 / 2
     begins = p["rub.static_coefficient"] * G / rate
     further = rate * ((3.0**3 - begins**3) / 6 - begins**2 * (3.0 - begins) / 2)
-    return first + further - slow * (3.0 - begins) ** 2 / 2
+    return first + further - slow * (3.0 - begins) ** 2 / 2, jnp.stack([stops, begins])
 
 
 def test_derivatives_through_stick_and_slip():
@@ -175,16 +175,18 @@ def test_derivatives_through_stick_and_slip():
     def block(p):
         system = mb.with_parameters(RAMP, p)
         motion = mb.simulate(system, mb.assemble(system), t1=3.0, saveat=[3.0], rtol=1e-10)
-        return motion["block"].position[-1, 0]
+        return motion["block"].position[-1, 0], motion.events.times[:2]
 
-    value, exact = jax.value_and_grad(ramped)(RAMPED)
-    found, gradient = jit_quickly(jax.value_and_grad(block))(RAMPED)
+    (value, times), exact = jax.value_and_grad(ramped, has_aux=True)(RAMPED)
+    (found, at), gradient = jit_quickly(jax.value_and_grad(block, has_aux=True))(RAMPED)
     np.testing.assert_allclose(found, value, rtol=1e-9)
+    np.testing.assert_allclose(at, times, rtol=1e-9)
     for name in RAMPED:
         np.testing.assert_allclose(gradient[name], exact[name], rtol=1e-7, err_msg=name)
     ahead = {name: jnp.ones_like(value) for name, value in RAMPED.items()}
-    along = jit_quickly(lambda p: jax.jvp(block, (p,), (ahead,))[1])(RAMPED)
+    along, later = jit_quickly(lambda p: jax.jvp(block, (p,), (ahead,))[1])(RAMPED)
     np.testing.assert_allclose(along, sum(gradient.values()), rtol=1e-9)
+    np.testing.assert_allclose(later, jax.jvp(ramped, (RAMPED,), (ahead,))[1][1], rtol=1e-7)
 
 
 RADIUS = 0.2
@@ -321,6 +323,68 @@ def test_a_rod_that_jams():
     np.testing.assert_allclose(motion.reactions["rub"].force[0], [2.0 * reaction, 0.0], rtol=1e-9, atol=1e-12)
     turn = reaction * np.cos(angle) + 2.0 * reaction * np.sin(angle)
     np.testing.assert_allclose(motion.accelerations[0, 2], 3.0 * turn, rtol=1e-8)
+
+
+def test_painleves_paradox_is_where_it_was_found():
+    """Beyond a friction of 4/3, where `tan θ` is between `(3 μ ± √(9 μ² − 16)) / 2`, the force at the end of a rod that is
+    pushed has no value, or two where the rod turns so fast that it may also lift off (F. Génot and B. Brogliato, "New
+    results on Painlevé paradoxes", European Journal of Mechanics A/Solids 18, 1999).
+    """
+    coefficient = 1.6
+    angle, turn = (x.ravel() for x in np.meshgrid(np.linspace(0.2, 1.4, 13), np.linspace(0.0, 6.0, 7)))
+    system = painleve(1.0, 0.0, coefficient)
+    state = mb.assemble(system, fix={"tip.mode": 1})
+
+    def run(angle, turn):
+        sin, cos = jnp.sin(angle), jnp.cos(angle)
+        q = state.q.at[:3].set(jnp.stack([-cos, sin, -angle]))
+        u = state.u.at[:3].set(jnp.stack([5.0 + turn * sin, turn * cos, -turn]))
+        motion = mb.simulate(system, mb.State(q, u), t1=1e-4, rtol=1e-8, throw=False)
+        return motion.result == mb.RESULTS.contacts_undetermined
+
+    root = np.sqrt(9 * coefficient**2 - 16)
+    paradox = np.abs(2 * np.tan(angle) - 3 * coefficient) < root
+    lifts = turn**2 * np.sin(angle) > G
+    assert all(np.any(paradox & own) and np.any(~paradox & own) for own in (lifts, ~lifts))
+    np.testing.assert_array_equal(jit_quickly(jax.vmap(run))(jnp.array(angle), jnp.array(turn)), paradox)
+
+
+def test_a_rod_falls_off_the_edge_of_a_table():
+    """It tips about the edge, slides over it where `tan θ = μ a² / (a² + 9 b²)`, and leaves it."""
+    half, beyond, coefficient = 0.5, 0.2, 0.5
+    rod = planar.Body("rod", mass=1.3, inertia=1.3 * half**2 / 3, position=(beyond, 0.0))
+    edge = mb.RigidPlaneContact("edge", "rod", "ground", point_a=(0.0, 0.0), point_b=(0.0, 0.0), normal=(0.0, -1.0))
+    rub = mb.DryFriction("rub", "edge", coefficient=coefficient)
+    system = mb.Scene([rod], joints=[edge], forces=[DOWN, rub]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=diffrax.SaveAt(dense=True), rtol=1e-11)
+    slips, leaves = motion.events
+    assert (slips.kind, leaves.kind) == ("slip", "open")
+
+    # Until it slips it turns about the edge, with the acceleration `g b cos θ / (k² + b²)`.
+    k2 = half**2 / 3
+    at = np.arctan(coefficient * half**2 / (half**2 + 9 * beyond**2))
+    np.testing.assert_allclose(-motion.at(slips.time).q[2], at, rtol=1e-9)
+    # With `θ = x²` the integrand has no singularity.
+    ratio = lambda x: x * x / np.sin(x * x) if x > 0 else 1.0
+    time, _ = quad(lambda x: 2 * np.sqrt(ratio(x)), 0.0, np.sqrt(at), epsabs=1e-13)
+    np.testing.assert_allclose(slips.time, time * np.sqrt((k2 + beyond**2) / (2 * G * beyond)), rtol=1e-9)
+
+    def slide(t, y):
+        out, angle, speed, rate = y
+        normal = force(y)
+        along = G * np.sin(angle) + out * rate**2 - coefficient * normal
+        return speed, rate, along, normal * out / k2
+
+    def force(y):
+        out, angle, speed, rate = y
+        return (G * np.cos(angle) - 2 * speed * rate) * k2 / (k2 + out**2)
+
+    leave = lambda t, y: force(y)
+    leave.terminal = True
+    start = beyond, at, 0.0, np.sqrt(2 * G * beyond * np.sin(at) / (k2 + beyond**2))
+    known = solve_ivp(slide, (slips.time, 0.5), start, events=leave, method="DOP853", rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(leaves.time, known.t_events[0][0], rtol=1e-9)
+    np.testing.assert_allclose(-motion.at(leaves.time).q[2], known.y_events[0][0, 1], rtol=1e-9)
 
 
 def falling_chain():

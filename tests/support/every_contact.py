@@ -61,6 +61,16 @@ CONTACTS = {
         [_body_3d("a", z=0.0), _body_3d("b")],
         [],
     ),
+    "RigidBoxContact": (
+        mb.RigidBoxContact("c", "a", "b", size=(0.4, 0.6), point_a=(0.0, 0.1), point_b=(0.1, 0.0), radius=0.1),
+        [_body_2d("a", y=0.0), _body_2d("b")],
+        [],
+    ),
+    "RigidBoxContact at a corner": (
+        mb.RigidBoxContact("c", "a", "b", size=(0.4, 0.6, 0.3), point_b=(0.1, 0.0, 0.0), radius=0.1),
+        [_body_3d("a", z=0.0), _body_3d("b", x=1.0)],
+        [],
+    ),
     "Slack": (mb.Slack("c", "a", "b", length=2.0, point_a=(0.1, 0.2)), [_body_2d("a"), _body_2d("b", x=1.5)], []),
     "Slack in space": (mb.Slack("c", "ground", "a", length=2.0), [_body_3d("a")], []),
     "a contact of a user": (InsideBowl("c", "a", radius=3.0, point=(0.1, 0.0)), [_body_2d("a")], []),

@@ -56,6 +56,11 @@ FRICTIONS = {
         [mb.RigidPlaneContact("joint", "a", "b", normal=(0.0, 1.0), point_b=(0.1, -0.3))],
         _rub(),
     ),
+    "disc on a corner": (
+        [_body_2d("a", y=0.0), _body_2d("b")],
+        [mb.RigidBoxContact("joint", "a", "b", size=(0.4, 1.0), radius=0.2)],
+        _rub(),
+    ),
     "two discs": (
         [_body_2d("a", y=0.0), _body_2d("b")],
         [mb.RigidBallContact("joint", "a", "b", radius_a=0.2, radius_b=0.4)],

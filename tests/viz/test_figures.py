@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from trajectories import motion_of
+from trajectories import bounced, motion_of
 
 import jaxmb as mb
 from jaxmb import planar, spatial, terrain, viz
@@ -51,6 +51,19 @@ def test_a_sliding_piston_shows_its_place_and_its_stroke(piston):
     assert [axes.get_ylabel() for axes in (position, velocity, displacement, rate, energy)] == labels
     assert list(drawn(residual)) == ["position", "velocity [1/s]"]
     np.testing.assert_allclose(drawn(energy)["sum"], (0.1 * np.cos(TS)) ** 2)
+
+
+def test_events_are_lines_in_every_panel():
+    """They do not change the limits of the panels; the first one has a legend of them."""
+    figure = viz.plot_motion(bounced())
+    for axes in figure.axes:
+        (marks,) = axes.collections
+        np.testing.assert_allclose(marks.get_segments(), [[(1.0, 0.0), (1.0, 1.0)]])
+        assert marks.get_linestyle()[0][1] is None
+    height, velocity, *_ = figure.axes
+    assert [text.get_text() for text in height.get_legend().get_texts()] == ["impact", "ball y"]
+    low, high = velocity.get_ylim()
+    assert -11.5 < low < -10.0 and 4.0 < high < 6.5
 
 
 def test_a_constant_rate_is_shown_and_a_body_at_rest_is_not():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from every_part import SPACES, compiled as built
 from pages import Page
-from trajectories import motion_of
+from trajectories import bounced, motion_of
 
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, terrain, viz
@@ -76,6 +76,14 @@ def test_bodies_are_where_they_were_at_the_saved_times(page, pendulum):
     assert len(lengths) == 1 and lengths[0][2] == pytest.approx(ARM, abs=1e-4)
     clock = read.values("/clock", "text")
     assert np.allclose(clock[0], ts) and [float(text[4:8]) for text in clock[1]] == list(ts)
+
+
+def test_an_event_is_named_for_half_a_second_of_playing():
+    """The motion of 1.5 s is shown in 2 s."""
+    times, texts = Page(viz.show(bounced()).html).values("/clock", "text")
+    shown = np.array(["floor: impact" in text for text in texts])
+    np.testing.assert_array_equal(shown, (np.array(times) >= 4 / 3 - 1e-6) & (np.array(times) < 4 / 3 + 0.5 - 1e-6))
+    assert shown.any()
 
 
 def test_a_spring_is_between_its_points(page, pendulum):
