@@ -6,6 +6,7 @@ force and a contact law see `notebooks/05_extending.ipynb`.
 """
 
 from .base import (
+    AbstractActor as AbstractActor,
     AbstractBody as AbstractBody,
     AbstractCompound as AbstractCompound,
     AbstractConstraint as AbstractConstraint,
@@ -14,8 +15,10 @@ from .base import (
     AbstractInertialConstraint as AbstractInertialConstraint,
     AbstractJoint as AbstractJoint,
     AbstractLaw as AbstractLaw,
+    AbstractLink as AbstractLink,
     AbstractNonIdeal as AbstractNonIdeal,
     AbstractPair as AbstractPair,
+    AbstractPart as AbstractPart,
     AbstractPlanarPart as AbstractPlanarPart,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,

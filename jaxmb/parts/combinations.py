@@ -23,7 +23,7 @@ class AbstractCombination(AbstractOfJoints):
     **Fields:** a scene fills in the names of the coordinates `within` their joints.
     """
 
-    within: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
 
     @property
     @abc.abstractmethod
