@@ -1,8 +1,8 @@
 """The parts of a scene: base classes and field declarations, also for user-defined parts.
 
 A part is a class derived from one of the base classes. Helpers declare the meaning of its fields (`point()`, `axis()`,
-`length()`, `parameter()`, …), and its kernel is a pure function of the poses of its bodies. For examples of a joint, a
-force and a contact law see `notebooks/05_extending.ipynb`.
+`length()`, `parameter()`, …), annotated with `Number`, `Numbers` (by name) or `Names`; its kernel is a pure function of
+the poses of its bodies. For examples of a joint, a force and a contact law see `notebooks/05_extending.ipynb`.
 """
 
 from .base import (
