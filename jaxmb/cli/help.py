@@ -1,6 +1,7 @@
 """`jaxmb help NAME` and `jaxmb reference FOLDER`: what the docstrings say, in the terminal and as HTML."""
 
 import argparse
+import json
 import os
 import shutil
 import sys
@@ -32,7 +33,12 @@ def add_to(commands: Any) -> None:
         description="Write the reference of all public names, with a search, as HTML; open index.html in it.",
     )
     command.add_argument("folder", type=Path, help="where to write; it must be empty, or hold an earlier reference")
-    command.add_argument("--notebooks", type=Path, help="folder of notebooks that become part of it (default: none)")
+    command.add_argument(
+        "--notebooks",
+        type=Path,
+        help="folder of notebooks that become part of it (default: those of the checkout of jaxmb in which the command "
+        "runs or the package lies)",
+    )
     command.set_defaults(command=_reference)
 
 
@@ -46,10 +52,20 @@ def _help(arguments: argparse.Namespace) -> None:
 
 
 def _reference(arguments: argparse.Namespace) -> None:
+    notebooks = _notebooks_of_checkout() if arguments.notebooks is None else arguments.notebooks
     try:
-        warnings = reference.build(arguments.folder, notebooks=arguments.notebooks)
+        warnings = reference.build(arguments.folder, notebooks=notebooks)
     except ImportError as error:
         raise RuntimeError(str(error)) from error
     for warning in warnings:
         print(f"jaxmb: {warning}", file=sys.stderr)
     print(f"Wrote {arguments.folder / 'index.html'}")
+
+
+def _notebooks_of_checkout() -> Path | None:
+    """The folder `notebooks` beside the package or in the current one, if its notebooks say that they are of jaxmb."""
+    for folder in (Path(__file__).parents[2] / "notebooks", Path("notebooks")):
+        paths = sorted(folder.glob("*.ipynb"))
+        if paths and all("jaxmb" in json.loads(path.read_text(encoding="utf-8"))["metadata"] for path in paths):
+            return folder
+    return None

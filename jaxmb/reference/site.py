@@ -40,10 +40,7 @@ html_copy_source = False
 html_show_copyright = False
 # Each parameter has a line where one line is too short for them.
 python_maximum_signature_line_length = 100
-# A name in an annotation may be that of a class or of a module.
-suppress_warnings = ["ref.python"]
 """
-_INDEX = "objects.inv"  # which every reference has
 _DEPTH = ":" * 8
 _NAME = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(\(\))?`(?!`)")
 
@@ -60,7 +57,7 @@ def build(folder: Path | str, *, notebooks: Path | str | None = None) -> list[st
     install "jaxmb[docs]"; `RuntimeError` if Sphinx fails.
     """
     folder, application = Path(folder), _sphinx()
-    if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / _INDEX).exists())):
+    if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or _is_reference(folder))):
         raise ValueError(f"{folder} holds other files; give a new folder, or that of an earlier reference.")
     shown = [] if notebooks is None else sorted(Path(notebooks).glob("*.ipynb"))
     if notebooks is not None and not shown:
@@ -78,6 +75,12 @@ def build(folder: Path | str, *, notebooks: Path | str | None = None) -> list[st
         shutil.move(made, folder)
         lines = re.sub(r"\x1b\[[\d;]*m", "", warnings.getvalue()).splitlines()
     return [line.replace(f"{sources}/", "") for line in lines if line.strip()]
+
+
+def _is_reference(folder: Path) -> bool:
+    """Whether a folder holds a site of Sphinx with the names of this package."""
+    inventory = folder / "objects.inv"
+    return inventory.is_file() and f"# Project: {PACKAGE}\n".encode() in inventory.read_bytes()
 
 
 def _sphinx() -> Callable[..., Any]:

@@ -101,6 +101,13 @@ def test_other_files_are_kept(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_a_site_of_another_project_is_kept(tmp_path, capsys):
+    inventory = tmp_path / "objects.inv"
+    inventory.write_bytes(b"# Sphinx inventory version 2\n# Project: another\n")
+    assert main(["reference", str(tmp_path)]) == 2
+    assert "holds other files" in capsys.readouterr().err and inventory.exists()
+
+
 def test_a_folder_without_notebooks(tmp_path, capsys):
     assert main(["reference", str(tmp_path / "made"), "--notebooks", str(tmp_path)]) == 2
     assert "There are no notebooks in" in capsys.readouterr().err
