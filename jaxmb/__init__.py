@@ -2,7 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from . import formulations as formulations, manifold as manifold, parts as parts, solvers as solvers
+from . import (
+    formulations as formulations,
+    manifold as manifold,
+    parts as parts,
+    solvers as solvers,
+    system as system,
+    trajectory as trajectory,
+)
 from ._programs import keep_compiled as keep_compiled
 from ._results import RESULTS as RESULTS
 from ._types import State as State

@@ -108,14 +108,11 @@ def held_groups(
     for name, value in values.items():
         own = known[name]
         group = groups[own.group].group
-        part = JointDriver(
-            name=name,
-            coordinate=name,
+        driver = JointDriver(name, name, value=value - rates[name] * jnp.asarray(t, value.dtype), rate=rates[name])
+        part = driver.with_fields(
             joints={"0": group.single(own.member, t)},
             places=(tuple(range(len(group.bodies[own.member]))),),
             within=own.field,
-            value=value - rates[name] * jnp.asarray(t, value.dtype),
-            rate=rates[name],
             rows=math.prod(own.shape),
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)

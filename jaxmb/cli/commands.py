@@ -1,6 +1,7 @@
 """The commands, and how they end."""
 
 import argparse
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ import jax
 
 from .. import mechanisms
 from .._programs import VARIABLE, keep_compiled
-from . import doctor, report, run, sweep
+from . import doctor, help, report, run, sweep
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,6 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         _keep_compiled()
     try:
         arguments.command(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # What reads a pipe, such as head, has enough; nothing is left to be written when the process ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (ValueError, RuntimeError, OSError) as error:
         print(f"jaxmb: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
@@ -47,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     out.set_defaults(compile_anew=False)
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, report, sweep, doctor):
+    for command in (run, report, sweep, doctor, help):
         command.add_to(commands)
     return out
 

@@ -29,6 +29,7 @@ from ..simulate import simulate
 _NEEDED = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "numpy")
 # What the extras of the package install.
 _OPTIONAL = {
+    "docs": ("furo", "myst-nb", "sphinx"),
     "plot": ("matplotlib",),
     "view": ("viser",),
     "import": ("mujoco",),

@@ -14,14 +14,15 @@ class NullSpace(AbstractFormulation):
     preferred over others, so no chart can become singular, and no pivots are searched for where no row is redundant.
     The mass matrix may be singular, as long as no velocity without mass is free.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{kim1986qr,
-          author = {Kim, S. S. and Vanderploeg, M. J.}, title = {{QR} Decomposition for State Space Representation of
-          Constrained Mechanical Dynamic Systems}, journal = {Journal of Mechanisms, Transmissions, and Automation in
-          Design}, volume = {108}, number = {2}, pages = {183--188}, year = {1986},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{kim1986qr,
+      author = {Kim, S. S. and Vanderploeg, M. J.}, title = {{QR} Decomposition for State Space Representation of
+      Constrained Mechanical Dynamic Systems}, journal = {Journal of Mechanisms, Transmissions, and Automation in
+      Design}, volume = {108}, number = {2}, pages = {183--188}, year = {1986},
+    }
+    ```
     """
 
     partitions: ClassVar[bool] = False

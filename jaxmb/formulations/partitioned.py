@@ -14,14 +14,15 @@ class Partitioned(AbstractFormulation):
     light body moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has;
     `Multipliers` keeps them.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{wehage1982generalized,
-          author = {Wehage, R. A. and Haug, E. J.}, title = {Generalized Coordinate Partitioning for Dimension
-          Reduction in Analysis of Constrained Dynamic Systems}, journal = {Journal of Mechanical Design}, volume =
-          {104}, number = {1}, pages = {247--255}, year = {1982},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{wehage1982generalized,
+      author = {Wehage, R. A. and Haug, E. J.}, title = {Generalized Coordinate Partitioning for Dimension
+      Reduction in Analysis of Constrained Dynamic Systems}, journal = {Journal of Mechanical Design}, volume =
+      {104}, number = {1}, pages = {247--255}, year = {1982},
+    }
+    ```
     """
 
     partitions: ClassVar[bool] = True

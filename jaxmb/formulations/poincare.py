@@ -17,14 +17,15 @@ class Poincare(AbstractFormulation):
     The condition of B counts once, where in `A M⁻¹ Aᵀ` it counts squared, and large forces that the constraints balance
     are not subtracted from each other.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{udwadia2007explicit,
-          author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Poincar\'e Equations of Motion for
-          General Constrained Systems. {Part I}. Analytical Results}, journal = {Proceedings of the Royal Society A},
-          volume = {463}, number = {2082}, pages = {1421--1434}, year = {2007},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{udwadia2007explicit,
+      author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Poincar\'e Equations of Motion for
+      General Constrained Systems. {Part I}. Analytical Results}, journal = {Proceedings of the Royal Society A},
+      volume = {463}, number = {2082}, pages = {1421--1434}, year = {2007},
+    }
+    ```
     """
 
     partitions: ClassVar[bool] = False

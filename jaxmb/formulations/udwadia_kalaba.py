@@ -27,26 +27,27 @@ class UdwadiaKalaba(AbstractFormulation):
     Ranks are structural: pseudo-inverses are taken of independent rows, from factors of fixed rank, where derivatives
     exist.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{udwadia1992new,
-          author = {Udwadia, Firdaus E. and Kalaba, Robert E.}, title = {A New Perspective on Constrained Motion},
-          journal = {Proceedings of the Royal Society A}, volume = {439}, number = {1906}, pages = {407--410}, year =
-          {1992},
-        }
+    **Reference:**
 
-        @article{kalaba1993equations,
-          author = {Kalaba, R. E. and Udwadia, F. E.}, title = {Equations of Motion for Nonholonomic, Constrained
-          Dynamical Systems via {Gauss's} Principle}, journal = {Journal of Applied Mechanics}, volume = {60}, number =
-          {3}, pages = {662--668}, year = {1993},
-        }
+    ```bibtex
+    @article{udwadia1992new,
+      author = {Udwadia, Firdaus E. and Kalaba, Robert E.}, title = {A New Perspective on Constrained Motion},
+      journal = {Proceedings of the Royal Society A}, volume = {439}, number = {1906}, pages = {407--410}, year =
+      {1992},
+    }
 
-        @article{udwadia2006explicit,
-          author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Equations of Motion for
-          Constrained Mechanical Systems with Singular Mass Matrices and Applications to Multi-Body Dynamics}, journal =
-          {Proceedings of the Royal Society A}, volume = {462}, number = {2071}, pages = {2097--2117}, year = {2006},
-        }
-        ```
+    @article{kalaba1993equations,
+      author = {Kalaba, R. E. and Udwadia, F. E.}, title = {Equations of Motion for Nonholonomic, Constrained
+      Dynamical Systems via {Gauss's} Principle}, journal = {Journal of Applied Mechanics}, volume = {60}, number =
+      {3}, pages = {662--668}, year = {1993},
+    }
+
+    @article{udwadia2006explicit,
+      author = {Udwadia, Firdaus E. and Phohomsiri, Phailaung}, title = {Explicit Equations of Motion for
+      Constrained Mechanical Systems with Singular Mass Matrices and Applications to Multi-Body Dynamics}, journal =
+      {Proceedings of the Royal Society A}, volume = {462}, number = {2071}, pages = {2097--2117}, year = {2006},
+    }
+    ```
     """
 
     method: Method = eqx.field(static=True, default="moore_penrose")

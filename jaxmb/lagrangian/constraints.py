@@ -128,14 +128,15 @@ class ServoConstraint(AbstractCoordinateConstraint):
 
     **Arguments:** `deviation`: φ, shape (rows,); `damping` [1/s] and `stiffness` [1/s²], default zero: kept only.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{kalaba1993equations,
-          author = {Kalaba, R. E. and Udwadia, F. E.}, title = {Equations of Motion for Nonholonomic, Constrained
-          Dynamical Systems via Gauss's Principle}, journal = {Journal of Applied Mechanics}, volume = {60}, number =
-          {3}, pages = {662--668}, year = {1993},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{kalaba1993equations,
+      author = {Kalaba, R. E. and Udwadia, F. E.}, title = {Equations of Motion for Nonholonomic, Constrained
+      Dynamical Systems via Gauss's Principle}, journal = {Journal of Applied Mechanics}, volume = {60}, number =
+      {3}, pages = {662--668}, year = {1993},
+    }
+    ```
     """
 
     name: str = eqx.field(static=True)

@@ -17,25 +17,28 @@ from .transposition import Transposition, check_shape, share_of_suslov
 
 
 class Hamel(AbstractEquations):
-    r"""Hamel's equations in a frame $X_1, \dots, X_n$ whose first columns are the velocities ξ = u:
+    """Hamel's equations in a frame `X_1, …, X_n` whose first columns are the velocities ξ = u:
 
-    $$\frac{d}{dt} p_c - X_c[\ell] = \gamma^a_c p_a - W_c \cdot p + (N^T Q)_c, \qquad [X_b, X_c] = c^a_{bc} X_a$$
+    ```text
+    d/dt p_c − X_c[ℓ] = γ^a_c p_a − W_c·p + (Nᵀ Q)_c,    [X_b, X_c] = c^a_bc X_a
+    ```
 
-    with $\ell(t, q, \xi) = L(t, q, N \xi + \nu)$, its momenta $p_a$ along all of the frame, and the transitivity
-    coefficients $\gamma^a_c = c^a_{bc} \xi^b + \Psi^a W_c$, $\Psi = N^{-1}$. The drift ν counts as one more field with
+    with `ℓ(t, q, ξ) = L(t, q, N ξ + ν)`, its momenta `p_a` along all of the frame, and the transitivity coefficients
+    `γ^a_c = c^a_bc ξ^b + Ψ^a W_c`, `Ψ = N⁻¹`. The drift ν counts as one more field with
     velocity one. With a frame of a base, moved along by a connection, these are the Hamel-Voronets equations.
 
     **Arguments:** `transposition`: what is meant by the variation of a velocity: `"holder"` (W = 0), `"suslov"` (varied
     velocities stay in the frame's columns), a number between zero and one for a mixture of both, or a function
     `W(t, q, v, dq, parameters)`, shape (nq,). The equations are the same for all.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{hamel1904lagrange,
-          author = {Hamel, G.}, title = {Die Lagrange-Eulerschen Gleichungen der Mechanik}, journal = {Zeitschrift
-          für Mathematik und Physik}, volume = {50}, pages = {1--57}, year = {1904},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{hamel1904lagrange,
+      author = {Hamel, G.}, title = {Die Lagrange-Eulerschen Gleichungen der Mechanik}, journal = {Zeitschrift
+      für Mathematik und Physik}, volume = {50}, pages = {1--57}, year = {1904},
+    }
+    ```
     """
 
     transposition: Transposition = eqx.field(static=True, default="holder")

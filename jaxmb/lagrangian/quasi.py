@@ -34,14 +34,15 @@ class QuasiVelocities(AbstractKinematics):
     - `near`: rates to begin Newton's method with, shape (nq,), or a function `near(t, q, omega, parameters)`, for
         branches that turn.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{papastavridis1994boltzmann,
-          author = {Papastavridis, J. G.}, title = {On the Boltzmann-Hamel Equations of Motion: A Vectorial
-          Treatment}, journal = {Journal of Applied Mechanics}, volume = {61}, number = {2}, pages = {453--459},
-          year = {1994},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{papastavridis1994boltzmann,
+      author = {Papastavridis, J. G.}, title = {On the Boltzmann-Hamel Equations of Motion: A Vectorial
+      Treatment}, journal = {Journal of Applied Mechanics}, volume = {61}, number = {2}, pages = {453--459},
+      year = {1994},
+    }
+    ```
     """
 
     omega: Callable[..., Array] = eqx.field(static=True)

@@ -27,7 +27,7 @@ _NOT_IN_FILES = "/\\:\0"
 
 
 class LagrangianSystem(AbstractLagrangian):
-    r"""A mechanical system from its Lagrangian `L(t, q, q̇)`, forces, and constraints at any level.
+    """A mechanical system from its Lagrangian `L(t, q, q̇)`, forces, and constraints at any level.
 
     ```python
     pendulum = jaxmb.lagrangian.LagrangianSystem(
@@ -41,8 +41,9 @@ class LagrangianSystem(AbstractLagrangian):
 
     With velocities u, `q̇ = K(t, q, u)` and `B = ∂K/∂u`, the equations are Lagrange's, projected on the columns of B:
 
-    $$B^T \left(\frac{d}{dt} \frac{\partial L}{\partial \dot q} - \frac{\partial L}{\partial q} - Q\right)
-      = A^T \lambda$$
+    ```text
+    Bᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q) = Aᵀ λ
+    ```
 
     Every term is found by automatic differentiation; structure functions of quasi-velocities appear only in equations
     that are written with them.

@@ -12,25 +12,25 @@ from .transposition import Transposition, check_shape, share_of_suslov
 
 
 class Voronets(AbstractEquations):
-    r"""Voronets' equations in the rates of the base coordinates r, with $\dot s = -A \dot r - a$ and
-    $L_c(t, q, \dot r) = L(t, q, \dot q)$:
+    """Voronets' equations in the rates of the base coordinates r, with `ṡ = −A ṙ − a` and `L_c(t, q, ṙ) = L(t, q, q̇)`:
 
-    $$\frac{d}{dt} \frac{\partial L_c}{\partial \dot r^\alpha} - \frac{\partial L_c}{\partial r^\alpha}
-      + A^a_\alpha \frac{\partial L_c}{\partial s^a}
-      = p_b \left(W^b_\alpha - B^b_\alpha \right) - p_b W^b_\alpha + Q_\alpha - A^a_\alpha Q_a$$
+    ```text
+    d/dt ∂L_c/∂ṙ^α − ∂L_c/∂r^α + A^a_α ∂L_c/∂s^a = p_b (W^b_α − B^b_α) − p_b W^b_α + Q_α − A^a_α Q_a
+    ```
 
-    $B_\alpha = B_{\alpha\beta} \dot r^\beta + B_{\alpha 0}$ is the curvature of the connection, time being one more
-    coordinate of the base. Constraining L first and forgetting B is the classical mistake.
+    `B_α = B_αβ ṙ^β + B_α0` is the curvature of the connection, time being one more coordinate of the base. Constraining
+    L first and forgetting B is the classical mistake.
 
     **Arguments:** `transposition`: as in `Hamel`; with `"suslov"`, W = B, varied velocities satisfy the constraints.
 
-    ??? cite "Reference"
-        ```bibtex
-        @article{voronets1901,
-          author = {Voronets, P. V.}, title = {On the Equations of Motion for Nonholonomic Systems}, journal =
-          {Matematicheskii Sbornik}, volume = {22}, number = {4}, year = {1901},
-        }
-        ```
+    **Reference:**
+
+    ```bibtex
+    @article{voronets1901,
+      author = {Voronets, P. V.}, title = {On the Equations of Motion for Nonholonomic Systems}, journal =
+      {Matematicheskii Sbornik}, volume = {22}, number = {4}, year = {1901},
+    }
+    ```
     """
 
     transposition: Transposition = eqx.field(static=True, default="suslov")

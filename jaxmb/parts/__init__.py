@@ -1,11 +1,12 @@
 """The parts of a scene: base classes and field declarations, also for user-defined parts.
 
 A part is a class derived from one of the base classes. Helpers declare the meaning of its fields (`point()`, `axis()`,
-`length()`, `parameter()`, …), and its kernel is a pure function of the poses of its bodies. For examples of a joint, a
-force and a contact law see `notebooks/05_extending.ipynb`.
+`length()`, `parameter()`, …), annotated with `Number`, `Numbers` (by name) or `Names`; its kernel is a pure function of
+the poses of its bodies. For examples of a joint, a force and a contact law see `notebooks/05_extending.ipynb`.
 """
 
 from .base import (
+    AbstractActor as AbstractActor,
     AbstractBody as AbstractBody,
     AbstractCompound as AbstractCompound,
     AbstractConstraint as AbstractConstraint,
@@ -14,8 +15,10 @@ from .base import (
     AbstractInertialConstraint as AbstractInertialConstraint,
     AbstractJoint as AbstractJoint,
     AbstractLaw as AbstractLaw,
+    AbstractLink as AbstractLink,
     AbstractNonIdeal as AbstractNonIdeal,
     AbstractPair as AbstractPair,
+    AbstractPart as AbstractPart,
     AbstractPlanarPart as AbstractPlanarPart,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,

@@ -23,7 +23,7 @@ class AbstractCombination(AbstractOfJoints):
     **Fields:** a scene fills in the names of the coordinates `within` their joints.
     """
 
-    within: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
 
     @property
     @abc.abstractmethod
@@ -127,8 +127,8 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     angle, `"rotor.displacement"` of a displacement or length, which counts on through full turns. The reaction of the
     part is the generalized force `−inertia ẍ`, on the last body of the joint.
 
-    **Arguments:** `coordinate`, a number, such as `"hip.angle"`; `inertia` [kg m² of an angle, kg of a displacement]
-    > 0.
+    **Arguments:** `coordinate`, a number, such as `"hip.angle"`; `inertia` > 0 [kg m² of an angle, kg of a
+    displacement].
     """
 
     coordinate: str = fields.name()

@@ -64,7 +64,7 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     # A scene fills in the names of the sources, and those by which the function returns several forces. In `measures`
     # and `acts_on` the number of a source then stands for its name, so that controllers of other joints are stacked.
     source_names: tuple[str, ...] = fields.names(optional=True)
-    force_names: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    force_names: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
     takes_bodies: ClassVar[bool] = True
 
     def __check_init__(self):

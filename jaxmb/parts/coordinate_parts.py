@@ -29,9 +29,9 @@ class AbstractOfJoints(AbstractLink):
 
     name: str = fields.name()
     joints: Any = eqx.field(
-        default_factory=dict, kw_only=True, metadata={"declaration": fields.Declaration("parts", of=dict)}
+        default_factory=dict, init=False, metadata={"declaration": fields.Declaration("parts", of=dict)}
     )
-    places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True, default_factory=tuple, init=False)
     stage: ClassVar[int] = 2
 
     @property
@@ -84,7 +84,7 @@ class AbstractCoordinatePart(AbstractOfJoints):
     """
 
     coordinate: str = fields.name()
-    within: str = eqx.field(static=True, default="", kw_only=True)
+    within: str = eqx.field(static=True, default_factory=str, init=False)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -218,7 +218,7 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
 
     value: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
     rate: fields.Number = fields.parameter(shape=None, unit="rad/s or m/s", optional=True)
-    rows: int = eqx.field(static=True, default=1, kw_only=True)
+    rows: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
     rheonomic: ClassVar[bool] = True
 
     def with_numbers(self, given):

@@ -131,7 +131,7 @@ class DryFriction(AbstractDryFriction):
     """
 
     radius: fields.Number = fields.length(sign="positive", optional=True)
-    within: str = eqx.field(static=True, default="", kw_only=True)
+    within: str = eqx.field(static=True, default_factory=str, init=False)
 
     def complete(self, space, poses):
         held = self.joints["0"]

@@ -339,7 +339,7 @@ def numbers() -> Any:
 
 def part(of: Any) -> Any:
     """Another part, which the scene fills in; its numbers are parameters under that part's own name."""
-    return _field(Declaration("part", of=of | None), default=None, kw_only=True)
+    return _field(Declaration("part", of=of | None), default_factory=lambda: None, init=False)
 
 
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:

@@ -91,39 +91,39 @@ class _Step(AbstractAttempt):
 
 
 class Adams(AbstractMultistep):
-    r"""Adams' method of variable order (1 to 13) and variable step, for non-stiff problems.
+    """Adams' method of variable order (1 to 13) and variable step, for non-stiff problems.
 
-    Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order $k$ predicts with the
-    Adams-Bashforth formula of order $k$ and corrects with the Adams-Moulton formula of order $k + 1$. Two evaluations a
+    Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order k predicts with the
+    Adams-Bashforth formula of order k and corrects with the Adams-Moulton formula of order k + 1. Two evaluations a
     step, whatever the order; at tolerances of about 1e-6 and below it needs roughly half the evaluations of high-order
     Runge-Kutta methods, so it pays when the vector field is expensive. The first step, of order one, evaluates at its
     start instead of at a prediction: it is Euler's.
 
-    Use it with [`jaxmb.solvers.MultistepController`][], which reads its error estimates and from which it takes the
+    Use it with `MultistepController`, which reads its error estimates and from which it takes the
     tolerances:
 
     ```python
     diffrax.diffeqsolve(term, Adams(), t0, t1, None, y0, stepsize_controller=MultistepController(rtol=1e-8, atol=1e-10))
     ```
 
-    The term is a `diffrax.ODETerm` or an [`jaxmb.solvers.AbstractManifoldTerm`][]. Every form of `diffrax.SaveAt`,
+    The term is a `diffrax.ODETerm` or an `AbstractManifoldTerm`. Every form of `diffrax.SaveAt`,
     events, jumps, integration backward in time and every adjoint work as with other diffrax solvers. Derivatives are
     those of the discrete solution with its mesh and orders frozen. After a jump
     (`diffrax.ClipStepSizeController(jump_ts=...)`) the method restarts at order one. A solve continued with
     `solver_state` must start at the state where the other ended, in the same direction of time; otherwise pass
     `made_jump=True`.
 
-    ??? cite "Reference"
+    **Reference:**
 
-        ```bibtex
-        @book{shampine1975computer,
-            author={Shampine, Lawrence F. and Gordon, Marilyn K.},
-            title={Computer Solution of Ordinary Differential Equations: The Initial Value Problem},
-            publisher={W. H. Freeman},
-            address={San Francisco},
-            year={1975},
-        }
-        ```
+    ```bibtex
+    @book{shampine1975computer,
+        author={Shampine, Lawrence F. and Gordon, Marilyn K.},
+        title={Computer Solution of Ordinary Differential Equations: The Initial Value Problem},
+        publisher={W. H. Freeman},
+        address={San Francisco},
+        year={1975},
+    }
+    ```
     """
 
     tolerances: Tolerances

@@ -97,7 +97,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
 
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm, so that
     the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
-    [`jaxmb.solvers.Adams`][] and [`jaxmb.solvers.Hermite`][]; to step exactly to some times, or over jumps, wrap it in
+    `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in
     `diffrax.ClipStepSizeController`.
 
     Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
@@ -216,7 +216,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         # A concrete class, since other solvers return an error that this controller cannot read.
         if not isinstance(y_error, StepEstimate):
             raise ValueError(
-                "`MultistepController` needs the estimates of a multistep method. Use it with `jaxmb.solvers.Adams` or "
+                "`MultistepController` needs the estimates of a multistep method. Use it with `Adams` or "
                 "`Hermite`, without `rtol` and `atol` in the solver: it takes those of the controller."
             )
         dt = t1 - t0

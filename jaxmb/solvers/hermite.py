@@ -92,18 +92,18 @@ class _Step(AbstractAttempt):
 
 
 class Hermite(AbstractMultistep):
-    r"""Implicit multistep methods that use $y'' = f_t + f_y f$, of variable order and step, for stiff problems.
+    """Implicit multistep methods that use `y″ = f_t + f_y f`, of variable order and step, for stiff problems.
 
-    A step interpolates, in the sense of Hermite, at the new point and at $k$ points of the past. The second derivative
+    A step interpolates, in the sense of Hermite, at the new point and at k points of the past. The second derivative
     is exact, by one directional derivative of the vector field, which must be differentiable. Families:
 
-    - `"E"` (Enright), order $k + 2$, $k \le 7$: integrates the polynomial through values of $f$. A-stable for
-        $k \le 2$, stiffly stable for all, and zero-stable for any sequence of steps. The default.
-    - `"B"`, order $k + 1$, $k \le 8$: backward differentiation of $y$ with the second derivative at the new point.
-        A-stable for $k \le 3$; steps may only grow slowly at high orders.
-    - `"H"`, order $2k + 2$, $k \le 3$: as E, with $f'$ at every point. A-stable, without damping at infinity, for
-        $k = 1$; unsuitable for stiff problems otherwise.
-    - `"Y"`, order $2k + 1$, $k \le 3$: as B, with $y'$ at every point. A-stable for $k = 1$.
+    - `"E"` (Enright), order `k + 2`, `k ≤ 7`: integrates the polynomial through values of `f`. A-stable for
+        `k ≤ 2`, stiffly stable for all, and zero-stable for any sequence of steps. The default.
+    - `"B"`, order `k + 1`, `k ≤ 8`: backward differentiation of `y` with the second derivative at the new point.
+        A-stable for `k ≤ 3`; steps may only grow slowly at high orders.
+    - `"H"`, order `2k + 2`, `k ≤ 3`: as E, with `f′` at every point. A-stable, without damping at infinity, for
+        `k = 1`; unsuitable for stiff problems otherwise.
+    - `"Y"`, order `2k + 1`, `k ≤ 3`: as B, with `y′` at every point. A-stable for `k = 1`.
 
     Formulas that are not A-stable amplify lightly damped vibrations when a step covers a few radians of them. They are
     chosen only for steps at which no eigenvalue of the Jacobian (computed whenever Newton's method needs a new one)
@@ -115,7 +115,7 @@ class Hermite(AbstractMultistep):
     step, where lightly damped vibrations and growing components are found first. One such vibration among many
     components that are damped well may be missed; the error estimate then keeps steps short.
 
-    Use it with [`jaxmb.solvers.MultistepController`][], as [`jaxmb.solvers.Adams`][]; the term, `diffrax.SaveAt`,
+    Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
     implicit function theorem, with the exact Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but
     more slowly.
@@ -125,16 +125,16 @@ class Hermite(AbstractMultistep):
     changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation with μ = 100 over a
     jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
 
-    ??? cite "Reference"
+    **Reference:**
 
-        ```bibtex
-        @article{enright1974second,
-            author={Enright, W. H.},
-            title={Second Derivative Multistep Methods for Stiff Ordinary Differential Equations},
-            journal={SIAM Journal on Numerical Analysis},
-            volume={11}, number={2}, pages={321--331}, year={1974},
-        }
-        ```
+    ```bibtex
+    @article{enright1974second,
+        author={Enright, W. H.},
+        title={Second Derivative Multistep Methods for Stiff Ordinary Differential Equations},
+        journal={SIAM Journal on Numerical Analysis},
+        volume={11}, number={2}, pages={321--331}, year={1974},
+    }
+    ```
     """
 
     tolerances: Tolerances
@@ -157,9 +157,9 @@ class Hermite(AbstractMultistep):
         """**Arguments:**
 
         - `family`: the family of formulas.
-        - `past_points`: the numbers $k$ of points of the past to choose from, increasing; default all useful ones. A
+        - `past_points`: the numbers k of points of the past to choose from, increasing; default all useful ones. A
             pair such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes
-            the order. The method starts with $k = 1$.
+            the order. The method starts with k = 1.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
             leave them out.

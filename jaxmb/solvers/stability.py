@@ -77,7 +77,7 @@ def formula(family: str, k: int) -> Formula:
         "Y" (with its slope at every point).
     - `k`: the number of points of the past, at least 1, also those without practical use.
 
-    **Returns:** a [`jaxmb.solvers.stability.Formula`][].
+    **Returns:** a `Formula`.
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
@@ -97,7 +97,7 @@ def adams(k: int) -> Formula:
 
     **Arguments:** `k`: the order of the predictor, at least 1.
 
-    **Returns:** a [`jaxmb.solvers.stability.Formula`][] of order k + 1, with `b_0 = c_0 = 0`.
+    **Returns:** a `Formula` of order k + 1, with `b_0 = c_0 = 0`.
 
     **Raises:** `ValueError` for `k < 1`.
     """
@@ -209,7 +209,7 @@ def largest_growth(family: str, k: int) -> float:
     With steps in a constant ratio the coefficients are constant too. Those of y are the same for all steps in the
     families E and H, and in the one-step formulas.
 
-    **Arguments:** `family`, `k`: as for [`jaxmb.solvers.stability.formula`][].
+    **Arguments:** `family`, `k`: as for `formula`.
 
     **Returns:** the ratio of a step and the one before, to 1e-5; infinite if every ratio is stable. It is below one for
     a formula that is not zero-stable when the steps are equal.

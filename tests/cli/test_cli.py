@@ -116,6 +116,20 @@ def test_where_to_write_is_checked_first(capsys, tmp_path, monkeypatch):
     assert "is not writable" in capsys.readouterr().err
 
 
+def test_help_on_a_name(capsys):
+    assert main(["help", "Trajectory.reactions"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("jaxmb.Trajectory.reactions\n\nForces of the joints")
+    assert main(["help"]) == 0
+    out = capsys.readouterr().out
+    assert "Scenes and their numbers" in out and "  mechanisms.four_bar  Crank, coupler and rocker" in out
+
+
+def test_help_on_an_unknown_name(capsys):
+    assert main(["help", "simulat"]) == 2
+    assert capsys.readouterr().err.startswith("jaxmb: Unknown name 'simulat'; did you mean 'simulate'")
+
+
 def test_interrupted(capsys, monkeypatch):
     def interrupt(*args, **kwargs):
         raise KeyboardInterrupt
@@ -143,5 +157,7 @@ def test_parameters_of_a_mechanism():
 
 
 def test_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "jaxmb", "--help"], capture_output=True, text=True, check=True)
-    assert "mechanisms" in done.stdout
+    """It is no error if the program that reads the output ends before it has read all."""
+    command = f"{sys.executable} -m jaxmb help | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert done.stdout == "Scenes and their numbers\n" and done.stderr == ""

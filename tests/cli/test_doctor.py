@@ -80,7 +80,7 @@ def test_what_is_missing(capsys, monkeypatch):
 def test_the_extras_are_those_of_the_package():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     names = {extra: tuple(re.match(r"[\w-]+", each).group() for each in own) for extra, own in extras.items()}
-    assert {extra: names[extra] for extra in ("plot", "view", "import", "studies")} == doctor._OPTIONAL
+    assert {extra: names[extra] for extra in ("docs", "plot", "view", "import", "studies")} == doctor._OPTIONAL
 
 
 def test_measurements(capsys, monkeypatch):

@@ -25,6 +25,7 @@ LAYERS = [
     ["simulate"],
     ["studies", "viz", "mechanisms", "importers"],
     ["report"],
+    ["reference"],
     ["cli"],
     ["__main__"],
 ]

@@ -17,14 +17,24 @@ from .joints import relative_angle
 class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
+    ```python
+    crank = planar.Body("crank", mass=1.0, inertia=0.1)
+    pin = planar.Revolute("pin", "ground", "crank", point=(0.0, 0.0))
+    ramp = {"motion": lambda t, p: p["rate"] * t, "parameters": {"rate": 2.0}}
+    turn = planar.Driver("turn", "ground", "crank", quantity="angle", **ramp)
+    system = jaxmb.Scene([crank], joints=[pin, turn]).compile()
+    ```
+
+    It has no coordinates of its own.
+
     **Arguments:**
 
-    - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
+    - `name`; `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
     - `quantity`: `"angle"` [rad], `angle_b − angle_a`; `"x"` or `"y"` [m], a coordinate of point B relative to point A
         in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.
     - `parameters`: numbers of the motion by name; they become parameters of the system, `"name.key"`.
-    - `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
+    - `point_a`, `point_b` [m], shape (2,), body-fixed, default the origins of the frames.
     """
 
     quantity: Literal["angle", "x", "y", "distance"] = fields.choice("angle", "x", "y", "distance")

@@ -29,11 +29,22 @@ def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
 
 
 class Revolute(AbstractPlanarPart, AbstractJoint):
-    """A pin: two points coincide. Rows 2: `d = 0`.
+    """A pin: points A and B of two bodies coincide. Rows 2: `d = 0`, with d from A to B.
+
+    ```python
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.0, -0.5), angle=-1.5)
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    system = jaxmb.Scene([bar], joints=[pin]).compile()
+    ```
 
     Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
 
-    **Arguments:** `point_a`, `point_b` [m], shape (2,), body-fixed; or `point` [m], shape (2,), world.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
+        at this place of the world at the given poses.
     """
 
     rows: ClassVar[int] = 2
@@ -50,9 +61,24 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
 
 
 class Fixed(AbstractPlanarPart, AbstractJoint):
-    """A weld: two points coincide and the relative angle is constant. Rows 3: `d = 0`, `angle_b − angle_a = angle`.
+    """A weld: points A and B of two bodies coincide and the relative angle is constant. Rows 3: `d = 0`, with d from A
+    to B, and `angle_b − angle_a = angle`.
 
-    **Arguments:** points as in `Revolute`; `angle` [rad], default that of the given poses.
+    ```python
+    plate = planar.Body("plate", mass=1.0, inertia=0.1, position=(0.4, 0.0), angle=0.2)
+    weld = planar.Fixed("weld", "ground", "plate", point=(0.0, 0.0))
+    system = jaxmb.Scene([plate], joints=[weld]).compile()
+    ```
+
+    It leaves no motion and has no coordinates.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
+        at this place of the world at the given poses.
+    - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
     """
 
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
@@ -66,13 +92,27 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
 
 
 class PointOnLine(AbstractPlanarPart, AbstractJoint):
-    """A pin in a straight slot: point B stays on the line through A. Rows 1: `n·d = 0`.
+    """A pin in a straight slot: point B stays on the line through A. Rows 1: `n·d = 0`, with d from A to B and n the
+    normal of the slot.
 
-    Its coordinates are `displacement` [m], the distance of B from A along the slot, and `angle` as in `Revolute`. If
-    the points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+    ```python
+    block = planar.Body("block", mass=1.0, inertia=0.1, position=(0.3, 0.0))
+    slot = planar.PointOnLine("slot", "ground", "block", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis_a=(1.0, 0.0))
+    system = jaxmb.Scene([block], joints=[slot]).compile()
+    ```
 
-    **Arguments:** points as in `Revolute`; `axis_a`, unit, shape (2,), direction of the slot fixed in `body_a`, or
-    `axis` in the world at the given pose.
+    Its coordinates are `displacement` [m], how far B is from A along the slot, zero where they coincide, and `angle`
+    [rad], that of `body_b` less that of `body_a`, zero where both bodies have the same angle. If the points are given
+    by a world `point`, where they coincide, the displacement is zero at the given poses.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, unit, shape (2,): the direction of the slot, fixed in `body_a`; or `axis`, unit, shape (2,): that in the
+        world at the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -94,15 +134,29 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
 
 
 class Prismatic(AbstractPlanarPart, AbstractJoint):
-    """A slide: B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, `angle_b − angle_a
-    = angle`.
+    """A slide: point B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, with d from A
+    to B and n the normal of the line, and `angle_b − angle_a = angle`.
 
-    Its coordinate is `displacement` [m], the distance of B from A along the axis. If the points are given by a world
-    `point`, where they coincide, the displacement is zero at the given poses, wherever the body then is; give `point_a`
-    and `point_b` to count from a place of your own. Where B is along the axis has no effect on the motion, and a
-    picture shows the slide next to the mass centre of `body_b`.
+    ```python
+    piston = planar.Body("piston", mass=1.0, inertia=0.1, position=(0.3, 0.0))
+    slide = planar.Prismatic("slide", "ground", "piston", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis_a=(1.0, 0.0))
+    system = jaxmb.Scene([piston], joints=[slide]).compile()
+    ```
 
-    **Arguments:** as in `PointOnLine`; `angle` [rad], default that of the given poses.
+    Its coordinate is `displacement` [m], how far B is from A along the axis, zero where they coincide. If the points
+    are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
+    then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
+    the motion, and a picture shows the slide next to the mass centre of `body_b`.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, unit, shape (2,): the direction of the slide, fixed in `body_a`; or `axis`, unit, shape (2,): that in
+        the world at the given poses.
+    - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -145,10 +199,23 @@ def _displacement(space, part, poses):
 
 
 class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
-    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`; the multiplier is
-    the rod force [N].
+    """A massless rod: points A and B of two bodies keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`,
+    with d from A to B; the multiplier is the rod force [N].
 
-    **Arguments:** `point_a`, `point_b` [m], shape (2,), body-fixed; `length` [m] > 0, default that of the given poses.
+    ```python
+    bob = planar.Body("bob", mass=1.0, inertia=0.1, position=(0.6, 0.0))
+    rod = planar.Distance("rod", "ground", "bob", point_b=(-0.1, 0.0))
+    system = jaxmb.Scene([bob], joints=[rod]).compile()
+    ```
+
+    It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
+    - `length` [m] > 0, default that of the given poses.
     """
 
     point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0))
@@ -172,8 +239,22 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A pin in a curved slot: point B stays on a curve fixed in `body_a`. Rows 1: `curve(B in the frame of body_a,
     parameters) = 0`.
 
-    **Arguments:** `point_b` [m], shape (2,), body-fixed; `curve(point, parameters) -> scalar`, zero on the curve and
-    with a gradient there; `parameters`, numbers of the curve by name.
+    ```python
+    bead = planar.Body("bead", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    circle = lambda point, p: point @ point - p["radius"] ** 2
+    ring = planar.PointOnCurve("ring", "ground", "bead", circle, parameters={"radius": 0.5})
+    system = jaxmb.Scene([bead], joints=[ring]).compile()
+    ```
+
+    Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `curve(point, parameters) -> scalar`: zero on the curve and with a gradient there; the point has shape (2,).
+    - `point_b` [m], shape (2,): B fixed in `body_b`, default the origin of its frame.
+    - `parameters`: numbers of the curve by name; they become parameters of the system, `"name.key"`.
     """
 
     curve: Callable[[Float[Array, "2"], Any], Scalar] = fields.function()
@@ -192,10 +273,25 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
 
 class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
-    """A pair of gears on a carrier. Rows 1: `(angle_b − angle_c) = ratio (angle_a − angle_c) + offset`.
+    """A pair of gears on a carrier. Rows 1: `(angle_b − angle_c) = ratio (angle_a − angle_c) + offset`, with the angle
+    of the carrier, `angle_c`.
 
-    **Arguments:** `ratio`, negative for an external mesh (−radius_a / radius_b); `carrier`, the body that holds both
-    axles, default ground; `offset` [rad], default that of the given poses.
+    ```python
+    wheels = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0)) for name, x in (("a", 0.0), ("b", 0.3))]
+    axles = [planar.Revolute(f"{own.name} axle", "ground", own.name, point=own.position) for own in wheels]
+    mesh = planar.Gear("mesh", "a", "b", ratio=-0.5)
+    system = jaxmb.Scene(wheels, joints=[*axles, mesh]).compile()
+    ```
+
+    It has no coordinates of its own; those of the axles have angles.
+
+    **Arguments:**
+
+    - `name`, of the pair; `body_a`, `body_b`: the two gears by name, each of which another joint holds on its axle.
+    - `ratio`, not zero: of the speed of `body_b` to that of `body_a`, negative for an external mesh (−radius_a /
+        radius_b).
+    - `carrier`: the body that holds both axles, default the ground.
+    - `offset` [rad], default that of the given poses.
     """
 
     ratio: fields.Number = fields.parameter(sign="nonzero")
@@ -214,13 +310,27 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
 class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A pinion (`body_a`) that rolls along a rack (`body_b`). Rows 1: `axis·(A − B) = −radius (angle_a − angle_b) +
-    offset`.
+    offset`, with the axis of the rack.
 
-    A pinion on top of a rack along x, turning clockwise, moves towards +x of the rack.
+    ```python
+    pinion = planar.Body("pinion", mass=1.0, inertia=0.1, position=(0.0, 0.2))
+    axle = planar.Revolute("axle", "ground", "pinion", point=(0.0, 0.2))
+    rack = planar.Body("rack", mass=1.0, inertia=0.1)
+    rail = planar.Prismatic("rail", "ground", "rack", point=(0.0, 0.0), axis=(1.0, 0.0))
+    mesh = planar.RackAndPinion("mesh", "pinion", "rack", radius=0.2)
+    system = jaxmb.Scene([pinion, rack], joints=[axle, rail, mesh]).compile()
+    ```
 
-    **Arguments:** `radius` [m] > 0 of the pinion; `point_a` [m], its centre; `point_b` [m], a point of the rack;
-    `axis_b`, unit, shape (2,), direction of the rack fixed in `body_b`; `offset` [m], default that of the given
-    poses.
+    A pinion on top of a rack along x, turning clockwise, moves towards +x of the rack. The pair has no coordinates of
+    its own; those of the axle and of the rail have them.
+
+    **Arguments:**
+
+    - `name`, of the pair; `body_a`, `body_b`: the pinion and the rack by name; either may be `"ground"`.
+    - `radius` [m] > 0 of the pinion; `point_a` [m], shape (2,): its centre A, fixed in `body_a`.
+    - `point_b` [m], shape (2,): a point B of the rack; `axis_b`, unit, shape (2,): its direction; both fixed in
+        `body_b`.
+    - `offset` [m], default that of the given poses.
     """
 
     radius: fields.Number = fields.length(sign="positive")

@@ -11,8 +11,19 @@ class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
     """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n
     the normal of the blade.
 
-    **Arguments:** `point` [m], shape (2,), contact point fixed in the body; `axis`, unit, shape (2,), direction of
-    the blade fixed in the body.
+    ```python
+    sled = planar.Body("sled", mass=1.0, inertia=0.1, velocity=(1.0, 0.0))
+    blade = planar.KnifeEdge("blade", "sled", point=(0.3, 0.0), axis=(1.0, 0.0))
+    system = jaxmb.Scene([sled], joints=[blade]).compile()
+    ```
+
+    It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`, of the blade; `body`: that it is fixed in, or a frame in it, by name.
+    - `point` [m], shape (2,): the contact point fixed in the body, default the origin of its frame.
+    - `axis`, unit, shape (2,): the direction of the blade fixed in the body, default its x axis.
     """
 
     name: str = fields.name()

@@ -37,6 +37,13 @@ _INDEPENDENT = 1e-6
 class Composite(AbstractSpatialPart, AbstractJoint):
     """Hinges and slides in succession, with no mass in between. Rows: 6 less the number of its coordinates.
 
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    way = {"sequence": ("hinge", "slide"), "axes": [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)]}
+    joint = spatial.Composite("joint", "ground", "arm", point=(0.0, 0.0, 0.0), **way)
+    system = jaxmb.Scene([arm], joints=[joint]).compile()
+    ```
+
     From `body_a` to `body_b` there are, in any order, up to three hinges, or a ball, and up to three slides. Their
     coordinates are `angle_1`, … [rad] of the hinges and `displacement_1`, … [m] of the slides, each kind numbered in
     this order, and of a ball `rotation` [rad], shape (3,), as in `Spherical`. The placement of B in A is the product of
@@ -44,15 +51,24 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     displacements from the relative position, which is linear in them.
 
     Where all coordinates are zero, the two points coincide, the relative attitude is `orientation`, and the joints have
-    the directions `axes`. Hinges that follow each other are not parallel. Of three hinges the second turns by less than
-    half a turn, between the two angles at which the three axes lie in one plane; there the angles are not smooth.
+    the directions `axes`; so they are at the given poses, if `point` is given and `orientation` is not. Hinges that
+    follow each other are not parallel. Of three hinges the second turns by less than half a turn, between the two
+    angles at which the three axes lie in one plane; there the angles are not smooth.
 
-    **Arguments:** `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B; points as in `Spherical`;
-    `axes`, shape (n, 3), unit, one for each word (that of a ball has no effect), in the axes of `body_a`, or in the
-    world, `axes_W`; `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world,
-    `points_W`, by default point A for all of them; `orientation`, shape (4,), unit Euler parameters of B relative to A,
-    default those of the given poses; `middle` [rad], default zero: the second of three angles counts in the half turn
-    that contains it.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axes`, shape (n, 3), unit, one for each word (that of a ball has no effect), in the axes of `body_a`; or in the
+        world at the given poses, `axes_W`.
+    - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world, `points_W`; by
+        default point A for all of them.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where all
+        coordinates are zero, default that of the given poses.
+    - `middle` [rad], default zero: the second of three angles counts in the half turn that contains it.
 
     Source: R. W. Brockett, "Robotic manipulators and the product of exponentials formula", Mathematical Theory of
     Networks and Systems, 1984; of three axes in any directions, P. B. Davenport, "Rotations about nonorthogonal axes",

@@ -17,13 +17,21 @@ from .axes import angle, cosine_sine, half_sine, measured_from_given_poses, offs
 class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    hinge = spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    ramp = {"motion": lambda t, p: p["rate"] * t, "parameters": {"rate": 2.0}}
+    turn = spatial.Driver("turn", "ground", "arm", quantity="angle", axis=(0.0, 0.0, 1.0), **ramp)
+    system = jaxmb.Scene([arm], joints=[hinge, turn]).compile()
+    ```
+
     An angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], written with products of direction
     components, which holds for any number of turns. The joint should let B turn about the axis only; otherwise the
-    angle is that of the projections perpendicular to the axis.
+    angle is that of the projections perpendicular to the axis. The driver has no coordinates of its own.
 
     **Arguments:**
 
-    - `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
+    - `name`; `body_a`, `body_b`: the two bodies; `body_a="ground"` prescribes an absolute coordinate of `body_b`.
     - `quantity`: `"angle"` [rad], from `x_a` to `x_b` about `axis_a`; `"x"`, `"y"` or `"z"` [m], a coordinate of point
         B relative to point A in the axes of `body_a`; `"distance"` [m], between the points.
     - `motion(t, parameters)`: its value as a function of time, twice differentiable by JAX.

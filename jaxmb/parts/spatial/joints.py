@@ -57,13 +57,26 @@ class AbstractOriented(AbstractSpatialPart, AbstractJoint):
 
 
 class Spherical(AbstractOriented):
-    """A ball: two points coincide. Rows 3: `d`.
+    """A ball: points A and B of two bodies coincide. Rows 3: `d = 0`, with d from A to B.
+
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    ball = spatial.Spherical("ball", "ground", "arm", point=(0.0, 0.0, 0.0))
+    system = jaxmb.Scene([arm], joints=[ball]).compile()
+    ```
 
     Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
-    from `orientation` to the relative attitude. It is not smooth at half a turn.
+    from `orientation` to the relative attitude; zero at the given poses, unless `orientation` is given. It is not
+    smooth at half a turn.
 
-    **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; or `point` [m], shape (3,), world; `orientation`,
-    shape (4,), unit Euler parameters of B relative to A where the rotation is zero, default those of the given poses.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where the rotation
+        is zero, default that of the given poses.
     """
 
     rows: ClassVar[int] = 3
@@ -93,14 +106,29 @@ class AbstractAxial(AbstractSpatialPart, AbstractJoint):
 
 
 class Revolute(AbstractAxial):
-    """A hinge: two points coincide and two axes are parallel. Rows 5: `d`, and two of the tilt.
+    """A hinge: points A and B of two bodies coincide and two axes are parallel. Rows 5: d from A to B (3), and the tilt
+    (2), the components across the axis of `2 sin(θ/2)` times the unit vector of the axis of B across that of A, with
+    the angle θ between the axes.
 
-    Its coordinate is `angle` [rad], the turn of `body_b` about the axis: from `x_a` to `x_b` if they are given, else
-    from the given poses.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    hinge = spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[hinge]).compile()
+    ```
 
-    **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), direction of the hinge fixed in each
-    body; or `axis`, unit, shape (3,), world; `x_a`, `x_b`, unit, shape (3,), body-fixed and perpendicular to the axis:
-    the angle is measured between them.
+    Its coordinate is `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
+    given poses, unless these are given.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
+        that of both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 5
@@ -116,14 +144,30 @@ class Revolute(AbstractAxial):
 
 
 class Universal(AbstractSpatialPart, AbstractJoint):
-    """A Cardan joint: two points coincide and two axes stay perpendicular. Rows 4: `d`, `a·b`.
+    """A Cardan joint: points A and B of two bodies coincide and two axes stay perpendicular. Rows 4: d from A to B (3),
+    and the product of the two axes (1).
+
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    axes = {"axis_a_W": (0.0, 1.0, 0.0), "axis_b_W": (0.0, 0.0, 1.0)}
+    cross = spatial.Universal("cross", "ground", "arm", point=(0.0, 0.0, 0.0), **axes)
+    system = jaxmb.Scene([arm], joints=[cross]).compile()
+    ```
 
     Its coordinates are `angle_a`, the turn of the cross in `body_a` about `axis_a`, and `angle_b`, that of `body_b` on
     the cross about `axis_b` [rad], both zero at the given poses: the relative attitude is a turn by the one, the
     attitude at zero, and a turn by the other. They are smooth in every position of the joint.
 
-    **Arguments:** points as in `Spherical`; `axis_a`, `axis_b`, unit, shape (3,), the arms of the cross, fixed in
-    `body_a` and in `body_b`; each may be given in the world instead, as `axis_a_W` and `axis_b_W`.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, `axis_b`, unit, shape (3,): the arms of the cross, fixed in `body_a` and in `body_b`; each may be given
+        in the world at the given poses instead, as `axis_a_W` and `axis_b_W`.
+    - `x_a`, `x_b`, unit, shape (3,): where both angles are zero, the direction in `body_a` of `axis_b`, and that in
+        `body_b` of `axis_a`; default those at the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -165,16 +209,29 @@ class Universal(AbstractSpatialPart, AbstractJoint):
 
 
 class Gimbal(AbstractOriented):
-    """Three hinges in succession about perpendicular axes through one point: a ball with angles. Rows 3: `d`.
+    """Three hinges in succession about perpendicular axes through one point: a ball with angles. Rows 3: d from A to B.
+
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    axes = {"axis_1_W": (1.0, 0.0, 0.0), "axis_2_W": (0.0, 1.0, 0.0), "axis_3_W": (0.0, 0.0, 1.0)}
+    gimbal = spatial.Gimbal("gimbal", "ground", "arm", point=(0.0, 0.0, 0.0), **axes)
+    system = jaxmb.Scene([arm], joints=[gimbal]).compile()
+    ```
 
     Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
-    `body_a`, the second and the third, which is fixed in `body_b`, all zero at the given poses. They are smooth except
-    where the second is a quarter turn, in (−π/2, π/2).
+    `body_a`, the second and the third, which is fixed in `body_b`; all are zero at the given poses, unless
+    `orientation` is given. They are smooth except where the second is a quarter turn, in (−π/2, π/2).
 
-    **Arguments:** points as in `Spherical`; `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each
-    other, the axes where all angles are zero, in the axes of `body_a`; or in the world, `axis_1_W`, `axis_2_W`,
-    `axis_3_W`; `orientation`, shape (4,), unit Euler parameters of B relative to A there, default those of the given
-    poses.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each other: the axes where all angles are zero,
+        in the axes of `body_a`; or in the world at the given poses, `axis_1_W`, `axis_2_W`, `axis_3_W`.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where all angles
+        are zero, default that of the given poses.
     """
 
     axis_1: fields.Number = fields.axis(body=0, optional=True)
@@ -227,12 +284,29 @@ class AbstractSliding(AbstractAxial):
 
 
 class Cylindrical(AbstractSliding):
-    """A pin that turns and slides: two axes stay on one line. Rows 4: two of the tilt, `u·d`, `v·d`.
+    """A pin that turns and slides: two axes stay on one line. Rows 4: the tilt (2) as in `Revolute`, and the components
+    across the axis (2) of d from A to B.
 
-    Its coordinates are `angle` as in `Revolute` and `displacement` [m], the distance of B from A along the axis. If the
-    points are given by a world `point`, where they coincide, the displacement is zero at the given poses.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    sleeve = spatial.Cylindrical("sleeve", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[sleeve]).compile()
+    ```
 
-    **Arguments:** as in `Revolute`.
+    Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
+    given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
+    coincide, so at the given poses if both are given by a world `point`.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
+        that of both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 4
@@ -243,18 +317,35 @@ class Cylindrical(AbstractSliding):
 
 
 class Screw(AbstractSliding):
-    """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical`, and the thread.
+    """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical` (4), and the thread
+    (1).
 
-    With the angle θ from `x_a` to `x_b` about the axis, the shift s = a·d and ψ = θ − 2π (s − offset)/pitch, the last
-    row is `pitch/2π · 2 sin(ψ/2) = 0` with ψ in (−π, π], written with products of direction components: it is periodic
-    in θ and in s, as the screw is, and so holds for any number of turns; near zero its value is the axial error [m].
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    screw = spatial.Screw("screw", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), pitch=0.02)
+    system = jaxmb.Scene([arm], joints=[screw]).compile()
+    ```
 
-    Its coordinates are `angle` and `displacement` as in `Cylindrical`.
+    Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
+    given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
+    coincide, so at the given poses if both are given by a world `point`.
 
-    **Arguments:** points and axes as in `Revolute`; `pitch` [m], advance of B along the axis per turn, positive for a
-    right-handed screw, not zero; `offset` [m], the shift at θ = 0, default that of the given poses; `x_a`, `x_b`, unit,
-    shape (3,), body-fixed and perpendicular to the axis: θ is measured between them; by default it is zero at the given
-    poses.
+    With the angle θ, the displacement s and ψ = θ − 2π (s − offset)/pitch, the last row is `pitch/2π · 2 sin(ψ/2) = 0`
+    with ψ in (−π, π], written with products of direction components: it is periodic in θ and in s, as the screw is, and
+    so holds for any number of turns; near zero its value is the axial error [m].
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
+        that of both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
+    - `pitch` [m], not zero: the advance of B along the axis per turn, positive for a right-handed screw.
+    - `offset` [m]: the displacement where the angle is zero, default that which the given poses ask for.
     """
 
     pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
@@ -277,19 +368,33 @@ class Screw(AbstractSliding):
 
 
 class Prismatic(AbstractOriented):
-    """A slide: B stays on the line through A without turning. Rows 5: `u·d`, `v·d`, and the rotation (3).
+    """A slide: point B stays on the line through A without turning. Rows 5: the components across the axis (2) of d
+    from A to B, and the rotation (3).
+
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    slide = spatial.Prismatic("slide", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[slide]).compile()
+    ```
 
     The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
     rotation vector [rad] when small, and zero only where they agree, for either sign of the bodies' Euler parameters.
 
-    Its coordinate is `displacement` [m], the distance of B from A along the axis. If the points are given by a world
-    `point`, where they coincide, the displacement is zero at the given poses, wherever the body then is; give `point_a`
-    and `point_b` to count from a place of your own. Where B is along the axis has no effect on the motion, and a
-    picture shows the slide next to the mass centre of `body_b`.
+    Its coordinate is `displacement` [m], how far B is from A along the axis, zero where they coincide. If the points
+    are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
+    then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
+    the motion, and a picture shows the slide next to the mass centre of `body_b`.
 
-    **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slide fixed in `body_a`, or
-    `axis` in the world; `orientation`, shape (4,), unit Euler parameters of B relative to A, default those of the given
-    poses.
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, unit, shape (3,): the direction of the slide fixed in `body_a`; or `axis`, unit, shape (3,): that in the
+        world at the given poses.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` along the motion,
+        default that of the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -313,12 +418,30 @@ class Prismatic(AbstractOriented):
 
 
 class Planar(AbstractAxial):
-    """A sliding face: B stays in the plane through A normal to `a`, the axes parallel. Rows 3: two of the tilt, `a·d`.
+    """A sliding face: point B stays in the plane through A normal to the axis, the axes parallel. Rows 3: the tilt (2)
+    as in `Revolute`, and the component along the axis (1) of d from A to B.
 
-    Its coordinates are `angle` as in `Revolute`, and `displacement` [m], shape (2,), the components of d along `x_a`
-    and along `a × x_a`: zero where B is next to A, so at the given poses if both are given by a world `point`.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    face = spatial.Planar("face", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[face]).compile()
+    ```
 
-    **Arguments:** as in `Revolute`; the axes are the normals of the two faces.
+    Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
+    given poses, unless these are given; and `displacement` [m], shape (2,), the components of d along `x_a` and along
+    the cross product of `axis_a` and `x_a`: zero where B is next to A, so at the given poses if both are given by a
+    world `point`.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, `axis_b`, unit, shape (3,): the normal of the face fixed in `body_a` and in `body_b`; or `axis`, unit,
+        shape (3,): that of both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 3
@@ -334,9 +457,25 @@ class Planar(AbstractAxial):
 
 
 class Fixed(AbstractOriented):
-    """A weld: two points coincide and B does not turn in A. Rows 6: `d`, and the rotation (3) as in `Prismatic`.
+    """A weld: points A and B of two bodies coincide and B does not turn in A. Rows 6: d from A to B (3), and the
+    rotation (3) as in `Prismatic`.
 
-    **Arguments:** points as in `Spherical`; `orientation` as in `Prismatic`.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    weld = spatial.Fixed("weld", "ground", "arm", point=(0.0, 0.0, 0.0))
+    system = jaxmb.Scene([arm], joints=[weld]).compile()
+    ```
+
+    It leaves no motion and has no coordinates.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept,
+        default that of the given poses.
     """
 
     rows: ClassVar[int] = 6

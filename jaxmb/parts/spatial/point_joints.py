@@ -13,11 +13,23 @@ from .axes import across, displacement_along, offset_in_a
 
 
 class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
-    """A massless rod: two points keep their distance. Rows 1: `(d·d − length²) / (2 length)`.
+    """A massless rod: points A and B of two bodies keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`,
+    with d from A to B.
 
-    The multiplier is the rod force [N].
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    rod = spatial.Distance("rod", "ground", "arm", point_b=(-0.4, 0.0, 0.0))
+    system = jaxmb.Scene([arm], joints=[rod]).compile()
+    ```
 
-    **Arguments:** `point_a`, `point_b` [m], shape (3,), body-fixed; `length` [m] > 0, default that of the given poses.
+    The multiplier is the rod force [N]. It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
+    - `length` [m] > 0, default that of the given poses.
     """
 
     point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
@@ -38,10 +50,25 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
 
 
 class PointOnPlane(AbstractSpatialPart, AbstractJoint):
-    """A point of B stays in a plane fixed in A, through A normal to the axis. Rows 1: `a·d`.
+    """Point B of a body stays in a plane fixed in A, through A normal to the axis. Rows 1: the component along the axis
+    of d from A to B.
 
-    **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), normal of the plane fixed in `body_a`, or
-    `axis` in the world.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    table = spatial.PointOnPlane("table", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[table]).compile()
+    ```
+
+    It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, unit, shape (3,): the normal of the plane fixed in `body_a`; or `axis`, unit, shape (3,): that in the
+        world at the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -53,10 +80,26 @@ class PointOnPlane(AbstractSpatialPart, AbstractJoint):
 
 
 class PointOnLine(AbstractSpatialPart, AbstractJoint):
-    """A ball in a straight slot: a point of B stays on the line through A along the axis. Rows 2: `u·d`, `v·d`.
+    """A ball in a straight slot: point B stays on the line through A along the axis. Rows 2: the components across the
+    axis of d from A to B.
 
-    **Arguments:** points as in `Spherical`; `axis_a`, unit, shape (3,), direction of the slot fixed in `body_a`, or
-    `axis` in the world.
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    slot = spatial.PointOnLine("slot", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    system = jaxmb.Scene([arm], joints=[slot]).compile()
+    ```
+
+    Its coordinate is `displacement` [m], how far B is from A along the slot: zero where they coincide, so at the given
+    poses if both are given by a world `point`.
+
+    **Arguments:**
+
+    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
+        at this place of the world at the given poses.
+    - `axis_a`, unit, shape (3,): the direction of the slot fixed in `body_a`; or `axis`, unit, shape (3,): that in the
+        world at the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)

@@ -15,13 +15,25 @@ from .axes import perpendiculars
 
 
 class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
-    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`.
+    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`, with the normal e of the
+    plane, the direction h of the blade and the velocity v of the contact point.
 
-    Here v is the velocity of the contact point and h the direction of the blade. The constraint does not hold the body
-    on the plane; add a `Planar` or `PointOnPlane` joint.
+    ```python
+    sled = spatial.Body("sled", mass=1.0, inertia=spatial.box(1.0, 0.5, 0.2, 0.1), velocity=(1.0, 0.0, 0.0))
+    ice = spatial.Planar("ice", "ground", "sled", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    blade = spatial.KnifeEdge("blade", "sled", point=(0.2, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    system = jaxmb.Scene([sled], joints=[ice, blade]).compile()
+    ```
 
-    **Arguments:** `point` [m], shape (3,), contact point fixed in the body; `axis`, unit, shape (3,), direction of the
-    blade fixed in the body; `normal`, unit, shape (3,), of the plane in the world.
+    The constraint does not hold the body on the plane; add a `Planar` or `PointOnPlane` joint. It has no coordinates of
+    its own.
+
+    **Arguments:**
+
+    - `name`, of the blade; `body`: that it is fixed in, or a frame in it, by name.
+    - `point` [m], shape (3,): the contact point fixed in the body, default the origin of its frame.
+    - `axis`, unit, shape (3,): the direction of the blade fixed in the body, default its x axis.
+    - `normal`, unit, shape (3,): that of the plane in the world, default z.
     """
 
     name: str = fields.name()
@@ -71,12 +83,21 @@ def _tangential(normal, v):
 class RollingDisc(AbstractDisc, AbstractCompound):
     """A thin disc that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
-    The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, n the
-    axle. The disc must never lie flat.
+    ```python
+    coin = spatial.Body("coin", mass=1.0, inertia=spatial.disc(1.0, 0.1, "y"), position=(0.0, 0.0, 0.1))
+    rolling = spatial.RollingDisc("rolling", "coin", radius=0.1, axis=(0.0, 1.0, 0.0))
+    system = jaxmb.Scene([coin], joints=[rolling]).compile()
+    ```
 
-    **Arguments:** `radius` [m] > 0; `axis`, unit, shape (3,), the axle fixed in the body; `centre` [m], shape (3,), of
-    the disc, fixed in the body, default the origin of the frame; `point` [m] and `normal` (unit), shape (3,), of the
-    plane in the world.
+    The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, with
+    the normal e of the plane and the axle n. The disc must never lie flat. It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`; `body`: that the disc is fixed in, or a frame in it, by name.
+    - `radius` [m] > 0; `axis`, unit, shape (3,): the axle fixed in the body, default its z axis; `centre` [m], shape
+        (3,), of the disc, fixed in the body, default the origin of its frame.
+    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0.
     """
 
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
@@ -128,9 +149,21 @@ class AbstractBall(AbstractSpatialPart):
 class RollingSphere(AbstractBall, AbstractCompound):
     """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
-    **Arguments:** `radius` [m] > 0; `centre` [m], shape (3,), of the sphere, fixed in the body, default the origin of
-    the frame; `point` [m] and `normal` (unit), shape (3,), of the plane in the world; `spin` [rad/s], of a turntable:
-    the rate at which the plane turns about its normal through `point`, default a plane at rest.
+    ```python
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1), position=(0.0, 0.0, 0.1))
+    rolling = spatial.RollingSphere("rolling", "ball", radius=0.1)
+    system = jaxmb.Scene([ball], joints=[rolling]).compile()
+    ```
+
+    It has no coordinates of its own.
+
+    **Arguments:**
+
+    - `name`; `body`: that the sphere is fixed in, or a frame in it, by name.
+    - `radius` [m] > 0; `centre` [m], shape (3,), of the sphere, fixed in the body, default the origin of its frame.
+    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0.
+    - `spin` [rad/s], of a turntable: the rate at which the plane turns about its normal through `point`, default a
+        plane at rest.
     """
 
     spin: fields.Number = fields.parameter(unit="rad/s", optional=True)

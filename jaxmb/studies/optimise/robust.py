@@ -22,7 +22,7 @@ def robust(
 
     ```python
     samples = {"spring.stiffness": 500.0 * rng.standard_normal(32), "payload": rng.uniform(0.0, 2e3, 32)}
-    mb.optimise(mb.robust(ride, samples, weight=1.0), start, objective="comfort", …)
+    mb.optimise(mb.robust(ride, samples, weight=1.0), start, objective="comfort")
     ```
 
     **Arguments:**

@@ -1,0 +1,286 @@
+"""The public names, each once, by subject.
+
+A name is public in a module that defines it without an underscore, or that imports it in the form that makes it public
+for type checkers, `from .planar import Body as Body`. Names of plain values, such as those of types, have no entry: the
+docstrings of their modules say what they are.
+"""
+
+import ast
+import dataclasses
+import functools
+import importlib
+import inspect
+import re
+from collections.abc import Iterable, Iterator
+from types import ModuleType
+from typing import Any
+
+from ..parts.names import unknown
+
+PACKAGE = __name__.split(".")[0]
+
+# The names of the package itself, which are too many for one list.
+_OF_PACKAGE = {
+    "Scenes and their numbers": "Scene RigidBodySystem State parameters with_parameters with_inputs design Variable",
+    "States and motions": "assemble assembly_gap equilibrium simulate batch Trajectory load RESULTS keep_compiled "
+    "UnknownNameError",
+    "Forces and drives of both spaces": "Gravity Motor Actuator Controller Servo Series Tendon FixedTendon "
+    "JointSpring JointForce JointStop JointFriction DryFriction JointDriver JointInertia JointCoupling",
+    "Unilateral constraints": "Stop RigidContact RigidBallContact RigidPlaneContact Slack",
+    "Parts from functions": "Constraint VelocityConstraint Force NonIdeal",
+    "Identification": "identify Identification Experiment Measurements read_measurements Sensor",
+    "Optimisation": "optimise Optimum robust",
+    "Small motions": "linearise Linearisation root_locus RootLocus steady_motion floquet Floquet",
+    "Sweeps": "sweep load_sweep",
+}
+# In this order; a name that several modules have belongs to the first of them.
+_MODULES = (
+    *("planar", "spatial", "contact", "terrain", "shapes", "rotations", "cases", "studies", "mechanisms"),
+    *("mechanisms.ride", "importers", "viz", "report", "lagrangian", "parts", "formulations", "manifold", "solvers"),
+    *("solvers.stability", "system", "trajectory"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A public name: of a module, a class or a function, or of a member of a class.
+
+    **Fields:** `name`, as a user writes it after `jaxmb.`; `thing`, what it stands for, of a field its annotation;
+    `owner`, the class of a member.
+    """
+
+    name: str
+    thing: Any
+    owner: type | None = None
+
+    @property
+    def kind(self) -> str:
+        """Module, class, function, method, property or field."""
+        if self.owner is not None:
+            if isinstance(self.thing, str):
+                return "field"
+            return "method" if callable(self.thing) else "property"
+        return "module" if inspect.ismodule(self.thing) else "class" if inspect.isclass(self.thing) else "function"
+
+    @property
+    def short(self) -> str:
+        """The last word of the name."""
+        return self.name.rpartition(".")[2]
+
+    @property
+    def text(self) -> str:
+        """Its docstring; of a class with the arguments that the docstring of its own `__init__` explains."""
+        own = self.thing.__doc__ if self.kind != "field" else f"A field; see `{self.name.rpartition('.')[0]}`."
+        texts = [own, vars(self.thing)["__init__"].__doc__] if _explains_arguments(self.thing) else [own]
+        return "\n\n".join(inspect.cleandoc(text) for text in texts if text)
+
+    @property
+    def summary(self) -> str:
+        """The first sentence of its docstring, in one line."""
+        paragraph = " ".join(self.text.split("\n\n")[0].split())
+        found = re.match(r".*?[^.]\.(?=\s+[A-Z`*]|$)", paragraph)
+        return found.group() if found else paragraph
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """Public names that belong together.
+
+    **Fields:** `title`; `module`, the entry of the module that has them, None for names of the package itself;
+    `entries`; `others`, entries elsewhere for names that the module has as well.
+    """
+
+    title: str
+    module: Entry | None
+    entries: tuple[Entry, ...]
+    others: tuple[Entry, ...] = ()
+
+
+def _explains_arguments(thing: Any) -> bool:
+    own = vars(thing).get("__init__") if inspect.isclass(thing) else None
+    return own is not None and (own.__doc__ or "").startswith("**Arguments:**")
+
+
+def public_names(module: ModuleType) -> Iterator[str]:
+    """The public names of a module, in its order."""
+    pending = list(ast.parse(inspect.getsource(module)).body)
+    while pending:
+        node = pending.pop(0)
+        match node:
+            case ast.If():
+                pending = node.body + pending
+            case ast.ImportFrom():
+                yield from (alias.name for alias in node.names if alias.asname == alias.name)
+            case ast.FunctionDef() | ast.ClassDef() if not node.name.startswith("_"):
+                yield node.name
+            case ast.Assign():
+                yield from (own.id for own in node.targets if isinstance(own, ast.Name) and not own.id.startswith("_"))
+
+
+def _is_described(thing: Any) -> bool:
+    is_own = getattr(thing, "__module__", "").split(".")[0] == PACKAGE
+    return is_own and (inspect.isclass(thing) or inspect.isroutine(thing))
+
+
+@functools.cache
+def subjects() -> tuple[Subject, ...]:
+    """All subjects: those of the package, and then its modules."""
+    package = importlib.import_module(PACKAGE)
+    made = [
+        Subject(title, None, tuple(Entry(name, getattr(package, name)) for name in names.split()))
+        for title, names in _OF_PACKAGE.items()
+    ]
+    known = {id(entry.thing): entry for subject in made for entry in subject.entries}
+    for path in _MODULES:
+        module = functools.reduce(getattr, path.split("."), package)
+        own, others = [], []
+        for name in public_names(module):
+            thing = getattr(module, name)
+            if id(thing) in known:
+                others.append(known[id(thing)])
+            elif _is_described(thing):
+                own.append(known.setdefault(id(thing), Entry(f"{path}.{name}", thing)))
+        made.append(Subject(f"{PACKAGE}.{path}", Entry(path, module), tuple(own), tuple(others)))
+    return tuple(made)
+
+
+@functools.cache
+def entries() -> dict[str, Entry]:
+    """All entries by name, but for members of classes."""
+    modules = (subject.module for subject in subjects() if subject.module is not None)
+    every = (*modules, *(entry for subject in subjects() for entry in subject.entries))
+    return {entry.name: entry for entry in every}
+
+
+@functools.cache
+def other_names() -> dict[str, Entry]:
+    """Entries by the further names that they have: in other modules, and in another spelling."""
+    known = {id(entry.thing): entry for entry in entries().values()}
+    package = importlib.import_module(PACKAGE)
+    modules = {"": package} | {subject.module.name: subject.module.thing for subject in subjects() if subject.module}
+    found = {}
+    for path, module in modules.items():
+        for name in public_names(module):
+            entry, own = known.get(id(getattr(module, name))), f"{path}.{name}".lstrip(".")
+            if entry is not None and entry.name != own:
+                found[own] = entry
+    return found
+
+
+@functools.cache
+def members(entry: Entry) -> tuple[Entry, ...]:
+    """The methods and properties of a class that have a docstring and that no public base class has."""
+    inherited = {name for base in bases(entry) for name in _documented(_of_package(base.thing))}
+    own, *others = _of_package(entry.thing)
+    public = {id(base.thing) for base in bases(entry)}
+    of_private = _documented(base for base in others if id(base) not in public)
+    every = {name: thing for name, thing in of_private.items() if name not in inherited} | _documented([own])
+    return tuple(Entry(f"{entry.name}.{name}", thing, entry.thing) for name, thing in every.items())
+
+
+@functools.cache
+def bases(entry: Entry) -> tuple[Entry, ...]:
+    """The entries of the public classes that a class derives from, nearest first."""
+    known = {id(own.thing): own for own in entries().values()}
+    mro = entry.thing.__mro__[1:] if entry.kind == "class" else ()
+    return tuple(known[id(base)] for base in mro if id(base) in known)
+
+
+def fields(entry: Entry) -> dict[str, str]:
+    """The annotations of the fields of a class, as they are written."""
+    found = {}
+    for base in reversed(_of_package(entry.thing)):
+        found |= _annotations(base)
+    return found
+
+
+def further_fields(entry: Entry, given: Iterable[str]) -> dict[str, str]:
+    """The fields that a class itself has, but for those that are `given` as parameters."""
+    return {name: annotation for name, annotation in _annotations(entry.thing).items() if name not in given}
+
+
+@functools.cache
+def _annotations(cls: type) -> dict[str, str]:
+    """Those in the source of a class itself, but for what its objects share."""
+    tree = ast.parse(inspect.cleandoc(f"\n{inspect.getsource(cls)}")).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for node in tree.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            annotation = ast.unparse(node.annotation)
+            if not annotation.startswith(("ClassVar", "AbstractVar")) and not node.target.id.startswith("_"):
+                found[node.target.id] = annotation
+    return found
+
+
+def _of_package(cls: type) -> list[type]:
+    """The class and its bases in this package."""
+    return [base for base in cls.__mro__ if base.__module__.split(".")[0] == PACKAGE]
+
+
+def _documented(classes: Iterable[type]) -> dict[str, Any]:
+    """The public methods and properties that some classes define, with docstrings; the first one's of each name."""
+    found = {}
+    for base in classes:
+        for name, raw in vars(base).items():
+            if name.startswith("_") or name in found:
+                continue
+            is_property = isinstance(raw, property | functools.cached_property)
+            thing = raw if is_property else getattr(base, name)
+            if (is_property or inspect.isroutine(thing)) and thing.__doc__:
+                found[name] = thing
+    return found
+
+
+def find(name: str) -> Entry:
+    """The entry of a public name, with `jaxmb.` or `mb.` before it or not. The module may be left out where no other
+    one has the name, as in `four_bar`.
+
+    **Raises:** `UnknownNameError` with the nearest names; `ValueError` for a name of several modules.
+    """
+    plain = re.sub(rf"^({PACKAGE}|mb)\.|\(\)$", "", name.strip())
+    found = _found(plain)
+    if found is not None:
+        return found
+    head, dot, last = plain.rpartition(".")
+    owner = _found(head) if dot else None
+    if owner is not None and owner.kind == "class":
+        own = {entry.short: entry for entry in (*_fields_of(owner), *_every_member(owner))}
+        if last in own:
+            return own[last]
+        raise unknown("name", plain, [f"{head}.{short}" for short in own])
+    raise unknown("name", plain, entries() if dot else _shortest_names())
+
+
+def _found(name: str) -> Entry | None:
+    for known in (entries(), other_names()):
+        if name in known:
+            return known[name]
+    same = _by_short_name().get(name, [])
+    if len(same) > 1:
+        listed = " and ".join(repr(entry.name) for entry in same)
+        raise ValueError(f"{name!r} is the name of {listed}; give one of these.")
+    return same[0] if same else None
+
+
+@functools.cache
+def _by_short_name() -> dict[str, list[Entry]]:
+    found = {}
+    for entry in entries().values():
+        found.setdefault(entry.short, []).append(entry)
+    return found
+
+
+def _shortest_names() -> list[str]:
+    """The shortest names by which entries are found."""
+    known = _by_short_name()
+    return [entry.short if len(known[entry.short]) == 1 else entry.name for entry in entries().values()]
+
+
+def _every_member(entry: Entry) -> tuple[Entry, ...]:
+    """Those of base classes first, so that a dictionary keeps the nearest."""
+    return tuple(own for base in (*reversed(bases(entry)), entry) for own in members(base))
+
+
+def _fields_of(entry: Entry) -> tuple[Entry, ...]:
+    return tuple(Entry(f"{entry.name}.{name}", annotation, entry.thing) for name, annotation in fields(entry).items())

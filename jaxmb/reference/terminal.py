@@ -1,0 +1,147 @@
+"""Entries as text for a terminal, filled to its width."""
+
+import re
+import textwrap
+from collections.abc import Iterable
+
+from .entries import Entry, bases, further_fields, members, subjects
+from .signatures import signature
+
+_BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
+_FENCE = re.compile(r"^( *)```")
+_ITEM = re.compile(r" *(- |\d+\. )")
+
+
+def shown(entry: Entry, width: int = 80, styled: bool = False) -> str:
+    """What is known of an entry: signature, docstring, and the first sentences of what it contains.
+
+    **Arguments:** `width`, of the terminal; `styled`: whether it shows bold and coloured text.
+    """
+    parts = [_styled(_heading(entry, width), styled)]
+    parts += [block if is_code else _styled(block, styled) for block, is_code in _filled(entry.text, width)]
+    if entry.kind in ("module", "class"):
+        contents = _of_module if entry.kind == "module" else _of_class
+        parts += [_styled(part, styled) for part in contents(entry, width)]
+    return "\n\n".join(parts)
+
+
+def listed(width: int = 80, styled: bool = False) -> str:
+    """All public names by subject, each with its first sentence."""
+    parts = [part for subject in subjects() for part in (f"**{subject.title}**", _table(subject.entries, width))]
+    return "\n\n".join(_styled(part, styled) for part in parts if part)
+
+
+def _heading(entry: Entry, width: int) -> str:
+    """The name as it is called, with a line for each parameter where one line is too short for them."""
+    name, own = f"jaxmb.{entry.name}", signature(entry)
+    if entry.kind == "field":
+        return f"**{name}**: {entry.thing}"
+    if own is None:
+        return f"**{name}**"
+    line = f"{name}{own}"
+    if len(line) <= width:
+        return line.replace(name, f"**{name}**", 1)
+    returns = f" -> {own.returns}" if own.returns else ""
+    return "\n".join([f"**{name}**(", *(f"    {parameter}," for parameter in own.parameters), f"){returns}"])
+
+
+def _of_module(entry: Entry, width: int) -> Iterable[str]:
+    (own,) = [subject for subject in subjects() if subject.module == entry]
+    yield from _section("Names", own.entries, width)
+    yield from _section("Of other modules", own.others, width)
+
+
+def _of_class(entry: Entry, width: int) -> Iterable[str]:
+    given = signature(entry)
+    others = further_fields(entry, given.names if given else ())
+    if others:
+        lines = (_hanging(f"{name}: {annotation}", 4, 8, width) for name, annotation in others.items())
+        yield "\n".join(["**Further fields**", *lines])
+    yield from _section("Methods and properties", members(entry), width)
+    for base in bases(entry):
+        inherited = ", ".join(own.short for own in members(base))
+        if inherited:
+            yield "\n".join([f"**From {base.name}**", _hanging(inherited, 4, 4, width)])
+
+
+def _section(title: str, entries: tuple[Entry, ...], width: int) -> Iterable[str]:
+    if entries:
+        yield f"**{title}**\n{_table(entries, width)}"
+
+
+def _table(entries: Iterable[Entry], width: int) -> str:
+    """Names with their first sentences beside them."""
+    lines = []
+    for entry in entries:
+        name = entry.short if entry.owner is not None else entry.name
+        lines.append(_hanging(f"**{name}**  {entry.summary}", 2, 6, width))
+    return "\n".join(lines)
+
+
+def _hanging(text: str, first: int, other: int, width: int) -> str:
+    return textwrap.fill(
+        text, width, initial_indent=" " * first, subsequent_indent=" " * other, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def _filled(text: str, width: int) -> Iterable[tuple[str, bool]]:
+    """The paragraphs of a docstring, filled, and whether they are code; code and tables stay as they are."""
+    for block in _blocks(text):
+        first = block[0]
+        if _FENCE.match(first):
+            yield textwrap.indent(textwrap.dedent("\n".join(block[1:-1])), "    "), True
+        elif first.lstrip().startswith("|"):
+            yield "\n".join(block), False
+        else:
+            yield "\n".join(_hanging_item(item, width) for item in _items(block)), False
+
+
+def _blocks(text: str) -> Iterable[list[str]]:
+    """The lines of a text between empty ones, with those of a piece of code together."""
+    block, in_code = [], False
+    for line in text.splitlines():
+        if _FENCE.match(line):
+            if block and not in_code:
+                yield block
+                block = []
+            block.append(line)
+            if in_code:
+                yield block
+                block = []
+            in_code = not in_code
+        elif line.strip() or in_code:
+            block.append(line)
+        elif block:
+            yield block
+            block = []
+    if block:
+        yield block
+
+
+def _items(block: list[str]) -> Iterable[list[str]]:
+    """The items of a list, or the paragraph."""
+    item = block[:1]
+    for line in block[1:]:
+        if _ITEM.match(line):
+            yield item
+            item = []
+        item.append(line)
+    yield item
+
+
+def _hanging_item(lines: list[str], width: int) -> str:
+    indent = len(lines[0]) - len(lines[0].lstrip())
+    mark = _ITEM.match(lines[0])
+    other = indent if mark is None else len(mark.group())
+    return _hanging(" ".join(" ".join(lines).split()), indent, other, width)
+
+
+def _styled(text: str, styled: bool) -> str:
+    """Bold text and code, in the terminal's way; without styles only the marks of bold text go."""
+    pieces = re.split(r"(`[^`]+`)", text)
+    bold = rf"{_BOLD}\1{_PLAIN}" if styled else r"\1"
+    pieces[::2] = [re.sub(r"\*\*(?=\S)(.+?)(?<=\S)\*\*", bold, piece) for piece in pieces[::2]]
+    if styled:
+        pieces[1::2] = [f"{_CODE}{piece[1:-1]}{_PLAIN}" for piece in pieces[1::2]]
+    return "".join(pieces)

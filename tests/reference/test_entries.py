@@ -1,0 +1,134 @@
+"""Public names: each has one entry with a docstring, and is found by what users call it."""
+
+import inspect
+
+import pytest
+
+import jaxmb as mb
+from jaxmb.reference import find, listed, shown, subjects
+from jaxmb.reference.entries import entries, public_names
+from jaxmb.reference.signatures import signature
+
+
+def public_modules():
+    """The package, and the modules that are public names of it or of one of them."""
+    found, pending = {}, [("", mb)]
+    while pending:
+        path, module = pending.pop()
+        found[path] = module
+        for name in public_names(module):
+            thing = getattr(module, name)
+            if inspect.ismodule(thing):
+                pending.append((f"{path}.{name}".lstrip("."), thing))
+    return found
+
+
+def test_every_public_name_has_one_entry():
+    modules = public_modules()
+    assert {path for path in modules if path} == {name for name, own in entries().items() if own.kind == "module"}
+    things = [id(entry.thing) for entry in entries().values()]
+    assert len(things) == len(set(things))
+    for path, module in modules.items():
+        for name in public_names(module):
+            thing = getattr(module, name)
+            is_own = getattr(thing, "__module__", "").startswith("jaxmb")
+            if is_own and (inspect.isclass(thing) or inspect.isroutine(thing)):
+                assert find(f"{path}.{name}".lstrip(".")).thing is thing
+
+
+def test_no_entry_is_private():
+    for entry in entries().values():
+        assert not any(word.startswith("_") for word in entry.name.split("."))
+
+
+@pytest.mark.parametrize("subject", subjects(), ids=lambda subject: subject.title)
+def test_every_entry_has_a_docstring(subject):
+    for entry in (*subject.entries, *([subject.module] if subject.module else [])):
+        # That of a dataclass without one is its signature.
+        assert entry.text and not entry.text.startswith(f"{entry.short}("), entry.name
+        assert entry.summary.endswith((".", ":")) and "\n" not in entry.summary, entry.summary
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("simulate", "simulate"),
+        ("mb.simulate()", "simulate"),
+        ("jaxmb.linearize", "linearise"),
+        ("four_bar", "mechanisms.four_bar"),
+        ("spatial.Contact", "planar.Contact"),
+        ("parts.AbstractTerrain", "terrain.AbstractTerrain"),
+        ("Trajectory.reactions", "Trajectory.reactions"),
+        ("planar.Revolute.anchor", "parts.AbstractLink.anchor"),
+        ("Adams.min_order", "solvers.Adams.min_order"),
+        ("solvers", "solvers"),
+    ],
+)
+def test_names_are_found(given, name):
+    assert find(given).name == name
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("simulat", "did you mean 'simulate'"),
+        ("planar.Revolut", "did you mean 'planar.Revolute'"),
+        ("Trajectory.reaction", "did you mean 'Trajectory.reactions'"),
+        ("Revolute", "'Revolute' is the name of 'planar.Revolute' and 'spatial.Revolute'; give one of these."),
+    ],
+)
+def test_unknown_names(given, message):
+    with pytest.raises(ValueError, match=message):
+        find(given)
+
+
+def test_signatures_are_those_of_the_source():
+    assert "q: Float[Array, '... nq']" in signature(find("State")).parameters
+    # A constant is shown by its value.
+    assert "rtol: Scalar = 1e-08" in signature(find("simulate")).parameters
+    assert signature(find("simulate")).returns == "Trajectory"
+    # Fields of base classes, and a constructor that is written.
+    assert signature(find("planar.Revolute")).parameters[:4] == ("name: str", "body_a: str", "body_b: str", "*")
+    assert signature(find("planar.Track")).parameters[1] == "path: Sequence[tuple[str, VectorLike]]"
+    assert str(signature(find("Trajectory.at"))) == "(t: ArrayLike) -> State"
+    assert signature(find("Trajectory.energy")) is None
+
+
+def test_signatures_are_those_of_python():
+    """By their names: those that the source and the classes have are what Python calls with."""
+    for entry in entries().values():
+        own = signature(entry)
+        if own is not None and entry.name != "RESULTS":
+            assert own.names - {"*", "/", ""} == set(inspect.signature(entry.thing).parameters), entry.name
+
+
+def test_text_for_a_terminal():
+    text = shown(find("simulate"), width=60)
+    assert text.startswith("jaxmb.simulate(\n    system: AbstractSystem,\n")
+    # Code is not broken into lines; what follows it is.
+    code = "    motion = jaxmb.simulate(system, state, t1=1.0, saveat=np.linspace(0.0, 1.0, 11))"
+    assert code in text.splitlines()
+    prose = text[text.index("\nMain arguments:\n\n- `system`") :].splitlines()
+    assert max(map(len, prose)) <= 60 and "**" not in text and "```" not in text
+
+
+def test_styles():
+    text = shown(find("planar.rod"), styled=True)
+    assert text.startswith("\x1b[1mjaxmb.planar.rod\x1b[0m(") and "`" not in text and "\x1b[36m" in text
+
+
+def test_a_list_of_all_names():
+    text = listed(width=200)
+    for subject in subjects():
+        assert subject.title in text.splitlines()
+        for entry in subject.entries:
+            assert f"\n  {entry.name}  {entry.summary[:40]}" in text
+
+
+def test_what_a_module_and_a_class_contain():
+    module = shown(find("spatial"))
+    assert "\nNames\n" in module and "  spatial.Revolute  A hinge" in module
+    assert "\nOf other modules\n" in module and "  planar.Contact  Contact of bodies" in module
+    of_class = shown(find("Scene"))
+    assert "\nMethods and properties\n" in of_class and "  compile  " in of_class
+    assert "From parts.AbstractLink\n    bodies" in shown(find("planar.Revolute"))
