@@ -113,9 +113,9 @@ class DryFriction(AbstractDryFriction):
     size of the joint's reaction force, in which moments do not count. The slip of a contact (`RigidContact`,
     `RigidBallContact`, `RigidPlaneContact`, `RigidBoxContact`) is the velocity of the last body against the other one
     where they touch, along the tangent that is the outward normal turned clockwise, so that on level ground it points
-    along x; the normal force is that of the contact. In an impact the friction of the contacts has an impulse of at most
-    `static_coefficient` times theirs where slip ends, and of `coefficient` times theirs where it does not; that of
-    joints has none.
+    along x; the normal force is that of the contact. In an impact the friction of the contacts has an impulse of at
+    most `static_coefficient` times theirs where slip ends, and of `coefficient` times theirs where it does not; that
+    of joints has none.
 
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 

@@ -591,15 +591,16 @@ def _segments(starts, of_rows, final, init_state, fixed, max_steps):
 def _of_loop(final, along: Tangents, like):
     """The tangent of the last state of diffrax's loop."""
     state = lambda flat: unravel_like(like, flat)
-    none, of_events = jax.tree.map(lambda _: None, final), events_found(final.controller_state) is not None
+    none, found = jax.tree.map(lambda _: None, final), lambda final: events_found(final.controller_state)
     parts = lambda final: (
         final.y,
         final.dense_infos,
         final.event_dense_info,
         *(saved.ys for saved in save_states(final)),
-        *([events_found(final.controller_state).states] if of_events else []),
+        *(() if (events := found(final)) is None else (events.states,)),
     )
-    tables, events = (along.saved[:-1], along.saved[-1:]) if of_events else (along.saved, ())
+    series = len(save_states(final))
+    tables, events = along.saved[:series], along.saved[series:]
     new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in tables), *events
     return eqx.tree_at(parts, none, new, is_leaf=_is_none)
 

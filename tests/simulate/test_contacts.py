@@ -136,7 +136,7 @@ def test_events_have_derivatives():
 
 
 def test_the_time_of_opening_has_a_derivative():
-    """A particle that slides down a sphere from rest leaves it later where there is less gravity, `t² g` is constant."""
+    """A particle that slides down a sphere from rest leaves it at a time with constant `t² g`."""
     system = mb.Scene(
         [planar.PointMass("p", mass=0.7, position=(0.6, 0.8))],
         joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],

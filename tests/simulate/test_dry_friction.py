@@ -326,9 +326,9 @@ def test_a_rod_that_jams():
 
 
 def test_painleves_paradox_is_where_it_was_found():
-    """Beyond a friction of 4/3, where `tan θ` is between `(3 μ ± √(9 μ² − 16)) / 2`, the force at the end of a rod that is
-    pushed has no value, or two where the rod turns so fast that it may also lift off (F. Génot and B. Brogliato, "New
-    results on Painlevé paradoxes", European Journal of Mechanics A/Solids 18, 1999).
+    """Beyond a friction of 4/3, where `tan θ` is between `(3 μ ± √(9 μ² − 16)) / 2`, the force at the end of a rod that
+    is pushed has no value, or two where the rod turns so fast that it may also lift off (F. Génot and B. Brogliato,
+    "New results on Painlevé paradoxes", European Journal of Mechanics A/Solids 18, 1999).
     """
     coefficient = 1.6
     angle, turn = (x.ravel() for x in np.meshgrid(np.linspace(0.2, 1.4, 13), np.linspace(0.0, 6.0, 7)))

@@ -94,7 +94,7 @@ def test_a_slider_crank_with_clearance():
 
 
 def test_ten_thousand_impacts():
-    """A mass on a spring rattles between two stops: no energy comes in, and all that friction takes is accounted for."""
+    """A mass on a spring rattles between two stops: no energy comes in, and what is lost is what impacts take."""
     system = mb.Scene(
         [planar.Body("mass", mass=1.0, inertia=1.0, velocity=(10.0, 0.0))],
         joints=[
