@@ -465,12 +465,10 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
 
 
 def _check_finite(value: Any, label: str, shown: str) -> None:
-    number = value.values if isinstance(value, ModuleWeights) else value
-    if is_traced(number) or np.all(np.isfinite(number)):
-        return
-    if number is not value:
-        raise ValueError(f"{label}: the weights of {shown} must be finite.")
-    raise ValueError(f"{label}: {shown} must be finite, got {np.asarray(number)}.")
+    # Of a module these are its weights.
+    for number in jax.tree.leaves(value):
+        if not is_traced(number) and not np.all(np.isfinite(number)):
+            raise ValueError(f"{label}: {shown} must be finite, got {np.asarray(number)}.")
 
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
@@ -571,11 +569,12 @@ _ANY_NUMBER = Declaration("number")
 def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: Declaration):
     if eqx.is_inexact_array(value):
         yield keys, shown, declared
-    elif isinstance(value, ModuleWeights):
-        yield (*keys, "values"), shown, _MODULE_FIELD
+    elif declared.kind == "module":
+        yield (*keys, "values"), shown, declared
     elif isinstance(value, dict):
         for key, entry in value.items():
-            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _ANY_NUMBER)
+            is_module = declared.kind == "numbers" and isinstance(entry, eqx.Module)
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _MODULE_FIELD if is_module else _ANY_NUMBER)
     elif isinstance(value, eqx.Module):
         for inner, name, own in paths(value):
             yield (*keys, *inner), (*shown, *name), own

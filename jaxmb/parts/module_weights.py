@@ -1,5 +1,6 @@
 """Modules, such as neural networks, whose weights are one number of a part."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -33,14 +34,13 @@ class ModuleWeights(eqx.Module):
         return with_weights(self.like, self.values)
 
 
+@functools.singledispatch
 def as_weights(module: Any) -> ModuleWeights:
-    """A module as its weights and the rest.
+    """A module as its weights and the rest; what is that already stays as it is.
 
     **Raises:** `ValueError` for a module without weights, and for arrays of other numbers, which are neither weights
     nor static.
     """
-    if isinstance(module, ModuleWeights):
-        return module
     if not isinstance(module, eqx.Module):
         raise ValueError(f"expected an equinox module, such as an eqx.nn.MLP, got {module!r}")
     dtype, weights = default_float(), []
@@ -63,6 +63,11 @@ def as_weights(module: Any) -> ModuleWeights:
     xp = jnp if is_traced(weights) else np
     values = xp.concatenate([xp.asarray(leaf, dtype).reshape(-1) for leaf in weights])
     return ModuleWeights(values if isinstance(values, Array) else jax.device_put(values), like)
+
+
+@as_weights.register
+def _(module: ModuleWeights) -> ModuleWeights:
+    return module
 
 
 def with_weights(like: eqx.Module, values: Float[Array, "n"]) -> eqx.Module:
