@@ -8,10 +8,10 @@ A part declares its fields with the helpers of this file, in place of `equinox.f
         stiffness: Number = parameter(unit="N/m", sign="positive")
         point: Number = point(body=0, default="origin")
 
-Numbers become read-only arrays and are the part's parameters, `"name.field"`; all other fields are static. A
-declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign and unit, the body that it is
-fixed in, and whether it is optional. Scenes use it to check and stack parts, `identify` to keep parameters positive,
-and pictures and reactions to find where a part acts.
+Numbers become read-only arrays and are the part's parameters, `"name.field"`, as are the weights of a `module`; all
+other fields are static. A declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign
+and unit, the body that it is fixed in, and whether it is optional. Scenes use it to check and stack parts, `identify`
+to keep parameters positive, and pictures and reactions to find where a part acts.
 """
 
 import dataclasses
