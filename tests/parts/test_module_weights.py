@@ -11,6 +11,7 @@ from compiling import jit_quickly
 
 import jaxmb as mb
 from jaxmb import parts, planar
+from jaxmb.studies.identify.experiment import known_parameters
 
 
 def network(seed, width=4, activation=jnp.tanh, size=1):
@@ -94,6 +95,9 @@ def test_the_weights_are_one_vector_by_name(linkage):
     again = mb.with_parameters(linkage, mb.parameters(changed) | {"friction.net": single})
     for name, value in mb.parameters(changed).items():
         np.testing.assert_allclose(mb.parameters(again)[name], value, rtol=1e-6 if name == "friction.net" else 0)
+    experiment = mb.Experiment({"crank.angle": np.zeros(3)}, ts=np.arange(1.0, 4.0), parameters=other)
+    for name, value in known_parameters(linkage, experiment).items():
+        np.testing.assert_array_equal(value, mb.parameters(changed)[name])
 
 
 def test_the_law_acts(linkage):
