@@ -59,6 +59,7 @@ from .states.gap import assembly_gap as assembly_gap
 from .system import (
     Variable as Variable,
     design as design,
+    modules as modules,
     parameters as parameters,
     with_inputs as with_inputs,
     with_parameters as with_parameters,

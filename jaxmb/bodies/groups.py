@@ -121,9 +121,8 @@ def _not_numbers(part: AbstractPart) -> str:
     path, leaf = found[0]
     field = jtu.keystr(path).removeprefix(".")
     return (
-        f"{part.label}: {field} is {leaf!r}, which is not a number. Declare a function with fields.function(). Split a "
-        "module that holds functions, such as a neural network, by arrays, rest = eqx.partition(module, eqx.is_array), "
-        "with a field for the arrays and one that is fields.function() for the rest."
+        f"{part.label}: {field} is {leaf!r}, which is not a number. Declare a function with fields.function(), and "
+        "a module that holds functions, such as a neural network, with fields.module()."
     )
 
 

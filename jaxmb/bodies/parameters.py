@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool
@@ -62,6 +63,13 @@ def parameter_paths(
     if gravity is not None:
         out[f"{gravity}.acceleration"] = [(lambda s: s.gravity, None)]
     return out
+
+
+def module_structures(groups: Mapping[str, Sequence[Any]]) -> dict[str, eqx.Module]:
+    """The modules whose weights are parameters, by name, with shapes in place of the weights."""
+    numbers = (number for number in stacked_numbers(groups) if number.declared.kind == "module")
+    part = lambda number: groups[number.kind][number.group].group.part
+    return {number.name: entry(part(number), number.keys[:-1]).like for number in numbers}
 
 
 def positive_parameters(groups: Mapping[str, Sequence[Any]]) -> Iterator[str]:

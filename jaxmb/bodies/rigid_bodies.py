@@ -59,6 +59,7 @@ from .motion import body_motion, body_quantities, coordinate_names, frame_quanti
 from .parameters import (
     are_in_range,
     check_parts,
+    module_structures,
     parameter_paths,
     positive_parameters,
     signals_of,
@@ -389,6 +390,9 @@ class RigidBodySystem(AbstractSystem):
 
     def parameter_paths(self):
         return parameter_paths(None if self.gravity is None else self.gravity_name, self._groups, self.servos)
+
+    def module_structures(self):
+        return module_structures(self._groups)
 
     def with_frames_of(self, before):
         pairs = zip(self.bodies, before.bodies, strict=True)

@@ -32,6 +32,7 @@ from .contact import (
 )
 from .dry_friction import AbstractDryFriction as AbstractDryFriction
 from .fields import (
+    Module as Module,
     Names as Names,
     Number as Number,
     Numbers as Numbers,
@@ -45,6 +46,7 @@ from .fields import (
     internal_state as internal_state,
     law as law,
     length as length,
+    module as module,
     name as name,
     names as names,
     numbers as numbers,

@@ -43,7 +43,7 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         the axes of the body or frame), in the plane `angle`, in space `orientation`.
     - `acts_on`: a coordinate, `"slide.displacement"`, or several.
     - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
-    - `parameters`: numbers by name; they become parameters of the system, `"pid.gain"`.
+    - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"pid.gain"`.
 
     Angles of joints in space are known up to full turns, and jump at half a turn.
 

@@ -8,10 +8,10 @@ A part declares its fields with the helpers of this file, in place of `equinox.f
         stiffness: Number = parameter(unit="N/m", sign="positive")
         point: Number = point(body=0, default="origin")
 
-Numbers become read-only arrays and are the part's parameters, `"name.field"`; all other fields are static. A
-declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign and unit, the body that it is
-fixed in, and whether it is optional. Scenes use it to check and stack parts, `identify` to keep parameters positive,
-and pictures and reactions to find where a part acts.
+Numbers become read-only arrays and are the part's parameters, `"name.field"`, as are the weights of a `module`; all
+other fields are static. A declaration holds the shape of a number (`"d"` is 2 in the plane and 3 in space), its sign
+and unit, the body that it is fixed in, and whether it is optional. Scenes use it to check and stack parts, `identify`
+to keep parameters positive, and pictures and reactions to find where a part acts.
 """
 
 import dataclasses
@@ -28,13 +28,14 @@ from jaxtyping import Array, Bool, Float
 
 from .._compat import default_float, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
+from .module_weights import ModuleWeights, as_weights
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
 # converters of these helpers.
 if TYPE_CHECKING:
-    Number = Numbers = Names = Any
+    Number = Numbers = Names = Module = Any
 else:
-    Number, Numbers, Names = Array, dict[str, Array], tuple[str, ...]
+    Number, Numbers, Names, Module = Array, dict[str, Array | ModuleWeights], tuple[str, ...], ModuleWeights
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d"] | None
@@ -50,10 +51,10 @@ class Declaration:
     **Fields:**
 
     - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
-        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of them, `"law"` for a module
-        with parameters, `"part"` for another part of the scene (`"parts"` for a dictionary of them), `"state"` for a
-        number of the initial guess, and `"internal"` for an internal state (`"internals"` for a dictionary of them);
-        these are not parameters.
+        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of them and of modules,
+        `"module"` for a module whose weights are one number, `"law"` for one with parameters of its own, `"part"` for
+        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
+        `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
     - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `""` for a number without one.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
@@ -151,15 +152,23 @@ def _lenient(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return converter
 
 
-def _as_numbers(values: Any) -> Any:
+def _as_states(values: Any) -> Any:
     return {key: as_jax(value) for key, value in values.items()} if isinstance(values, dict) else values
+
+
+def _as_numbers(values: Any) -> Any:
+    if not isinstance(values, dict):
+        return values
+    convert = lambda value: as_weights(value) if isinstance(value, eqx.Module) else as_jax(value)
+    return {key: convert(value) for key, value in values.items()}
 
 
 def _as_names(values: Any) -> Any:
     return (values,) if isinstance(values, str) else tuple(values)
 
 
-_NUMBER, _NUMBERS, _NAMES = _lenient(as_parameter), _lenient(_as_numbers), _lenient(_as_names)
+_NUMBER, _NUMBERS, _STATES = _lenient(as_parameter), _lenient(_as_numbers), _lenient(_as_states)
+_NAMES, _MODULE = _lenient(_as_names), _lenient(as_weights)
 
 
 # Helpers
@@ -329,12 +338,24 @@ def internal_state(
 
 def internal_states_by_name() -> Any:
     """Internal states of a user function by name, `"part.key"`, with their initial values."""
-    return _field(Declaration("internals"), converter=_NUMBERS, default_factory=dict, kw_only=True)
+    return _field(Declaration("internals"), converter=_STATES, default_factory=dict, kw_only=True)
 
 
 def numbers() -> Any:
-    """Parameters of a user function by name, `"part.key"`."""
+    """Parameters of a user function by name, `"part.key"`: numbers, and modules as in `module`."""
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
+
+
+def module() -> Any:
+    """An equinox module, such as a neural network, whose weights are one parameter `"part.field"`, a vector.
+
+    The weights are all arrays of floating-point numbers in it; everything else, such as sizes and functions, is static.
+    The kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
+    """
+    return _field(_MODULE_FIELD, converter=_MODULE, kw_only=True)
+
+
+_MODULE_FIELD = Declaration("module", shape=(None,))
 
 
 def part(of: Any) -> Any:
@@ -384,10 +405,21 @@ def check_kinds(part: Any, label: str) -> None:
             for key, number in value.items():
                 if not key or "." in key:
                     raise ValueError(f"{label}: names of {field} must not be empty or contain a dot, got {key!r}.")
-                if not _is_number(number):
+                if declared.kind == "numbers" and isinstance(number, eqx.Module):
+                    _check_module(number, f"{label}: {key}")
+                elif not _is_number(number):
                     raise ValueError(f"{label}: {key}: expected a real number or an array, got {number!r}.")
+        elif declared.kind == "module":
+            _check_module(value, f"{label}: {field}")
         elif not isinstance(value, declared.of):
             raise ValueError(f"{label}: {field} must be {declared.what}, got {value!r}.")
+
+
+def _check_module(value: Any, label: str) -> None:
+    try:
+        as_weights(value)
+    except ValueError as error:
+        raise ValueError(f"{label}: {error}.") from None
 
 
 def _is_number(value: Any) -> bool:
@@ -425,10 +457,18 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
                 check_numbers(value, label, dimension, f"{shown}.")
         elif declared.kind == "numbers":
             for key, number in value.items():
-                if not is_traced(number) and not np.all(np.isfinite(number)):
-                    raise ValueError(f"{label}: {prefix}{key} must be finite, got {np.asarray(number)}.")
+                _check_finite(number, label, f"{prefix}{key}")
+        elif declared.kind == "module":
+            _check_finite(value, label, shown)
         elif declared.is_number and value is not None and not is_traced(value):
             _check_number(declared, label, shown, np.asarray(value), dimension)
+
+
+def _check_finite(value: Any, label: str, shown: str) -> None:
+    # Of a module these are its weights.
+    for number in jax.tree.leaves(value):
+        if not is_traced(number) and not np.all(np.isfinite(number)):
+            raise ValueError(f"{label}: {shown} must be finite, got {np.asarray(number)}.")
 
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
@@ -514,7 +554,7 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declara
     """The parameters of a part itself, not of parts that it holds.
 
     For each: the path of keys to it; the path in its name, which leaves out the keys of dictionaries' fields; and its
-    declaration, an empty one for an entry of a dictionary.
+    declaration, an empty one for an entry of a dictionary. The weights of a module have the name of the module.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
@@ -529,9 +569,12 @@ _ANY_NUMBER = Declaration("number")
 def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: Declaration):
     if eqx.is_inexact_array(value):
         yield keys, shown, declared
+    elif declared.kind == "module":
+        yield (*keys, "values"), shown, declared
     elif isinstance(value, dict):
         for key, entry in value.items():
-            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _ANY_NUMBER)
+            is_module = declared.kind == "numbers" and isinstance(entry, eqx.Module)
+            yield from _paths(entry, (*keys, key), (*shown[:-1], key), _MODULE_FIELD if is_module else _ANY_NUMBER)
     elif isinstance(value, eqx.Module):
         for inner, name, own in paths(value):
             yield (*keys, *inner), (*shown, *name), own

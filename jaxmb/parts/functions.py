@@ -35,7 +35,7 @@ class Constraint(AbstractConstraint):
     - `function(poses, t, parameters)`: returns shape `(rows,)`; `poses` has a row per body, of its frame (plane: x, y,
         angle; space: r, Euler parameters). It must be twice differentiable by JAX.
     - `rows`: the number of equations.
-    - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
+    - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"name.key"`.
     - `rheonomic`: whether the function depends on `t`.
     """
 
@@ -89,7 +89,9 @@ class Force(AbstractPotentialForce):
         (force in the world frame, moment in the body frame). The force acts at the origin of the body's frame, whose
         pose and velocity the function sees, and the moment is about it: the mass centre, unless the body was given
         `centre=`.
-    - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
+    - `parameters`: numbers by name; they become parameters of the system, `"name.key"`. An equinox module, such as a
+        neural network, may be among them: the function calls it as `parameters["net"](x)`, and all its weights are one
+        parameter, a vector. `with_parameters` takes a vector or a module of new weights, and `jaxmb.modules` gives it.
     - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
         energy balance.
     """
@@ -125,7 +127,7 @@ class NonIdeal(AbstractNonIdeal):
         exerts on them besides, in the same axes, in the presence of all these forces. Components that the function
         returns in directions that the joint blocks do not change the motion: the reactions are smaller by them. Moments
         of both are about the origins of the frames.
-    - `parameters`: numbers by name; they become parameters of the system, `"name.key"`.
+    - `parameters`: as in `Force`.
     """
 
     name: str = fields.name()

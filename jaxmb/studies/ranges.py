@@ -274,6 +274,11 @@ def range_of(
     **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether it stays positive, or a matrix
     of inertia; `scale`: a typical change, default the size of the start.
     """
+    if isinstance(start, eqx.Module):
+        raise ValueError(
+            f"The start of {name!r} must be numbers, got a {type(start).__name__}; leave it out, and set the weights "
+            "that it starts from by with_parameters."
+        )
     value = jnp.asarray(start, own.dtype)
     if value.shape != own.shape:
         raise ValueError(f"Parameter {name!r} has shape {own.shape}, got a start of shape {value.shape}.")

@@ -102,6 +102,10 @@ class AbstractSystem(AbstractEquation):
         """Paths to the arrays that hold each parameter, by name."""
         return {}
 
+    def module_structures(self) -> dict[str, eqx.Module]:
+        """The modules whose weights are parameters, by name, with shapes in place of the weights."""
+        return {}
+
     def positive_parameters(self) -> frozenset[str]:
         """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
         return frozenset()

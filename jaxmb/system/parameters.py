@@ -1,7 +1,7 @@
 """The parameters of a system by name, `"part.field"`, and its design variables."""
 
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._types import VectorLike
 from ..linalg.arrays import is_traced, replaced
 from ..parts.fields import as_jax
+from ..parts.module_weights import weights_of, with_weights
 from ..parts.names import unknown
 from .catalogue import AbstractSystem
 
@@ -22,7 +23,7 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
 
     **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the
     shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`, and the variables of
-    `design` their own names.
+    `design` their own names. The weights of a module, `"friction.net"`, are a vector; see `modules`.
     """
     leaves = {}
     for name, paths in system.parameter_paths().items():
@@ -34,16 +35,31 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
     return leaves
 
 
-def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
+def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
+    """Every module, such as a neural network, whose weights are a parameter of a system, by the parameter's name.
+
+    ```python
+    net = jaxmb.modules(jaxmb.with_parameters(system, fit.parameters))["friction.net"]
+    ```
+
+    **Returns:** the modules with their weights, as `with_parameters` takes them.
+    """
+    own = parameters(system)
+    return {name: with_weights(like, own[name]) for name, like in system.module_structures().items()}
+
+
+def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module]) -> System:
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
     the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows.
 
-    **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. Where design
-    variables are among them, all parameters that follow from them are computed anew.
+    **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. For the
+    weights of a module, a vector or a module that differs in nothing but its weights. Where design variables are among
+    them, all parameters that follow from them are computed anew.
 
-    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, numbers with which the scene
+    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, another module, numbers with
+    which the scene
     would not compile, design variables out of bounds, and a parameter that follows from design variables. Under `jit`,
     `vmap` or a derivative the numbers are not known yet; `simulate` then ends with `RESULTS.invalid_parameters`, before
     the first step.
@@ -61,7 +77,8 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
                     f"Parameter {name!r} follows from the design variable{several} {names}; set "
                     f"{'those' if several else 'that'} instead."
                 )
-    given, design, before = dict(values), [], system
+    given: dict[str, Any] = dict(values)
+    design, before = [], system
     # Variables of a design may follow from those of a later one.
     for own in reversed(system.design):
         mine = {name: given.pop(name) for name in own.values if name in given}
@@ -75,7 +92,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
                 f"{name!r} is an input of this system, a function of time, which its value would not change; give "
                 "another input instead."
             )
-        value = as_jax(value)
+        value = _as_array(system, name, value)
         for where, index in paths[name]:
             old = where(system)
             shape = old.shape if index is None else old.shape[1:]
@@ -87,6 +104,26 @@ def with_parameters(system: System, values: Mapping[str, VectorLike]) -> System:
         system = eqx.tree_at(lambda s: s.design, system, tuple(design))
     system.check_parameters(given)
     return system
+
+
+def _as_array(system: AbstractSystem, name: str, value: Any) -> Array:
+    """A number, or the weights of a module."""
+    if not isinstance(value, eqx.Module):
+        try:
+            return as_jax(value)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"Parameter {name!r}: {error}.") from None
+    like = system.module_structures().get(name)
+    if like is None:
+        kind = type(value).__name__
+        raise ValueError(f"Parameter {name!r} is a number or an array, not the weights of a module; got a {kind}.")
+    try:
+        return weights_of(value, like)
+    except ValueError as error:
+        raise ValueError(
+            f"Parameter {name!r}: {error}. Only the weights of a module are numbers; for another module compile the "
+            "scene anew."
+        ) from None
 
 
 def _of(values: Array, index: int) -> Array:

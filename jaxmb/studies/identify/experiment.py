@@ -48,7 +48,7 @@ class Experiment:
     rates: Mapping[str, VectorLike] | None = None
     t0: Scalar = 0.0
     inputs: Any = None
-    parameters: Mapping[str, VectorLike] | None = None
+    parameters: Mapping[str, VectorLike | eqx.Module] | None = None
     own: Sequence[str] = ()
     free_initial: Sequence[str] | Mapping[str, VectorLike] = ()
     sigma: Mapping[str, VectorLike] | None = None
@@ -296,15 +296,9 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
 
 def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:
     """The parameters that are known for an experiment alone."""
-    known = parameters(system)
-    out = {}
-    for name, value in (experiment.parameters or {}).items():
-        if name not in known:
-            raise unknown("parameter", name, known)
-        out[name] = jnp.asarray(value, known[name].dtype)
-        if out[name].shape != known[name].shape:
-            raise ValueError(f"Parameter {name!r} has shape {known[name].shape}, got {out[name].shape}.")
-    return out
+    given = experiment.parameters or {}
+    known = parameters(with_parameters(system, given))
+    return {name: known[name] for name in given}
 
 
 def arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Bool[Array, "..."]]:
