@@ -21,12 +21,13 @@ PACKAGE = __name__.split(".")[0]
 
 # The names of the package itself, which are too many for one list.
 _OF_PACKAGE = {
-    "Scenes and their numbers": "Scene RigidBodySystem State parameters with_parameters with_inputs design Variable",
+    "Scenes and their numbers": "Scene RigidBodySystem State parameters with_parameters modules with_inputs "
+    "design Variable",
     "States and motions": "assemble assembly_gap equilibrium simulate batch Trajectory load RESULTS keep_compiled "
     "UnknownNameError",
     "Forces and drives of both spaces": "Gravity Motor Actuator Controller Servo Series Tendon FixedTendon "
     "JointSpring JointForce JointStop JointFriction DryFriction JointDriver JointInertia JointCoupling",
-    "Unilateral constraints": "Stop RigidContact RigidBallContact RigidPlaneContact Slack",
+    "Unilateral constraints": "Stop RigidContact RigidBallContact RigidPlaneContact RigidBoxContact Slack",
     "Parts from functions": "Constraint VelocityConstraint Force NonIdeal",
     "Identification": "identify Identification Experiment Measurements read_measurements Sensor",
     "Optimisation": "optimise Optimum robust",

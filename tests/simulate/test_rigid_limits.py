@@ -103,7 +103,7 @@ def test_ten_thousand_impacts():
         ],
         forces=[mb.JointSpring("spring", "rail.displacement", stiffness=3.0)],
     ).compile()
-    rtol, times = 1e-8, np.linspace(0.0, 350.0, 1001)
+    rtol, times = 1e-10, np.linspace(0.0, 350.0, 1001)
     motion = mb.simulate(
         system, mb.assemble(system), t1=350.0, saveat=times, rtol=rtol, max_steps=10**6, max_events=20_000
     )
@@ -111,5 +111,5 @@ def test_ten_thousand_impacts():
     assert len(events.times) >= 10_000
     assert np.max(np.diff(motion.energy)) <= rtol * start
     lost = np.cumsum(np.asarray(events.energy_lost))[np.searchsorted(np.asarray(events.times), times) - 1]
-    np.testing.assert_allclose(motion.energy[1:], start - lost[1:], atol=1e2 * rtol * start)
+    np.testing.assert_allclose(motion.energy[1:], start - lost[1:], atol=1e3 * rtol * start)
     assert np.max(np.abs(np.asarray(motion["mass"].position[:, 0]))) <= 0.1 + 1e-11

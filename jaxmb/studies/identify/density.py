@@ -27,11 +27,14 @@ class LogDensity(eqx.Module):
         return _log_density(z, problem=self.problem)
 
     def parameters(self, z: Float[Array, "*batch n"]) -> dict[str, Array]:
-        """The values by name of a vector, or of the vectors of a chain."""
+        """The values by name of a vector, or of the vectors of a chain, in the order of the vector's entries."""
         each = self.problem.free
+        names = list(each(self.start))
         for _ in range(z.ndim - 1):
             each = jax.vmap(each)
-        return each(z)
+        # JAX sorts dictionaries.
+        values = each(z)
+        return {name: values[name] for name in names}
 
 
 def logdensity(fit: Fit) -> LogDensity:
