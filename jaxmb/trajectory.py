@@ -1,7 +1,8 @@
 """A motion, with views by name."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -312,6 +313,64 @@ class Trajectory(eqx.Module):
                 out[f"stats.{name}"] = np.asarray(value)
         return out
 
+    def to_xarray(self, names: Sequence[str] | None = None) -> Any:
+        """An `xarray.Dataset` with the dimension `t` [s] and a variable for each quantity.
+
+        Vectors have the dimension `axis` as well, with the coordinates x, y and z; Euler parameters have the dimension
+        `euler_parameter`. `read_measurements` reads such a Dataset.
+
+        **Arguments:** `names` of quantities, as `quantity` takes them, and `"energy"`; default the energy and all
+        quantities but forces and accelerations.
+
+        **Raises:** `ImportError` without xarray, which `jaxmb[studies]` installs; `ValueError` for a batch.
+        """
+        xarray, values = _package("xarray", "jaxmb[studies]"), self._table(names)
+        components = _components(values)
+        variables = {
+            name: (("t",) if value.ndim == 1 else ("t", components[value.shape[1]][0]), value)
+            for name, value in values.items()
+        }
+        out = xarray.Dataset(variables, {"t": np.asarray(self.ts), **dict(components.values())})
+        out["t"].attrs["units"] = "s"
+        return out
+
+    def to_pandas(self, names: Sequence[str] | None = None) -> Any:
+        """A `pandas.DataFrame` with the column `t` [s] and one for each component of each quantity:
+        `"crank.angle"`, `"crank.position.x"`, of Euler parameters `"rotor.orientation.0"`.
+
+        **Arguments:** `names` as in `to_xarray`.
+
+        **Raises:** `ImportError` without pandas; `ValueError` for a batch.
+        """
+        pandas, values = _package("pandas", "pandas"), self._table(names)
+        components, columns = _components(values), {"t": np.asarray(self.ts)}
+        for name, value in values.items():
+            if value.ndim == 1:
+                columns[name] = value
+            else:
+                _, labels = components[value.shape[1]]
+                columns |= {f"{name}.{label}": column for label, column in zip(labels, value.T, strict=True)}
+        return pandas.DataFrame(columns)
+
+    def _table(self, names: Sequence[str] | None) -> dict[str, np.ndarray]:
+        """Quantities by name, shape (times,) or (times, components)."""
+        if self.ts.ndim != 1:
+            raise ValueError(
+                f"A table shows a single motion, and this is a batch of shape {self.ts.shape[:-1]}; choose a member, "
+                "such as jax.tree.map(lambda leaf: leaf[0], trajectory)."
+            )
+        known = self.system.quantities()
+        if names is None:
+            names = ["energy", *(name for name, quantity in known.items() if not quantity.of_forces)]
+        names = (names,) if isinstance(names, str) else names
+        for name in names:
+            if name not in known and name != "energy":
+                raise unknown("quantity", name, ("energy", *known))
+        values = dict(self._measured(tuple(name for name in names if name in known)))
+        if "energy" in names:
+            values["energy"] = self.energy
+        return {name: np.asarray(values[name]) for name in names}
+
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`."""
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
@@ -361,6 +420,22 @@ class GlobalError(NamedTuple):
     def of(self, observed: Callable[[Trajectory], Any]) -> Any:
         """Of anything that is computed from a trajectory: `error.of(lambda trajectory: trajectory.energy)`."""
         return _distance(observed(self.motion), observed(self.closer))
+
+
+def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[Any]]]:
+    """For each number of components that a quantity has, the name of the dimension and the labels along it."""
+    sizes = sorted({value.shape[1] for value in values.values() if value.ndim > 1})
+    # Vectors have as many as the space has dimensions.
+    names = {4: "euler_parameter", 3 if 3 in sizes else 2: "axis"}
+    labels = lambda size: list("xyz"[:size]) if names.get(size) == "axis" else list(range(size))
+    return {size: (names.get(size, f"component_of_{size}"), labels(size)) for size in sizes}
+
+
+def _package(name: str, install: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(f'This table needs {name}; install it with: pip install "{install}"') from None
 
 
 def _distance(a, b):

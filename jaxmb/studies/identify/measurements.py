@@ -29,11 +29,12 @@ def have_times(measured: Any) -> bool:
 def read_measurements(
     source: str | Path | Any, columns: Mapping[str, str | Sequence[str]] | None = None, *, time: str = "t"
 ) -> Measurements:
-    """Read measured data from a CSV file with a header line, or from a DataFrame.
+    """Read measured data from a CSV file with a header line, a DataFrame, or an xarray Dataset.
 
     **Arguments:**
 
-    - `source`: the path of a file, or a table with `columns` and columns by name, such as those of pandas and polars.
+    - `source`: the path of a file; a table with `columns` and columns by name, such as those of pandas and polars; or a
+        Dataset, such as `Trajectory.to_xarray` makes, whose variables have the dimension of time and at most one more.
     - `columns`: for each quantity or sensor the name of its column, or of one column for each component:
         `{"rod.angle": "phi", "rod.position": ["x", "y"]}`; default every column but that of time, by its own name.
     - `time`: the column of times [s], which must increase.
@@ -44,7 +45,10 @@ def read_measurements(
     **Raises:** `ValueError` naming missing and repeated columns, the line and column of a cell that is no number, times
     that are missing or out of order, and tables with fewer than two rows. `FileNotFoundError` if there is no such file.
     """
-    named = _of_file(Path(source)) if isinstance(source, str | Path) else _of_frame(source)
+    if isinstance(source, str | Path):
+        named = _of_file(Path(source))
+    else:
+        named = _of_dataset(source, time) if hasattr(source, "data_vars") else _of_frame(source)
     label = str(source) if isinstance(source, str | Path) else "The table"
     if time not in named:
         raise unknown("column of time", time, named)
@@ -118,4 +122,18 @@ def _of_frame(frame: Any) -> dict[str, np.ndarray]:
             out[name] = np.asarray(frame[column].to_numpy(), float)
         except (TypeError, ValueError):
             raise ValueError(f"Column {name!r} of the table holds something that is no number.") from None
+    return out
+
+
+def _of_dataset(dataset: Any, time: str) -> dict[str, np.ndarray]:
+    if time not in dataset.coords:
+        raise unknown("coordinate of time", time, map(str, dataset.coords))
+    out = {time: np.asarray(dataset[time].to_numpy(), float)}
+    for name, variable in dataset.data_vars.items():
+        if time not in variable.dims or variable.ndim > 2:
+            raise ValueError(
+                f"The variable {name!r} of the Dataset must have the dimension {time!r} and at most one more, got "
+                f"{', '.join(map(str, variable.dims)) or 'none'}; dataset[[name, …]] chooses variables."
+            )
+        out[str(name)] = np.asarray(variable.transpose(time, ...).to_numpy(), float)
     return out
