@@ -59,9 +59,9 @@ def test_what_is_no_table_is_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"a batch of shape \(2,\); choose a member"):
         batch.to_xarray()
     dataset = motion.to_xarray()
-    with pytest.raises(ValueError, match="Unknown coordinate of time 'time'.*'t'"):
+    with pytest.raises(ValueError, match=r"Unknown coordinate of time 'time'.*'t'"):
         mb.read_measurements(dataset, time="time")
-    with pytest.raises(ValueError, match="variable 'bar.angle' of the Dataset must have the dimension 't'"):
+    with pytest.raises(ValueError, match=r"variable 'bar\.angle' of the Dataset must have the dimension 't'"):
         mb.read_measurements(dataset[["bar.angle"]].isel(t=0).expand_dims(other=2).assign_coords(t=TS))
 
     monkeypatch.setitem(sys.modules, "pandas", None)
