@@ -18,7 +18,7 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory
 from .loss import Loss
-from .measurements import Measurements, have_times
+from .measurements import have_times, is_table, read_measurements
 from .sensors import Channel, Rows, Sensor, readings_of
 
 # The name of a residual function's result among the readings.
@@ -31,8 +31,8 @@ class Experiment:
 
     **Arguments:**
 
-    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`. The
-        `Measurements` that `read_measurements` returns have their own `ts`.
+    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
+        `Measurements`, files and tables have their own `ts`.
     - `inputs`: as of `simulate`.
     - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
@@ -40,7 +40,7 @@ class Experiment:
     - `held_out`: whether the data are only predicted, for `Identification.held_out`, and not fitted.
     """
 
-    measured: Mapping[str, VectorLike] | Measurements | None = None
+    measured: Any = None
     _: dataclasses.KW_ONLY
     ts: ArrayLike | Mapping[str, ArrayLike] | None = None
     state: State | None = None
@@ -176,6 +176,8 @@ def _of_user(residuals: Array, loss: Loss) -> Rows:
 def with_times(experiment: Experiment, where: str = "") -> Experiment:
     """An experiment with what was measured by name, and with times, whatever they were read from."""
     measured: Any = experiment.measured
+    if is_table(measured):
+        measured = read_measurements(measured)
     if have_times(measured):
         if experiment.ts is not None:
             raise ValueError(f"Measurements{where} have their own times; leave out ts.")

@@ -19,7 +19,7 @@ from ..ranges import Bounds
 from .experiment import Experiment, with_times
 from .identification import Identification, identification
 from .loss import loss_named
-from .measurements import Measurements, have_times
+from .measurements import have_times, is_table
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
 from .sensors import Sensor
 from .shooting import shoot
@@ -34,7 +34,7 @@ _ITERATIONS = {"lm": 100, "optax": 1000}
 @names_arguments
 def identify(
     system: AbstractSystem,
-    measured: Mapping[str, VectorLike] | Measurements | Experiment | Sequence[Experiment] | None = None,
+    measured: Any = None,
     *,
     ts: ArrayLike | Mapping[str, ArrayLike] | None = None,
     free: Mapping[str, VectorLike | None] | Sequence[str] = (),
@@ -74,8 +74,9 @@ def identify(
         `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
         coordinates and their rates q̇, `"theta"` and `"theta_rate"`, shape (times,), and generalized forces of its
         constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
-        wrapping. Instead, the `Measurements` that `read_measurements` returns, with their times; or an `Experiment` or
-        a list of them, each with its own data, times and initial state.
+        wrapping. Instead, the `Measurements` that `read_measurements` returns, with their times; what it reads with
+        every column by its own name, the path of a CSV file, a DataFrame or a Dataset; or an `Experiment` or a list of
+        them, each with its own data, times and initial state.
     - `ts`: times [s], shape (times,), increasing, from `t0` on. Where sensors have times of their own, by name of what
         was measured: `ts={"encoder": (times1,), "gyro": (times2,)}`; each measured array has the length of its own.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
@@ -190,7 +191,7 @@ def identify(
 
 def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> tuple[Problem, bool]:
     """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
-    if measured is None or isinstance(measured, Mapping) or have_times(measured):
+    if measured is None or isinstance(measured, Mapping) or have_times(measured) or is_table(measured):
         experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]

@@ -26,6 +26,11 @@ def have_times(measured: Any) -> bool:
     return hasattr(measured, "ts") and isinstance(getattr(measured, "values", None), Mapping)
 
 
+def is_table(measured: Any) -> bool:
+    """Whether measured data are something that `read_measurements` reads: a path, a DataFrame or a Dataset."""
+    return isinstance(measured, str | Path) or hasattr(measured, "columns") or hasattr(measured, "data_vars")
+
+
 def read_measurements(
     source: str | Path | Any, columns: Mapping[str, str | Sequence[str]] | None = None, *, time: str = "t"
 ) -> Measurements:

@@ -12,6 +12,7 @@ from jax.scipy.special import ndtri
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.studies.identify.covariance import combinations, covariance
+from jaxmb.studies.identify.experiment import with_times
 from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
 from jaxmb.studies.ranges import second_moments
@@ -546,6 +547,13 @@ def test_measurements_from_files_and_tables(tmp_path):
     frame = pytest.importorskip("pandas").DataFrame({"time": [0.0, 1.0], "rod.angle": [1.0, None]})
     table = mb.read_measurements(frame, time="time")
     np.testing.assert_array_equal(table.values["rod.angle"], [1.0, np.nan])
+    # `identify` and `Experiment` take them as they are.
+    frame = frame.rename(columns={"time": "t"})
+    frame.to_csv(path, index=False)
+    for given in (path, str(path), frame):
+        own = with_times(mb.Experiment(given))
+        np.testing.assert_array_equal(own.ts, [0.0, 1.0])
+        np.testing.assert_array_equal(own.measured["rod.angle"], [1.0, np.nan])
 
 
 @pytest.mark.parametrize(
