@@ -16,9 +16,6 @@ from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
 
-# Impulses below this fraction of the largest one are rounding errors.
-_ROUNDING = 1e-10
-
 
 class FoundEvents(NamedTuple):
     """What a run notes of its events: their `number`, and buffers with the `times` of the ends of steps at which they
@@ -100,12 +97,10 @@ class ContactEvents(eqx.Module):
         )
         rows = []
         for k in np.flatnonzero(np.isfinite(times)):
-            # What an impulse must exceed: those that are less are rounding errors, also beside those of other events.
-            least = _ROUNDING * np.max(impulses[:, : self.contacts], initial=0.0)
             for i, name in enumerate(self.names):
                 if i >= self.contacts:
                     changed, impulse = before[k, i] != after[k, i], float(impulses[k, i])
-                    struck = abs(impulse) > least
+                    struck = impulse != 0
                     kind = "stick" if after[k, i] == STICK else "slip" if after[k, i] != FREE else "impact"
                     if struck or (changed and after[k, i] != FREE):
                         kind = kind if changed else "impact"
@@ -113,7 +108,7 @@ class ContactEvents(eqx.Module):
                     continue
                 was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
                 impulse = float(impulses[k, i])
-                struck = impulse > least and was_open
+                struck = impulse > 0 and was_open
                 kind = "impact" if struck and is_open else "close" if was_open and not is_open else "open"
                 if struck or was_open != is_open:
                     rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
@@ -144,8 +139,13 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
         flat = jnp.where(taken, flat, found.states[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
         out = guards.impact(jnp.where(taken, t, found.times[0]), y, dated=True)
+        # Steps also end where it turns out that nothing changes.
+        before, after = out.modes
+        taken = taken & (jnp.any(before != after) | jnp.any(out.impulses != 0))
         time = jnp.where(taken, t + out.late, jnp.inf)
-        values = out.impulses, out.energy, *out.modes, out.rest
+        values = out.impulses, out.energy, before, after, out.rest
         return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)
 
-    return jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
+    found = jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
+    order = jnp.argsort(jnp.isinf(found[0]), stable=True)
+    return jax.tree.map(lambda x: x[order], found)

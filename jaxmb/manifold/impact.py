@@ -521,6 +521,9 @@ def _event(system, formulation, touch, t, y) -> _Event:
     held = held & _independent(influence, held)
     lost = jnp.where(held & cancelled, solved_components(influence, left, held & cancelled), 0.0)
     after = after + lost @ moves
+    # Impulses of rounding errors are none.
+    sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
+    impulses = jnp.where(jnp.abs(jnp.diag(influence) * impulses) <= _REST * sizes, 0.0, impulses)
     energy = 0.5 * (jnp.dot(u, inertia.product(u)) - jnp.dot(after, inertia.product(after)))
     return _Event(
         late=late,
