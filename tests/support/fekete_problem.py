@@ -49,18 +49,22 @@ def start() -> np.ndarray:
     return np.concatenate(rings)
 
 
+PAIRS = np.triu_indices(len(POSITIONS), 1)
+
+
+def lagrangian(t, q, v, parameters):
+    p = q.reshape(-1, 3)
+    distances = jnp.sum((p[PAIRS[0]] - p[PAIRS[1]]) ** 2, axis=1)
+    return 0.5 * jnp.dot(v, v) + 0.5 * jnp.sum(jnp.log(distances))
+
+
+def force(t, q, v, parameters):
+    return -DAMPING * v
+
+
+def sphere(t, q, parameters):
+    return jnp.sum(q.reshape(-1, 3) ** 2, axis=1) - 1.0
+
+
 def system() -> mb.system.AbstractSystem:
-    points = start()
-    pairs = np.triu_indices(len(points), 1)
-
-    def potential(t, q, parameters):
-        p = q.reshape(-1, 3)
-        return -0.5 * jnp.sum(jnp.log(jnp.sum((p[pairs[0]] - p[pairs[1]]) ** 2, axis=1)))
-
-    return LagrangianSystem(
-        kinetic=lambda t, q, v, parameters: 0.5 * jnp.dot(v, v),
-        potential=potential,
-        force=lambda t, q, v, parameters: -DAMPING * v,
-        constraints=[Holonomic("sphere", lambda t, q, _: jnp.sum(q.reshape(-1, 3) ** 2, axis=1) - 1.0)],
-        q=points.ravel(),
-    )
+    return LagrangianSystem(lagrangian, force=force, constraints=[Holonomic("sphere", sphere)], q=start().ravel())
