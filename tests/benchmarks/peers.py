@@ -1,23 +1,25 @@
-"""Other programs beside jaxmb, at equal error and in one process: a four-bar linkage (a loop) and a pendulum of ten links
-(a tree), values and gradients.
+"""Other programs beside jaxmb, at equal error and in one process.
+
+A four-bar linkage (a loop) and a pendulum of ten links (a tree), values and gradients.
 
     python tests/benchmarks/peers.py [--record FILE]
 
 on an otherwise idle machine; `NPROC=1 taskset -c 0` before it allows each of them one thread. What is not installed is
 left out: `pip install pin mujoco exudyn casadi`. Each program runs over its tolerances or its steps; from the curves
-come the times at an error of 1e-4, 1e-6 and 1e-8 of an angle at the end [rad, relative], where a program gets there.
-Compilation is not in the times. `--record` writes the table as JSON, for the notebook on benchmarks.
+come the times at relative errors of 1e-4, 1e-6 and 1e-8 of an angle at the end, and of its derivative by a mass,
+where a program gets there. Compilation is not in the times. `--record` writes the curves as JSON, for the notebook on
+benchmarks: `--record notebooks/14_benchmarks.json`.
 
-- jaxmb: `simulate` as it is, `Adams` on independent coordinates.
+- jaxmb: `simulate` with its defaults, `Adams` on independent coordinates.
 - Pinocchio: accelerations by `aba`, or `constraintDynamics` in the loop, in minimal coordinates; SciPy's DOP853.
 - MuJoCo: fourth-order Runge–Kutta of fixed steps, the loop closed by a stiff `connect`, which is soft.
 - Exudyn: trapezoidal rule with constraints of index 2, fixed steps, planar bodies with redundant coordinates.
-- CasADi: equations written out, with CVODES or IDAS (multipliers as algebraic variables), sensitivities by their adjoint.
+- CasADi: equations written out, with CVODES or IDAS (multipliers as algebraic variables), gradients by their
+  adjoint sensitivities.
 - diffrax: equations written out, Dopri8; constraints hold in accelerations only.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -32,14 +34,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from bar_chain import GRAVITY, BarChain, accelerations, four_bar, levers, pendulum
-from equal_error import machine, measured, seconds_at
+from equal_error import Curve, machine, measured, record, table
 
 import jaxmb as mb
-from jaxmb.report.table import aligned
 
 jax.config.update("jax_enable_x64", True)
 REPEATS = 1
-ERRORS = (1e-4, 1e-6, 1e-8)
 TOLERANCES = 10.0 ** -np.arange(3.0, 12.1)
 
 
@@ -142,19 +142,16 @@ def of_mujoco(chain: BarChain) -> dict[str, Peer]:
             )
             offset = length
         bodies += "</body>" * len(chain.lengths)
-        # A time constant of two steps, and forces of nearly the whole stiffness, are as hard as it gets.
-        hard = f'solref="{2 * step} 1" solimp="0.9999 0.9999 0.001"'
-        # The anchor on the ground is that of the pose that the file is written in, with all bars along x.
-        last, tip = f"b{len(chain.lengths) - 1}", "pin_a"
-        sites = "" if chain.end is None else f'<site name="pin_b" pos="{chain.end[0]} {chain.end[1]} 0"/>'
+        ground = loop = ""
         if chain.end is not None:
-            at = bodies.index("</body>")
-            bodies = f'{bodies[:at]}<site name="{tip}" pos="{offset} 0 0"/>{bodies[at:]}'
-        loop = "" if chain.end is None else f'<equality><connect site1="{tip}" site2="pin_b" {hard}/></equality>'
-        del last
+            # A time constant of two steps, and forces of nearly the whole stiffness, are as hard as it gets.
+            hard = f'solref="{2 * step} 1" solimp="0.9999 0.9999 0.001"'
+            bodies = bodies.replace("</body>", f'<site name="tip" pos="{offset} 0 0"/></body>', 1)
+            ground = f'<site name="pin" pos="{chain.end[0]} {chain.end[1]} 0"/>'
+            loop = f'<equality><connect site1="tip" site2="pin" {hard}/></equality>'
         return mujoco.MjModel.from_xml_string(
             f'<mujoco><option timestep="{step}" integrator="RK4" gravity="0 {-GRAVITY} 0" tolerance="1e-14" '
-            f'iterations="100"><flag contact="disable"/></option><worldbody>{sites}{bodies}</worldbody>{loop}</mujoco>'
+            f'iterations="100"><flag contact="disable"/></option><worldbody>{ground}{bodies}</worldbody>{loop}</mujoco>'
         )
 
     models = {}
@@ -212,7 +209,9 @@ def of_exudyn(chain: BarChain) -> dict[str, Peer]:
     def angle(step):
         settings.timeIntegration.numberOfSteps = round(chain.t1 / step)
         mbs.SolveDynamic(settings, solverType=exu.DynamicSolverType.TrapezoidalIndex2, updateInitialValues=False)
-        return mbs.GetNodeOutput(nodes[chain.watched], exu.OutputVariableType.Coordinates)[2] + chain.angles[chain.watched]
+        return (
+            mbs.GetNodeOutput(nodes[chain.watched], exu.OutputVariableType.Coordinates)[2] + chain.angles[chain.watched]
+        )
 
     return {"Exudyn": Peer(angle, None, chain.t1 / np.geomspace(300, 100_000, 9).round())}
 
@@ -270,12 +269,18 @@ def of_casadi(chain: BarChain) -> dict[str, Peer]:
     return {name: peer(*form) for name, form in forms.items()}
 
 
-PEERS = {"mujoco": of_mujoco, "pinocchio": of_pinocchio, "exudyn": of_exudyn, "casadi": of_casadi, "diffrax": of_diffrax}
+PEERS = {
+    "mujoco": of_mujoco,
+    "pinocchio": of_pinocchio,
+    "exudyn": of_exudyn,
+    "casadi": of_casadi,
+    "diffrax": of_diffrax,
+}
 PACKAGES = ("jaxmb", "jax", "jaxlib", "diffrax", "scipy", "pin", "mujoco", "exudyn", "casadi")
 
 
-def compare(chain: BarChain) -> list[dict[str, Any]]:
-    """For values and gradients, the points of every program and its times at equal error."""
+def compare(chain: BarChain) -> list[Curve]:
+    """Of every program, values and gradients."""
     programs = of_jaxmb(chain)
     for package, build in PEERS.items():
         try:
@@ -283,53 +288,31 @@ def compare(chain: BarChain) -> list[dict[str, Any]]:
         except ImportError:
             print(f"{package} is not installed: left out.", file=sys.stderr)
     # The angle is known better than any program computes it; its derivative from two programs at their tightest.
-    tight = {name: float(programs[name].gradient(1e-13)) for name in ("jaxmb", "diffrax")}
-    slope = tight["jaxmb"]
-    agreement = abs(tight["diffrax"] / slope - 1)
-    results = []
+    slope, other = (float(programs[name].gradient(1e-13)) for name in ("jaxmb", "diffrax"))
+    print(f"{chain.title}: derivative {slope:.12g}, jaxmb and diffrax differ by {abs(other / slope - 1):.0e}")
+    curves = []
     for kind, exact in (("value", chain.exact), ("gradient", slope)):
         error = lambda found, exact=exact: abs(float(found) / exact - 1)
         for name, peer in programs.items():
             run = getattr(peer, kind)
-            if run is None:
-                continue
-            points = measured(run, error, peer.settings, REPEATS)
-            times = {f"{target:.0e}": seconds_at(points, target) for target in ERRORS if kind == "value" or target > agreement}
-            results.append({"case": chain.title, "kind": kind, "program": name, "points": points, "seconds": times})
-            print(f"{chain.title}, {kind}, {name}: done", file=sys.stderr, flush=True)
-    return results
-
-
-def table(results: list[dict[str, Any]]) -> str:
-    """Times at equal error, and over those of jaxmb: more than one where jaxmb is faster, less where it loses."""
-    lines = []
-    for case, kind in dict.fromkeys((r["case"], r["kind"]) for r in results):
-        own = [r for r in results if (r["case"], r["kind"]) == (case, kind)]
-        base = next(r for r in own if r["program"] == "jaxmb")["seconds"]
-        rows = [(f"{case}, {kind}", *(f"at {error} [ms]  ×" for error in base), "least error")]
-        for result in own:
-            least = min((point.error for point in result["points"]), default=float("nan"))
-            cells = [_cell(seconds, base[error]) for error, seconds in result["seconds"].items()]
-            rows.append((result["program"], *cells, f"{least:.0e}"))
-        lines += ["", *aligned(rows)]
-    return "\n".join(lines[1:])
-
-
-def _cell(seconds, base):
-    return "–" if not np.isfinite(seconds) else f"{1e3 * seconds:.2f}  {seconds / base:5.2f}"
+            if run is not None:
+                print(f"{chain.title}, {kind}, {name}", file=sys.stderr, flush=True)
+                curves.append(Curve(chain.title, kind, name, measured(run, error, peer.settings, REPEATS)))
+    return curves
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--record", metavar="FILE", help="write the results as JSON")
+    parser.add_argument("--record", metavar="FILE", type=Path, help="write the curves into a JSON file")
     given = parser.parse_args()
     described = machine(PACKAGES)
-    results = [result for chain in (four_bar(), pendulum()) for result in compare(chain)]
-    print(f"{described}\n\n{table(results)}")
+    print(described)
+    curves = [curve for chain in (four_bar(), pendulum()) for curve in compare(chain)]
+    print(
+        f"\nTimes at equal error, and over those of jaxmb: × is more than one where jaxmb is faster\n\n{table(curves)}"
+    )
     if given.record:
-        for result in results:
-            result["seconds"] = {k: None if np.isnan(x) else x for k, x in result["seconds"].items()}
-        Path(given.record).write_text(json.dumps({"machine": described, "results": results}, indent=1) + "\n")
+        record(given.record, "peers", described, curves)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,25 @@
-"""The mechanisms among the differential-algebraic problems of SciMLBenchmarks, which are those of the test set for initial
-value problem solvers (Mazzia and Magherini, 2008): Andrews' squeezer, the car axis, Fekete's particles on a sphere and
-the rail wheelset. Its slider-crank is elastic and not rigid, so it is left out.
+"""The mechanisms among the differential-algebraic problems of SciMLBenchmarks, beside RADAU5.
 
-Run it with `python tests/benchmarks/sciml_dae.py [andrews car_axis fekete wheelset]`, on an otherwise idle machine. Printed
-are scd, the number of correct digits of the worst component against the published end values; the largest relative error
-against better values, where there are any; steps and times of warm runs; and times at equal error, with their ratio.
+They are those of the test set for initial value problem solvers (Mazzia and Magherini, 2008): Andrews' squeezer, the
+car axis, Fekete's particles on a sphere and the rail wheelset. The slider-crank is elastic, not rigid: left out.
 
-Beside jaxmb stands RADAU5 in the form of index 3, with the indices of its variables given: of all solvers that
-SciMLBenchmarks tries on Andrews' squeezer (2026) it is the only one that comes through. RADAU5 is Fortran (`pip install
-assimulo-testing`); each of its evaluations is a call of a function compiled by JAX, about ten microseconds.
+    python tests/benchmarks/sciml_dae.py [--record FILE] [andrews car_axis fekete wheelset]
+
+on an otherwise idle machine. Printed are scd, the number of correct digits of the worst component against the
+published end values; the largest relative error against better values, where there are any; steps and times of warm
+runs; and times at equal error, with their ratio. `--record notebooks/14_benchmarks.json` writes the curves for the
+notebook on benchmarks.
+
+RADAU5 has the form of index 3, with the indices of its variables given: of all solvers that SciMLBenchmarks tries on
+Andrews' squeezer (2026) it is the only one that comes through. It is Fortran (`pip install assimulo-testing`); every
+evaluation is a call of a function that JAX compiled, and how long the calls take is printed as well.
 """
 
+import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from equal_error import Point, machine, measured, seconds_at
+from equal_error import ERRORS, Curve, machine, measured, record, table
 from ivp_test_set import PROBLEMS, Problem, relative, scd
 from radau5 import motion_of
 
@@ -31,12 +36,19 @@ from jaxmb.report.table import aligned
 
 jax.config.update("jax_enable_x64", True)
 REPEATS = 1
-ERRORS = (1e-4, 1e-6, 1e-8)
 TOLERANCES = 10.0 ** -np.arange(3.0, 11.1)
 
 
-def jaxmb_run(problem: Problem) -> tuple[Callable[[float], Any], Callable[[Any], tuple[np.ndarray, int]]]:
-    """A run at a tolerance, and its end with its steps."""
+class Outcome(NamedTuple):
+    """`calls`: how long calls of the equations took [s], where they are calls from outside."""
+
+    end: Any
+    steps: int
+    calls: float | None
+
+
+def jaxmb_run(problem: Problem) -> tuple[Callable[[float], Any], Callable[[Any], Outcome]]:
+    """A run at a tolerance, and its outcome."""
     system, state = problem.build()
 
     @eqx.filter_jit
@@ -44,44 +56,52 @@ def jaxmb_run(problem: Problem) -> tuple[Callable[[float], Any], Callable[[Any],
         trajectory = mb.simulate(system, state, t1=problem.t1, rtol=rtol, throw=False)
         return problem.end(trajectory), trajectory.stats["num_steps"]
 
-    return lambda rtol: program(system, state, np.asarray(rtol)), lambda result: (result[0], int(result[1]))
+    return lambda rtol: program(system, state, np.asarray(rtol)), lambda result: Outcome(
+        result[0], int(result[1]), None
+    )
 
 
-def radau_run(problem: Problem):
+def radau_run(problem: Problem) -> tuple[Callable[[float], Any], Callable[[Any], Outcome]]:
     """The same of RADAU5; what it does not finish is NaN."""
     end = lambda run: problem.end_of(run) if run.ok else np.full_like(problem.exact, np.nan)
-    return motion_of(problem.equations), lambda run: (end(run), run.steps)
+    return motion_of(problem.equations), lambda run: Outcome(end(run), run.steps, run.seconds)
 
 
-def measure(name: str) -> None:
+def measure(name: str) -> list[Curve]:
     problem = PROBLEMS[name]()
-    print(f"\n{problem.title}, {problem.t1:g} s")
     solvers = {"jaxmb": jaxmb_run(problem)}
     try:
         solvers["RADAU5"] = radau_run(problem)
     except ImportError:
         print("RADAU5 is not installed (pip install assimulo-testing): left out.")
-    rows = [("", "tolerance", "scd", "error", "steps", "time [ms]")]
-    curves: dict[str, list[Point]] = {}
-    for solver, (run, end) in solvers.items():
-        error = lambda result, end=end: relative(end(result)[0], problem.exact)
-        curves[solver] = measured(run, error, TOLERANCES, REPEATS)
-        for point in curves[solver]:
-            found, steps = end(run(point.setting))
-            digits, took = f"{scd(found, problem.published):.1f}", f"{1e3 * point.seconds:.1f}"
-            rows.append((solver, f"{point.setting:.0e}", digits, f"{point.error:.1e}", str(steps), took))
-    print("\n".join(aligned(rows)))
-    if "RADAU5" in curves:
-        for target in (error for error in ERRORS if error > problem.accuracy):
-            own, other = (1e3 * seconds_at(curves[solver], target) for solver in ("jaxmb", "RADAU5"))
-            print(f"at error {target:.0e}: jaxmb {own:.1f} ms, RADAU5 {other:.1f} ms, ratio {own / other:.2f}")
+    rows = [("", "tolerance", "scd", "error", "steps", "time [ms]", "of it calls")]
+    curves = []
+    for solver, (run, outcome) in solvers.items():
+        error = lambda result, outcome=outcome: relative(outcome(result).end, problem.exact)
+        points = measured(run, error, TOLERANCES, REPEATS)
+        for point in points:
+            found = outcome(run(point.setting))
+            calls = "" if found.calls is None else f"{1e3 * found.calls:.1f}"
+            digits = f"{scd(found.end, problem.published):.1f}"
+            cells = digits, f"{point.error:.1e}", str(found.steps), f"{1e3 * point.seconds:.1f}", calls
+            rows.append((solver, f"{point.setting:.0e}", *cells))
+        curves.append(Curve(problem.title, "value", solver, points))
+    print("\n".join(["", f"{problem.title}, {problem.t1:g} s", *aligned(rows)]))
+    print("\n" + table(curves, [error for error in ERRORS if error > problem.accuracy]), flush=True)
+    return curves
 
 
 def main():
-    print(machine(("jaxmb", "jax", "jaxlib", "assimulo-testing")))
-    for name in sys.argv[1:] or PROBLEMS:
-        measure(name)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("problems", nargs="*", metavar="PROBLEM", help=", ".join(PROBLEMS))
+    parser.add_argument("--record", metavar="FILE", type=Path, help="write the curves into a JSON file")
+    given = parser.parse_args()
+    described = machine(("jaxmb", "jax", "jaxlib", "assimulo-testing"))
+    print(described)
+    curves = [curve for name in given.problems or PROBLEMS for curve in measure(name)]
     print("\nThe slider-crank of the same set is elastic, not rigid: left out.")
+    if given.record:
+        record(given.record, "sciml_dae", described, curves)
 
 
 if __name__ == "__main__":

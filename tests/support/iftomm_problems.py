@@ -20,8 +20,8 @@ from jaxmb.mechanisms import Mechanism
 
 
 class Case(NamedTuple):
-    """`error(trajectory)` is the largest one of the `measure` over all saved `times`, in its unit; `opensim` a published
-    time [s], None if there is none.
+    """`error(mechanism, trajectory)` is the largest one of the `measure` over all saved `times`, in its unit;
+    `opensim` a published time [s], or None.
     """
 
     title: str
@@ -91,8 +91,8 @@ EIGENVALUES = {0.0: 2.14767663837j, 1.0: -0.2423858093 + 2.1339550282j}
 
 
 def sprung_four_bar(damping: float) -> tuple[mb.system.AbstractSystem, mb.State]:
-    """A rhombus of three bars of 1 m and 1 kg on ground pivots (0, 0) and (1, 0), which a spring of 25 N/m and √2 m along
-    its diagonal, and a damper [N s/m], hold against gravity; and its equilibrium.
+    """A rhombus of three bars of 1 m and 1 kg on ground pivots (0, 0) and (1, 0), which a spring of 25 N/m and √2 m
+    along its diagonal holds against gravity, with a damper [N s/m] beside it; and its equilibrium.
     """
     half, angle = 0.5, 2.234
     across, along = np.array([np.cos(angle), np.sin(angle)]), np.array([1.0, 0.0])

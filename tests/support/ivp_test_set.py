@@ -55,12 +55,26 @@ _MASSES = np.array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.0549
 _INERTIAS = np.array([2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5])
 _A, _B, _C = np.array([-0.06934, -0.00227]), np.array([-0.03635, 0.03273]), np.array([0.014, 0.072])
 _ANDREWS_START = np.array(
-    [-0.0617138900142764496, 0.0, 0.455279819163070380, 0.222668390165885885, 0.487364979543842550]
-    + [-0.222668390165885885, 1.23054744454982119]
+    [
+        -0.0617138900142764496,
+        0.0,
+        0.455279819163070380,
+        0.222668390165885885,
+        0.487364979543842550,
+        -0.222668390165885885,
+        1.23054744454982119,
+    ]
 )
 _ANDREWS_END = np.array(
-    [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948, 0.5244099658805304]
-    + [0.5347301163226948, 1.048080741042263]
+    [
+        15.81077119629904,
+        -15.75637105984298,
+        0.04082224013073101,
+        -0.5347301163226948,
+        0.5244099658805304,
+        0.5347301163226948,
+        1.048080741042263,
+    ]
 )
 
 
@@ -84,7 +98,7 @@ def _squeezer(q):
 
 
 def _squeezer_lagrangian(t, q, v, parameters):
-    poses, rates = jax.jvp(lambda q: _squeezer(q)[:2], (q,), (v,))
+    _, rates = jax.jvp(lambda q: _squeezer(q)[:2], (q,), (v,))
     spring = jnp.linalg.norm(_squeezer(q)[3] - _C) - 0.07785
     kinetic = 0.5 * (jnp.dot(_INERTIAS, rates[0] ** 2) + jnp.dot(_MASSES, jnp.sum(rates[1] ** 2, axis=1)))
     return kinetic - 0.5 * 4530.0 * spring**2
@@ -121,8 +135,16 @@ def _andrews() -> Problem:
 
 _CAR_LABELS = ("xl", "yl", "xr", "yr", "xl1", "yl1", "xr1", "yr1")
 _CAR_END = np.array(
-    [0.0493455784275402809122, 0.496989460230171153861, 1.04174252488542151681, 0.373911027265361256927]
-    + [-0.0770583684040972357970, 0.00744686658723778553466, 0.0175568157537232222276, 0.770341043779251976443]
+    [
+        0.0493455784275402809122,
+        0.496989460230171153861,
+        1.04174252488542151681,
+        0.373911027265361256927,
+        -0.0770583684040972357970,
+        0.00744686658723778553466,
+        0.0175568157537232222276,
+        0.770341043779251976443,
+    ]
 )
 _POINT, _FREE = 0.5 * 10.0 * 1e-2**2, 0.5
 
@@ -221,9 +243,7 @@ def _wheelset() -> Problem:
         wheelset.T1,
         build,
         lambda trajectory: jnp.concatenate([trajectory.ys.q[-1, :5], trajectory.ys.u[-1]]),
-        Equations(
-            wheelset.lagrangian, force, lambda t, q: wheelset.gaps(q), wheelset.START, np.zeros(6), wheelset.T1
-        ),
+        Equations(wheelset.lagrangian, force, lambda t, q: wheelset.gaps(q), wheelset.START, np.zeros(6), wheelset.T1),
         lambda run: np.concatenate([run.q[:5], run.v]),
         published,
         published,

@@ -4,6 +4,7 @@ It is that of the package `assimulo` (`pip install assimulo-testing` has it comp
 `assimulo` do not let it know that variables have index 3. Equations and their Jacobian are compiled by JAX.
 """
 
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -27,10 +28,13 @@ class Equations(NamedTuple):
 
 
 class Run(NamedTuple):
+    """The end, and the `seconds` that calls of the equations and their Jacobian took."""
+
     q: np.ndarray
     v: np.ndarray
     steps: int
     evaluations: int
+    seconds: float
     ok: bool
 
 
@@ -58,8 +62,19 @@ def motion_of(equations: Equations) -> Callable[[float], Run]:
     start = _consistent(implicit, equations, n, m)
     # Arguments that switch an option off are zero; one number for the kind of problem, as the wrapper wants it.
     known = np.zeros(1, np.intc)
-    field = lambda t, y: (np.concatenate([y[n : 3 * n], rest(t, y)]), known)
-    jacobian = lambda t, y: (np.asfortranarray(slope(t, y)), known)
+    seconds = [0.0]
+
+    def timed(function):
+        def call(t, y):
+            begin = time.perf_counter()
+            result = function(t, y)
+            seconds[0] += time.perf_counter() - begin
+            return result, known
+
+        return call
+
+    field = timed(lambda t, y: np.concatenate([y[n : 3 * n], rest(t, y)]))
+    jacobian = timed(lambda t, y: np.asfortranarray(slope(t, y)))
     mass = lambda am: np.zeros((1, n + m))
     unused = lambda *args: 1
     N = 3 * n + m
@@ -73,8 +88,10 @@ def motion_of(equations: Equations) -> Callable[[float], Run]:
         tolerances = np.full(N, tolerance)
         options = (1, jacobian, 1, N, N, mass, 1, 0, 0, unused, 0, work, iwork)
         step = 1e-4 * equations.t1
-        _, y, _, counts, code = fortran.radau5(field, 0.0, start.copy(), equations.t1, step, tolerances, tolerances, *options)
-        return Run(y[:n], y[n : 2 * n], int(counts[15]), int(counts[13]), code == 1)
+        seconds[0] = 0.0
+        found = fortran.radau5(field, 0.0, start.copy(), equations.t1, step, tolerances, tolerances, *options)
+        _, y, _, counts, code = found
+        return Run(y[:n], y[n : 2 * n], int(counts[15]), int(counts[13]), seconds[0], code == 1)
 
     return run
 

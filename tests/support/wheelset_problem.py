@@ -1,9 +1,9 @@
 """The rail wheelset of the test set for initial value problem solvers: it hunts between two rails.
 
 Source: B. Simeon, C. Führer and P. Rentrop, "Differential-algebraic equations in vehicle system dynamics", Surv. Math.
-Ind. 1, 1991, as in F. Mazzia and C. Magherini, "Test Set for Initial Value Problem Solvers", 2008. Two conical wheels on
-one axle run at 30 m/s on straight rails of circular profile; the axle is held by springs, and creep forces after Kalker
-depend on the normal forces, which are constraint forces.
+Ind. 1, 1991, as in F. Mazzia and C. Magherini, "Test Set for Initial Value Problem Solvers", 2008. Two conical wheels
+on one axle run at 30 m/s on straight rails of circular profile; the axle is held by springs, and creep forces after
+Kalker depend on the normal forces, which are constraint forces.
 
 Coordinates are the axle's displacements x (lateral), y (up) and z (forward) [m], its yaw θ and roll φ [rad], and the
 angle β [rad] that it has turned beyond 300 rad/s. The source's four contact variables are functions of them: wheels are
@@ -25,14 +25,20 @@ START = np.array([0.14941e-2, 0.40089e-6, 0.11241e-5, -0.28573e-3, 0.26459e-3, 0
 ACCELERATIONS = np.array(
     [-1.975258894011285, -1.0898297102811276e-3, 7.8855083626142589e-2, -5.533362821731549, -0.3487021489546511]
 )
-# The published end: x, y, z, θ, φ and their rates, the rate of β, and the contacts' ψ and ξ, left and right; by DASSL at
-# a tolerance of 1e-9; RADAU5 and jaxmb agree with it to 5e-6.
+# The published end: x, y, z, θ, φ and their rates, the rate of β, and the contacts' ψ and ξ, left and right; by DASSL
+# at a tolerance of 1e-9. RADAU5 and jaxmb agree with it to 5e-6.
 COORDINATES = np.array(
     [0.86355386965811e-2, 0.13038281022727e-4, -0.93635784016818e-4, -0.13642299804033e-1, 0.15292895005422e-2]
 )
 RATES = np.array(
-    [-0.76985374142666e-1, -0.25151106429207e-3, 0.20541188079539e-2, -0.23904837703692, -0.13633468454173e-1]
-    + [-0.24421377661131]
+    [
+        -0.76985374142666e-1,
+        -0.25151106429207e-3,
+        0.20541188079539e-2,
+        -0.23904837703692,
+        -0.13633468454173e-1,
+        -0.24421377661131,
+    ]
 )
 CONTACTS = np.array([[-0.33666751972196e-3, -0.15949425684022], [0.37839614386969e-3, 0.14173214964613]])
 
@@ -129,7 +135,7 @@ def force(t, q, v, parameters):
 
 
 def gaps(q: Array) -> Array:
-    """Over those of the published start, which are small, and which the source's constraints between velocities keep."""
+    """Over those of the published start, which are small; the source's constraints between velocities keep them."""
     return jnp.stack([contact(side, q).gap - contact(side, jnp.asarray(START)).gap for side in SIDES.values()])
 
 
