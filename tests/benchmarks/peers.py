@@ -39,7 +39,7 @@ from equal_error import Curve, machine, measured, record, table
 import jaxmb as mb
 
 jax.config.update("jax_enable_x64", True)
-REPEATS = 1
+REPEATS = 5
 TOLERANCES = 10.0 ** -np.arange(3.0, 12.1)
 
 

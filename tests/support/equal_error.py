@@ -35,17 +35,24 @@ class Curve(NamedTuple):
 
 
 def measured(
-    run: Callable[[float], Any], error: Callable[[Any], float], settings: Iterable[float], repeats: int
+    run: Callable[[float], Any],
+    error: Callable[[Any], float],
+    settings: Iterable[float],
+    repeats: int,
+    seconds: Callable[[Any], float] | None = None,
 ) -> list[Point]:
-    """The runs that end, with the shortest of `repeats` times of each, all of one setting after the other in turns."""
+    """The runs that end, with the shortest of `repeats` times of each, all settings in turns; with `seconds(result)`
+    instead of the time that passes.
+    """
     settings = list(settings)
     errors = [error(jax.block_until_ready(run(setting))) for setting in settings]
     shortest = [np.inf] * len(settings)
     for _ in range(repeats):
         for k, setting in enumerate(settings):
             begin = time.perf_counter()
-            jax.block_until_ready(run(setting))
-            shortest[k] = min(shortest[k], time.perf_counter() - begin)
+            result = jax.block_until_ready(run(setting))
+            passed = time.perf_counter() - begin
+            shortest[k] = min(shortest[k], passed if seconds is None else seconds(result))
     return [Point(*point) for point in zip(settings, errors, shortest, strict=True) if np.isfinite(point[1])]
 
 

@@ -106,7 +106,7 @@ def _squeezer_lagrangian(t, q, v, parameters):
 
 def _squeezer_loops(t, q):
     ends = _squeezer(q)[2]
-    return jnp.ravel(ends[1:] - ends[0])
+    return jnp.ravel(ends[1:] - ends[:1])
 
 
 def _andrews() -> Problem:
