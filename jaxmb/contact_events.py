@@ -132,13 +132,17 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
     guards = contact_guards(system, formulation, found.touch)
     assert guards is not None, "a system without contacts has no events"
     nq, nu = system.nq, system.nu
+    # Behind the last event a state is needed that has no failure, nor its derivative.
+    guess = system.guess
+    still = jnp.concatenate([guess.q, guess.u, jnp.zeros(system.nz, guess.q.dtype)])
+    some = found.number > 0
+    first = jnp.where(some, found.states[0], still), jnp.where(some, found.times[0], 0.0)
 
     def single(k, t, flat):
-        # Behind the last event a state is needed that has no failure.
         taken = k < found.number
-        flat = jnp.where(taken, flat, found.states[0])
+        flat = jnp.where(taken, flat, first[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
-        out = guards.impact(jnp.where(taken, t, found.times[0]), y, dated=True)
+        out = guards.impact(jnp.where(taken, t, first[1]), y, dated=True)
         # Steps also end where it turns out that nothing changes.
         before, after = out.modes
         taken = taken & (jnp.any(before != after) | jnp.any(out.impulses != 0))
@@ -146,6 +150,6 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
         values = out.impulses, out.energy, before, after, out.rest
         return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)
 
-    found = jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
-    order = jnp.argsort(jnp.isinf(found[0]), stable=True)
-    return jax.tree.map(lambda x: x[order], found)
+    rows = jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
+    order = jnp.argsort(jnp.isinf(rows[0]), stable=True)
+    return jax.tree.map(lambda x: x[order], rows)
