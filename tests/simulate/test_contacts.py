@@ -87,14 +87,19 @@ def test_forward_mode_is_reverse_mode_through_impacts():
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
-@pytest.mark.long
-def test_derivatives_through_closing_sliding_and_opening():
-    """A particle falls on a sphere, slides down and leaves it: both modes, and differences of a tighter solution."""
-    system = mb.Scene(
-        [planar.PointMass("p", mass=0.7, position=(0.3, 1.3))],
+def particle_on_a_sphere(x, y):
+    """Of radius 1, or above it, without friction."""
+    return mb.Scene(
+        [planar.PointMass("p", mass=0.7, position=(x, y))],
         joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
         forces=[mb.Gravity((0.0, -G))],
     ).compile()
+
+
+@pytest.mark.long
+def test_derivatives_through_closing_sliding_and_opening():
+    """A particle falls on a sphere, slides down and leaves it: both modes, and differences of a tighter solution."""
+    system = particle_on_a_sphere(0.3, 1.3)
     start = mb.assemble(system)
 
     def run(at, rtol=1e-10):
@@ -135,13 +140,29 @@ def test_events_have_derivatives():
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
 
 
+def test_a_member_without_events_has_finite_derivatives_of_them():
+    """In space, where zeros are no attitude; one member of the batch meets the floor, the other does not."""
+    system = mb.Scene(
+        [spatial.Body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 1.0))],
+        joints=[mb.RigidContact("floor", "ball", terrain=mb.terrain.Flat(), restitution=0.8)],
+        forces=[mb.Gravity((0.0, 0.0, -G))],
+    ).compile()
+    state = mb.assemble(system)
+
+    def first(height):
+        start = mb.State(state.q.at[2].set(height), state.u)
+        times = mb.simulate(system, start, t1=0.6, rtol=1e-9, max_steps=200, max_events=8).events.times
+        return jnp.where(jnp.isfinite(times[0]), times[0], 0.0)
+
+    times, slopes = jit_quickly(jax.vmap(jax.value_and_grad(first)))(jnp.array([1.0, 5.0]))
+    fall = np.sqrt(2 / G)
+    np.testing.assert_allclose(times, [fall, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(slopes, [fall / 2, 0.0], rtol=1e-7)
+
+
 def test_the_time_of_opening_has_a_derivative():
     """A particle that slides down a sphere from rest leaves it at a time with constant `t² g`."""
-    system = mb.Scene(
-        [planar.PointMass("p", mass=0.7, position=(0.6, 0.8))],
-        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
-        forces=[mb.Gravity((0.0, -G))],
-    ).compile()
+    system = particle_on_a_sphere(0.6, 0.8)
 
     def opens(strength):
         changed = mb.with_parameters(system, {"gravity.acceleration": jnp.stack([0.0 * strength, -strength])})
@@ -217,11 +238,7 @@ def test_cradle():
 def test_a_particle_leaves_a_sphere():
     """It slides from the top without friction and leaves the sphere at two thirds of its radius above the centre."""
     start = 0.1
-    system = mb.Scene(
-        [planar.PointMass("p", mass=0.7, position=(np.sin(start), np.cos(start)))],
-        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
-        forces=[mb.Gravity((0.0, -G))],
-    ).compile()
+    system = particle_on_a_sphere(np.sin(start), np.cos(start))
     state = mb.assemble(system)
     motion = mb.simulate(system, state, t1=2.0, saveat=diffrax.SaveAt(dense=True), rtol=1e-10)
     (event,) = motion.events
