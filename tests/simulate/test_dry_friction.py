@@ -266,6 +266,27 @@ def test_derivatives_through_an_impact_with_friction():
 HALF, TALL = 0.1, 0.4
 
 
+@pytest.mark.parametrize("spin", [0.0, -40.0])
+def test_impulses_and_energies_change_as_their_differences(spin):
+    """Of an impact with friction that slips to its end, or whose slip ends in it; and the time of it."""
+    system = disc(coefficient=0.2, height=RADIUS, velocity=1.0, spin=spin, restitution=0.4)
+    state = mb.assemble(system)
+    method = mb.simulate(system, state, t1=1e-3).formulation
+
+    def event(x):
+        changed = mb.with_parameters(system, {"rub.coefficient": x[0], "floor.restitution": x[1], "disc.mass": x[2]})
+        y = mb.State(state.q.at[1].add(x[3]), state.u.at[:3].set(jnp.stack([x[4], -2.0, x[5]])))
+        found = impact(changed, method, jnp.asarray(1e-3), jnp.zeros(()), y, dated=True)
+        return jnp.concatenate([found.impulses, jnp.stack([found.energy, found.late])])
+
+    at, h = jnp.array([0.2, 0.4, 1.5, 0.0, 1.0, spin]), 1e-6
+    forward, reverse = (jax.jit(mode(event))(at) for mode in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    value = jax.jit(jax.vmap(event))
+    differences = (value(at[None] + h * jnp.eye(6)) - value(at[None] - h * jnp.eye(6))) / (2 * h)
+    np.testing.assert_allclose(forward, differences.T, rtol=1e-6, atol=1e-7)
+
+
 def test_a_rocking_block():
     """Housner's: between impacts a pendulum about a corner, and at each impact the angular velocity falls by
     `1 - 1.5 sin² α`. Source: G. W. Housner, Bull. Seism. Soc. Am. 53, 1963.
