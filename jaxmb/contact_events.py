@@ -51,10 +51,12 @@ class ContactEvents(eqx.Module):
     A state that is saved just at an event may be that before it or that after it. Times, impulses and energies have
     first derivatives; `rest` counts as a constant.
 
-    **Fields:** the `names` of the parts, and how many of them, the first ones, are `contacts`; `times` [s], shape
+    **Fields:** the `names` of the parts, twice that of friction in space, which has two directions, and how many of
+    them, the first ones, are `contacts`; `times` [s], shape
     (events,); `impulses` [N s, of angles N m s], shape (events, parts); `energy_lost` [J], shape (events,): that of the
     impact; `before` and `after`: modes, of a contact 0 where it is open, 1 where it is closed, 2 where others imply it,
-    of friction 1 and -1 where it slips forwards and backwards, 2 where it sticks, 0 where it does nothing; `rest` [s],
+    of friction 1 and -1 where it slips forwards and backwards, in space 1, 2 where it sticks, 0 where it does nothing;
+    `rest` [s],
     shape (events, parts): the time from an event to the end of the infinitely many bounces that begin with it and are
     too low to be resolved, after which the contact is at rest; zero where there are none. Under `jit` or in a batch
     there are as many events as `max_events`, with times of infinity after the last.
@@ -99,7 +101,12 @@ class ContactEvents(eqx.Module):
         for k in np.flatnonzero(np.isfinite(times)):
             for i, name in enumerate(self.names):
                 if i >= self.contacts:
-                    changed, impulse = before[k, i] != after[k, i], float(impulses[k, i])
+                    if self.names[i - 1] == name:
+                        continue
+                    # Both directions of friction that has two.
+                    own = slice(i, i + self.names.count(name))
+                    changed = before[k, i] != after[k, i]
+                    impulse = float(impulses[k, i] if own.stop == i + 1 else np.linalg.norm(impulses[k, own]))
                     struck = impulse != 0
                     kind = "stick" if after[k, i] == STICK else "slip" if after[k, i] != FREE else "impact"
                     if struck or (changed and after[k, i] != FREE):

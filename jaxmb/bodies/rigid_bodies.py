@@ -307,23 +307,26 @@ class RigidBodySystem(AbstractSystem):
         return Contacts(tuple(names), tuple(rows), tuple(modes), coefficients, frictions)
 
     def _dry_frictions(self, contacts):
-        names, rows, modes, of_contacts, releases, first = [], [], [], [], [], self.position_rows
+        names, rows, modes, of_contacts, releases, pairs, first = [], [], [], [], [], [], self.position_rows
         for g in self.velocity_constraints:
             count = len(g.group.names) * g.rows
             if g.joints:
-                names += g.group.names
+                pairs += range(len(names), len(names) + count, 2) if g.rows == 2 else ()
+                names += [name for name in g.group.names for _ in range(g.rows)]
                 rows += range(first, first + count)
-                modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
-                of_contacts += [contacts.index(name) if name in contacts else -1 for name in g.joints]
+                modes += self.layout.pose_index[g.group.body_index[:, -g.rows :].reshape(-1), 0].tolist()
+                numbers = [contacts.index(name) if name in contacts else -1 for name in g.joints]
+                of_contacts += [k for k in numbers for _ in range(g.rows)]
                 releases += [g.group.part.static_coefficient is not None] * count
             first += count
         if not names:
             return None
-        parts = [g.group.part for g in self.frictions]
-        coefficient, limit = (jnp.concatenate([getattr(p, own) for p in parts]) for own in ("coefficient", "limit"))
-        return Frictions(
-            tuple(names), tuple(rows), tuple(modes), tuple(of_contacts), tuple(releases), coefficient, limit
+        parts = [(g.group.part, g.rows) for g in self.frictions]
+        coefficient, limit = (
+            jnp.concatenate([_of_rows(getattr(p, own), n) for p, n in parts]) for own in ("coefficient", "limit")
         )
+        static = map(tuple, (names, rows, modes, of_contacts, releases, pairs))
+        return Frictions(*static, coefficient, limit)
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):
@@ -331,7 +334,7 @@ class RigidBodySystem(AbstractSystem):
         groups = self.frictions
         reactions = joint_reactions(self.joints, [g.law for g in groups], t, poses, velocities, multipliers)
         d, both = self.layout.space.dimension, zip(groups, reactions, strict=True)
-        return jnp.concatenate([own[:, g.group.part.last, :d] for g, own in both])
+        return jnp.concatenate([_of_rows(own[:, g.group.part.last, :d], g.rows) for g, own in both])
 
     # Scalar coordinates
 
@@ -677,7 +680,11 @@ class RigidBodySystem(AbstractSystem):
             return self.mass
         found = [(g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial]
         # The mode of friction has a velocity that no force changes.
-        found += [(g.group.body_index[:, -1], jnp.ones_like(g.group.part.coefficient)) for g in self.frictions]
+        found += [
+            (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient))
+            for g in self.frictions
+            for k in range(-g.rows, 0)
+        ]
         still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
         order = np.argsort(np.concatenate([*(numbers for numbers, _ in found), still]).astype(int))
         ones = jnp.ones(len(still), self.mass.dtype)
@@ -839,3 +846,8 @@ def _with_scalars(system, guess):
         unmet = g.velocity(t, system.prepared_poses(q), system.all_velocities(u))[:, 0]
         u = u.at[layout.velocity_index[scalars, 0]].add(-unmet)
     return dataclasses.replace(guess, q=q, u=u)
+
+
+def _of_rows(values: Array, count: int) -> Array:
+    """The numbers of parts, once for each of their rows."""
+    return values if count == 1 else jnp.repeat(values, count, axis=0)

@@ -99,7 +99,7 @@ class Scene(eqx.Module):
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
         joints = {part.name: part for part in self.joints}
         links = [part for part in (*self.joints, *self.forces) if isinstance(part, AbstractLink)]
-        scalars = {part.name: _call(part, "scalar_coordinates", joints) for part in links}
+        scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
         layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
         index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
         numbers = iter(range(layout.bodies, layout.ground))

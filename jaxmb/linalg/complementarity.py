@@ -1,7 +1,10 @@
-"""Linear complementarity problems: `W x + b ≥ 0`, `x ≥ 0`, of which one is zero for each component.
+"""Linear complementarity problems: `W x + b ≥ 0`, `x ≥ 0`, of which one is zero for each component; and such with
+friction in two directions, whose force is in a circular cone.
 
 Sources: R. W. Cottle, J.-S. Pang and R. E. Stone, "The Linear Complementarity Problem", SIAM, 2009, §4.4 (Lemke's
-method); for friction F. Pfeiffer and Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, §6.3.
+method); for friction F. Pfeiffer and Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, §6.3; for
+the direction of slip P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone to Newton like
+solution methods", Computer Methods in Applied Mechanics and Engineering 92, 1991.
 """
 
 from typing import NamedTuple
@@ -11,11 +14,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .rotations import norm
+
 # Entries of a column below this multiple of its largest one are rounding errors, and no pivots.
 _PIVOT = 1e-9
 # Right-hand sides are displaced by this multiple of their largest entry, differently in each row, since equal ones
 # could make the method return to where it was.
 _APART = 1e-10
+# Directions of slip are turned until they change by less than this, in this many rounds at most, and then made precise
+# by this many steps of Newton's method.
+_TURN, _TURNS, _CORRECTIONS = 1e-4, 100, 4
+# Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
+_ASIDE = 1e-8
 
 
 def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
@@ -76,12 +86,14 @@ def _lemke(W, b):
 class Dry(NamedTuple):
     """Laws of dry friction beside those of contacts.
 
-    **Fields:** the number of the contact of each in `contacts`, -1 for one with a normal force of its own; the
-    `coefficient`; where it `slips`, 1 or -1, and 0 where it may stick; the `bound` of the force of those without a
-    contact.
+    **Fields:** the number of the contact of each in `contacts`, -1 for one with a normal force of its own; `pairs`: the
+    numbers of the first laws of those friction that has two, one after the other; the `coefficient`; where it `slips`,
+    1 or -1, of pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force of those
+    without a contact.
     """
 
     contacts: tuple[int, ...]
+    pairs: tuple[int, ...]
     coefficient: Float[Array, "m"]
     slips: Float[Array, "m"]
     bound: Float[Array, "m"]
@@ -89,7 +101,8 @@ class Dry(NamedTuple):
 
 class Answers(NamedTuple):
     """Which laws hold: contacts that are `closed`; friction that `sticks`; the direction in which other friction
-    `slips`, 1 or -1, and 0 where there is no force; whether there is a solution, and no contact that slips has two.
+    `slips`, 1 or -1, of pairs the components of a unit vector, and 0 where there is no force; whether there is a
+    solution, and no contact that slips has two.
     """
 
     closed: Bool[Array, "n"]
@@ -104,8 +117,110 @@ def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, amo
     **Arguments:** `W x + b`: accelerations or velocities along the normals and the slips, with their forces or
     impulses x; `among`: those that may have a force.
     """
-    W, b, among, *numbers = lax.stop_gradient((W, b, among, *dry[1:]))
-    dry = Dry(dry.contacts, *numbers)
+    W, b, among, *numbers = lax.stop_gradient((W, b, among, *dry[2:]))
+    dry = Dry(dry.contacts, dry.pairs, *numbers)
+    return _in_directions(W, b, dry, among) if dry.pairs else _in_lines(W, b, dry, among)
+
+
+def of_pairs(pairs: tuple[int, ...]) -> np.ndarray:
+    """The numbers of both laws of each pair."""
+    return np.array(pairs, int)[:, None] + np.arange(2)
+
+
+def slip_direction(modes: Float[Array, "rows"], slip: Float[Array, "rows"]) -> Float[Array, "rows"]:
+    """The unit vector against which dry friction acts, by its modes, which are whole numbers in one direction; zero
+    where it sticks or is free.
+
+    In two directions it is that of the slip, on the side of the modes, so that the force has no jump where slip passes
+    through zero; where slip has just begun, or there is none, it is that of the modes.
+    """
+    if modes.size == 1:
+        return jnp.where(jnp.abs(jnp.round(modes)) == 1, jnp.round(modes), 0.0)
+    size, speed = norm(modes), norm(slip)
+    slides = (size > 0.75) & (size < 1.5) & (speed > 0)
+    sign = jnp.where(jnp.dot(lax.stop_gradient(slip), modes) < 0, -1.0, 1.0)
+    own = sign * slip / jnp.where(slides, speed, 1.0)
+    begun = modes / jnp.where(size > 0, size, 1.0)
+    return jnp.where(slides, own, jnp.where(size < 1.5, begun, 0.0))
+
+
+def _in_directions(W, b, dry, among):
+    """`frictional` with pairs, in whose planes the first law acts along a direction of slip.
+
+    Where that is found, the force of the second law is zero.
+    """
+    m, pairs = len(dry.contacts), of_pairs(dry.pairs)
+    n = b.size - m
+    both, contact = n + pairs, np.array(dry.contacts)[pairs[:, 0]]
+    known, touches = dry.slips[pairs], among[both[:, 0]]
+    may = touches & (known == 0).all(1)
+    among = among.at[both[:, 1]].set(may)
+    # The inverse of the largest change of a slip by its force, at most.
+    step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
+
+    def solved(e):
+        turn = jnp.eye(n + m, dtype=b.dtype)
+        for own, (c, s) in zip(both, e, strict=True):
+            turn = turn.at[np.ix_(own, own)].set(jnp.array([[c, s], [-s, c]]))
+        matrix, right = turn @ W @ turn.T, turn @ b
+        laws = dry._replace(slips=turn[n:, n:] @ dry.slips)
+        answers = _in_lines(matrix, right, laws, among)
+        return answers, turn.T @ jnp.linalg.solve(*laws_of(matrix, right, laws, answers))
+
+    def direction(e, x):
+        """Where slip goes if the force is the nearest one in the cone to what would end it."""
+        ahead = step[:, None] * (W @ x + b)[both] - x[both]
+        size = norm(ahead)
+        return jnp.where((may & (size > 0))[:, None], ahead / jnp.where(size > 0, size, 1.0)[:, None], e)
+
+    def advance(carry):
+        e, _, x, _, count = carry
+        new = jnp.where(count == 0, e, direction(e, x))
+        turned = jnp.where(count == 0, jnp.inf, jnp.max(jnp.abs(new - e)))
+        return new, *solved(new), turned, count + 1
+
+    size = norm(jnp.where(may[:, None], b[both], known))
+    first = jnp.where(may[:, None], b[both], known) / jnp.where(size > 0, size, 1.0)[:, None]
+    first = jnp.where(size[:, None] > 0, first, jnp.array([1.0, 0.0], b.dtype))
+    nothing = jnp.zeros(m, b.dtype)
+    start = Answers(nothing[:0] > 0, nothing > 0, nothing, jnp.array(True))._replace(closed=jnp.zeros(n, bool))
+    start = first, start, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
+    goes_on = lambda carry: (carry[3] > _TURN) & (carry[4] < _TURNS)
+    e, answers, x, _, _ = lax.while_loop(goes_on, advance, start)
+    pressed, sticks = answers.closed[contact], answers.sticks[pairs].all(1)
+    slides = may & pressed & ~sticks
+    answers = answers._replace(sticks=answers.sticks.at[pairs].set(sticks[:, None]))
+
+    def with_slips(e):
+        slips = jnp.where((touches & pressed & ~sticks)[:, None], jnp.where(may[:, None], e, known), 0.0)
+        return answers._replace(slips=answers.slips.at[pairs].set(slips))
+
+    def correct(_, carry):
+        e, x = carry
+        e = direction(e, x)
+        matrix, right = laws_of(W, b, dry, with_slips(e))
+        rates, normal = W @ x + b, jnp.maximum(x[contact], 0.0)
+        for k, own in enumerate(both):
+            # Along the direction the force is that of slip. Across, force and slip are zero together.
+            across, load = jnp.stack([-e[k, 1], e[k, 0]]), dry.coefficient[pairs[k, 0]] * normal[k]
+            speed = jnp.abs(jnp.dot(e[k], rates[own]))
+            size = load / step[k] + speed + jnp.finfo(b.dtype).tiny
+            sideways = (load * (across @ W[own])).at[own].add(speed * across) / size
+            asked = -load * jnp.dot(across, b[own]) / size
+            rows = jnp.outer(e[k], e[k] @ matrix[own]) + jnp.outer(across, sideways)
+            matrix = matrix.at[own].set(jnp.where(slides[k], rows, matrix[own]))
+            right = right.at[own].set(jnp.where(slides[k], e[k] * jnp.dot(e[k], right[own]) + across * asked, right[own]))
+        return e, jnp.linalg.solve(matrix, right)
+
+    e, x = lax.fori_loop(0, _CORRECTIONS, correct, (e, x))
+    e, rates = direction(e, x), (W @ x + b)[both]
+    aside, back = jnp.abs(e[:, 0] * x[both[:, 1]] - e[:, 1] * x[both[:, 0]]), jnp.sum(e * rates, axis=1)
+    wrong = (aside > _ASIDE * jnp.max(jnp.abs(x))) | (back < -_ASIDE * jnp.max(jnp.abs(b)))
+    found = with_slips(e)
+    return found._replace(solvable=found.solvable & ~jnp.any(slides & wrong) & jnp.all(jnp.isfinite(x)))
+
+
+def _in_lines(W, b, dry, among):
     m = len(dry.contacts)
     n, none = b.size - m, jnp.zeros((), b.dtype)
     scale = jnp.where(among, _scale(W), 1.0)

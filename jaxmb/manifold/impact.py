@@ -30,7 +30,9 @@ from ..linalg.complementarity import (
     Dry,
     frictional,
     laws_of,
+    of_pairs,
     positive_components,
+    slip_direction,
     solved_components,
 )
 from ..linalg.rotations import norm
@@ -38,6 +40,7 @@ from ..solvers import AbstractGuards
 from ..solvers.events import narrowed
 from ..system import AbstractEquation
 from ..system.gaps import (
+    BEGUN,
     CLOSED,
     FORWARD,
     FREE,
@@ -53,8 +56,10 @@ from ..system.gaps import (
     direction_rows,
     frictions_of,
     gaps,
+    kinds_of,
     mode_places,
     modes_of,
+    pairs_of,
     with_modes,
 )
 from ..system.residuals import binding_velocities, velocity_rows
@@ -65,6 +70,11 @@ from .impulse import after_impulse
 _NEAR = 1e2
 # The state moves by less than this multiple of it until then.
 _FAR = 1e6
+# Slip in two directions, which has none at rest, ends at this multiple of it per second: errors of integration, that
+# are larger than it, turn slower ones. Slip that begins has the direction of its modes up to a multiple of that.
+_SLOW, _SEEN = 1e4, 4
+# Modes of slip are longer than this, and those of slip that has begun shorter.
+_HALFWAY = 0.75
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e3
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
@@ -100,9 +110,10 @@ class ContactGuards(AbstractGuards):
             acts = modes == CLOSED
         else:
             acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] == STICK])
-            slips = jnp.abs(modes[n:]) == FORWARD
-            slip = modes[n:] * direction_rates(system, t, q, y.u)[n:]
+            rates = direction_rates(system, t, q, y.u)
+            slips, slip = jnp.abs(modes[n:]) == FORWARD, modes[n:] * rates[n:]
             free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
+            free = self._of_pairs(free, modes, rates, y.u)
 
         def forces():
             own = system.at(y)
@@ -115,6 +126,21 @@ class ContactGuards(AbstractGuards):
 
         held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
         return jnp.where(acts, held, free / system.length)
+
+    def _of_pairs(self, free, modes, rates, u):
+        """With the guards of slip in two directions: that it has not turned by more than 60 degrees from its modes, nor
+        is slow; where it has begun, that it is neither back at rest nor faster.
+        """
+        own = pairs_of(self.system)
+        if not own.size:
+            return free
+        length = self.system.length
+        slow, size, speed = _slow(self.system, self.touch * length, u), norm(modes[own]), norm(rates[own])
+        along = jnp.sum(modes[own] * rates[own], axis=1)
+        has_begun, slides = (size > 0) & (size < _HALFWAY), (size > _HALFWAY) & (size < STICK)
+        turned = jnp.where(has_begun, along / BEGUN, jnp.where(slides, along - 0.5 * speed, length))
+        fast = jnp.where(has_begun, _SEEN * slow - speed, jnp.where(slides, speed - slow, length))
+        return free.at[own].set(jnp.stack([turned, fast], axis=1))
 
     def impact(self, t: Scalar, y: State, dated: bool = False) -> "Impact":
         """The event at a state; see `impact`."""
@@ -138,7 +164,16 @@ def _reserve(system, t, q, u, multipliers):
     """By how much the forces [N] of friction that sticks are within their limits."""
     frictions = frictions_of(system)
     normal = norm(system.friction_reactions(t, q, u, multipliers))
-    return frictions.limit * normal - jnp.abs(multipliers[np.array(frictions.rows)])
+    forces = jnp.abs(multipliers[np.array(frictions.rows)])
+    return frictions.limit * normal - _sizes(frictions.pairs, forces)
+
+
+def _sizes(pairs, values):
+    """The sizes of what friction in one direction has, and of both where it has two."""
+    if not pairs:
+        return jnp.abs(values)
+    own = of_pairs(pairs)
+    return jnp.abs(values).at[own].set(norm(values[own])[:, None], unique_indices=True)
 
 
 def _coefficients(system, t, q, u):
@@ -239,7 +274,8 @@ def impact(
     """
     t = jnp.asarray(t, y.q.dtype)
     after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype), dated)
-    return Impact(after, event.late, event.impulses, event.modes, event.rest, event.energy, event.solvable)
+    modes = tuple(kinds_of(system, modes) for modes in event.modes)
+    return Impact(after, event.late, event.impulses, modes, event.rest, event.energy, event.solvable)
 
 
 @eqx.filter_custom_jvp
@@ -272,8 +308,14 @@ def _impact_jvp(primals, tangents):
     rate = direction_rates(system, t, y.q, event.at)
     if m:
         slip = push(direction_rates, (system, t, y.q, y.u), (dsystem, dt, dq, du))[n:]
-        zero = jnp.concatenate([zero, slip])
-        rate = rate.at[n:].set(direction_accelerations(system, t, y.q, event.at, event.before)[n:])
+        slowing = direction_accelerations(system, t, y.q, event.at, event.before)[n:]
+        own = of_pairs(frictions_of(system).pairs)
+        if own.size:
+            # Slip in two directions ends where it is zero along its modes.
+            along = event.modes[0][n:][own]
+            slip = slip.at[own[:, 0]].set(jnp.sum(along * slip[own], axis=1), unique_indices=True)
+            slowing = slowing.at[own[:, 0]].set(jnp.sum(along * slowing[own], axis=1))
+        zero, rate = jnp.concatenate([zero, slip]), rate.at[n:].set(slowing)
     dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
     if dated or (m and any(frictions_of(system).releases)):
         dlate = dlate + _release(system, formulation, touch, event, (t, y), (dsystem, dt, dy))
@@ -316,6 +358,15 @@ def _impact_jvp(primals, tangents):
         more = jnp.concatenate([more[:n], -coefficient * event.slips * normal])
         for k in np.flatnonzero(of_contact):
             law = law.at[n + k, frictions.contacts[k]].set(known[k] * event.slips[k])
+        for k in frictions.pairs:
+            # The direction of slip changes with the velocity after the impact.
+            own, of_q = np.array([k, k + 1]), (dsystem, dt, dq)
+            turned = push(lambda *at: direction_rates(*at, event.u)[n + own], (system, t, y.q), of_q)
+            last, speed = direction_rates(system, t, y.q, event.u)[n + own], norm(event.slips[own])
+            across = jnp.eye(2, dtype=q.dtype) - jnp.outer(event.slips[own], event.slips[own])
+            by = known[k] * normal[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
+            law = law.at[n + own].add(by @ rows[n + own] @ moves.T, unique_indices=True)
+            more = more.at[n + own].add(-by @ (turned + rows[n + own] @ plain), unique_indices=True)
     matrix = jnp.where(event.held[:, None], rows @ moves.T, law)
     impulses = jnp.linalg.solve(matrix, jnp.where(event.held, asked, more))
     change = plain + impulses @ moves
@@ -400,6 +451,25 @@ def _without_jvp(primals, tangents):
     )
 
 
+def _of_both(pairs, modes, rates, curve, slow, single):
+    """Which friction may come to rest, how fast it slips, and how fast that changes, with that in two directions, of
+    which the first number is that of both, along the modes.
+    """
+    own = of_pairs(pairs)
+    size = norm(modes[own])
+    along = modes[own] / jnp.where(size > 0, size, 1.0)[:, None]
+    may = (size > 0) & (size < STICK) & (norm(rates[own]) <= 2 * slow)
+    both = may, jnp.sum(along * rates[own], axis=1), jnp.sum(along * curve[own], axis=1)
+    # The second number says nothing.
+    pairwise = lambda new, old: old.at[own].set(jnp.stack([new, jnp.zeros_like(new)], axis=1))
+    return tuple(map(pairwise, both, single))
+
+
+def _slow(system, touch, u):
+    """The velocity [m/s] up to which slip in two directions has ended; `touch` [m, rad]."""
+    return _SLOW * touch * (1 + jnp.max(jnp.abs(u) / system.velocity_scale()))
+
+
 def _event(system, formulation, touch, t, y) -> _Event:
     """An event at a state; `touch` [m, rad]."""
     contacts, q, u = contacts_of(system), y.q, y.u
@@ -431,10 +501,12 @@ def _event(system, formulation, touch, t, y) -> _Event:
         reactions = lambda own: system.friction_reactions(t, q, u, own)
         return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
 
+    slow = _slow(system, touch, u)
+
     # What is next, of the equations before.
     udot, opening, reactions = accelerated(u)
-    before = udot + laws.forces(opening, reactions, laws.of_modes(modes)) @ moves
     rates = direction_rates(system, t, q, u)
+    before = udot + laws.forces(opening, reactions, laws.of_modes(modes, rates)) @ moves
     gap, closing = gaps(system, t, q), rates[:n]
     about_to = (modes[:n] == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
     # The first zero of a parabola.
@@ -443,7 +515,11 @@ def _event(system, formulation, touch, t, y) -> _Event:
     until = 2 * gap / (root + jnp.where(about_to, -closing, 1.0))
     if m:
         slip, slowing = modes[n:] * rates[n:], modes[n:] * curve[n:]
-        ends = (jnp.abs(modes[n:]) == FORWARD) & (slip <= _NEAR * touch) & (slowing < 0)
+        slides = jnp.abs(modes[n:]) == FORWARD
+        if laws.pairs:
+            single = slides, slip, slowing
+            slides, slip, slowing = _of_both(laws.pairs, modes[n:], rates[n:], curve[n:], slow, single)
+        ends = slides & (slip <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch)) & (slowing < 0)
         until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
         about_to = jnp.concatenate([about_to, ends])
     # A zero that is far off in time, since rates are rounding errors, is none.
@@ -487,35 +563,40 @@ def _event(system, formulation, touch, t, y) -> _Event:
         sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
         resting = touching & ((rate[:n] <= _REST * sizes[:n]) | low)
         # Slip that is not to be seen has ended.
-        ended = (jnp.abs(rate[n:]) <= _REST * sizes[n:]) | (jnp.abs(rate[n:]) <= _NEAR * touch)
-        slips = jnp.where(ended, 0.0, jnp.sign(rate[n:]))
+        speed = laws.sizes(rate[n:])
+        ended = (speed <= _REST * laws.sizes(sizes[n:])) | (speed <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch))
+        slips = jnp.where(ended, 0.0, rate[n:] / jnp.where(ended, 1.0, speed))
         answers = laws.decided(opening, reactions, resting, slips, modes, before.forces)
         forces = laws.forces(opening, reactions, answers)
         ok = solvable & answers.solvable
         share = before.trial.share
         return _Settled(
-            low, rest, struck, impulses, after, rate, udot, opening, resting, answers, forces, ok, trial, share
+            low, rest, struck, impulses, after, rate, udot, opening, resting, ended, answers, forces, ok, trial, share
         )
 
     none = jnp.zeros(n + m, q.dtype)
     no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True))
     one, yes = jnp.ones((), q.dtype), jnp.array(True)
     trial = _Trial(one, 0 * one, one, 0 * one, one, jnp.array(False))
-    nothing = _Settled(none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, no, none, yes, trial, one)
+    nothing = _Settled(
+        none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, none[n:] > 0, no, none, yes, trial, one
+    )
     going = lambda carry: (carry[0] < _ROUNDS) | (carry[1].trial.again & (carry[0] < _ROUNDS + _TRIALS))
     advance = lambda carry: (carry[0] + 1, settle(*carry))
     _, settled = lax.while_loop(going, advance, (jnp.array(0), nothing))
-    low, rest, struck, impulses, after, rate, udot, _, staying, last, forces, solvable, _, share = settled
+    low, rest, struck, impulses, after, rate, udot, _, staying, ended, last, forces, solvable, _, share = settled
     held = struck.closed | low
 
     implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
     new = jnp.where(last.closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
-    new = jnp.concatenate([new, jnp.where(last.sticks, STICK, last.slips)]).astype(q.dtype)
+    new = jnp.concatenate([new, jnp.where(last.sticks, STICK, laws.begun(ended) * last.slips)]).astype(q.dtype)
     if m:
         # Slips that have ended are zero to all digits.
-        held = jnp.concatenate([held | last.closed, last.sticks | struck.sticks])
-        left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(last.sticks, rate[n:], 0.0)])
-        cancelled = held & jnp.concatenate([staying, last.sticks])
+        # Slip in two directions begins at rest.
+        rests = last.sticks | (laws.are_pairs & ended & (last.slips != 0))
+        held = jnp.concatenate([held | last.closed, rests | struck.sticks])
+        left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(rests, rate[n:], 0.0)])
+        cancelled = held & jnp.concatenate([staying, rests])
     else:
         left, cancelled = jnp.where(staying, rate, 0.0), held & low
     held = held & _independent(influence, held)
@@ -581,6 +662,7 @@ class _Settled(NamedTuple):
     udot: Float[Array, "nu"]
     opening: Float[Array, "laws"]
     resting: Bool[Array, "contacts"]
+    ended: Bool[Array, "frictions"]
     answers: Answers
     forces: Float[Array, "laws"]
     solvable: Bool[Array, ""]
@@ -600,11 +682,32 @@ class _Laws(NamedTuple):
     coefficient: Float[Array, "m"]
     limit: Float[Array, "m"]
 
-    def of_modes(self, modes) -> Answers:
-        """Which laws hold in some modes."""
-        dry = modes[self.n :]
+    def of_modes(self, modes, rates) -> Answers:
+        """Which laws hold in some modes, and at some rates of gaps and slips."""
+        dry, slip = modes[self.n :], rates[self.n :]
         slips = jnp.where(jnp.abs(dry) == FORWARD, dry, FREE)
+        if self.pairs:
+            own = of_pairs(self.pairs)
+            slips = slips.at[own].set(jax.vmap(slip_direction)(dry[own], slip[own]))
         return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True))
+
+    @property
+    def pairs(self) -> tuple[int, ...]:
+        """The numbers of the first directions of those friction that has two."""
+        return self.frictions.pairs if self.m else ()
+
+    def sizes(self, values):
+        """The sizes of what friction in one direction has, and of both where it has two."""
+        return _sizes(self.pairs, values)
+
+    @property
+    def are_pairs(self) -> np.ndarray:
+        """Which laws are of friction in two directions."""
+        return np.isin(np.arange(self.m), of_pairs(self.pairs))
+
+    def begun(self, ended):
+        """The length of the modes of slip, which begins where it had ended."""
+        return jnp.where(self.are_pairs & ended, BEGUN, 1.0)
 
     @property
     def of_joints(self) -> np.ndarray:
@@ -663,7 +766,7 @@ class _Laws(NamedTuple):
             return Answers(closed, none > 0, none, solvable)
         # Friction that has just reached its limit is beyond it up to rounding errors.
         limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REST, 1.0)
-        coefficient, bounds = jnp.where(slips == 0, limit, self.coefficient), none
+        coefficient, bounds = jnp.where(self.sizes(slips) == 0, limit, self.coefficient), none
         if self.of_joints.any():
             normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
             bounds = jnp.where(self.of_joints, coefficient * normal, 0.0)
@@ -677,7 +780,7 @@ class _Laws(NamedTuple):
         return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.frictions.contacts])
 
     def _dry(self, coefficient, slips, bound) -> Dry:
-        return Dry(self.frictions.contacts, coefficient, slips, bound)
+        return Dry(self.frictions.contacts, self.pairs, coefficient, slips, bound)
 
 
 def _independent(influence, among):

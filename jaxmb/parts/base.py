@@ -309,13 +309,15 @@ class AbstractLink(AbstractActor):
         """Hook: the parts that it consists of, by default itself; called after the numbers have been filled in."""
         return (self,)
 
-    def scalar_coordinates(self, parts: Mapping[str, "AbstractLink"]) -> tuple[ScalarCoordinate, ...]:
-        """Hook: the scalar coordinates that the part adds, from all parts of the scene by name.
+    def scalar_coordinates(
+        self, space: AbstractSpace, parts: Mapping[str, "AbstractLink"]
+    ) -> tuple[ScalarCoordinate, ...]:
+        """Hook: the scalar coordinates that the part adds, from all joints of the scene by name.
 
         Its kernel sees each as one body more than `bodies`, after these, of which the first entry of the pose is the
         coordinate.
         """
-        del parts
+        del space, parts
         return ()
 
     def anchor(self, k: int) -> Array | None:

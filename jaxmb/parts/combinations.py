@@ -140,7 +140,8 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     def combined(self):
         return (self.coordinate,)
 
-    def scalar_coordinates(self, parts):
+    def scalar_coordinates(self, space, parts):
+        del space, parts
         length = is_length(self.coordinate.partition(".")[2])
         name = f"{self.name}.{'displacement' if length else 'angle'}"
         return (ScalarCoordinate(name, is_length=length, moves=True),)
@@ -186,7 +187,8 @@ class FixedTendon(AbstractCombination, AbstractTendon):
     def rows(self):
         return len(self._periodic)
 
-    def scalar_coordinates(self, parts):
+    def scalar_coordinates(self, space, parts):
+        del space
         split = [name.partition(".") for name in self.along]
         periodic = (own in parts[joint].periodic if joint in parts else False for joint, _, own in split)
         return tuple(ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, own in enumerate(periodic) if own)

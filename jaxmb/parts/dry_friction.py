@@ -6,9 +6,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..linalg.complementarity import slip_direction
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractVelocityConstraint, Poses, ScalarCoordinate, Velocities, Wrenches
@@ -21,7 +23,7 @@ _STICK = 2
 
 
 class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
-    """Coulomb friction in a joint or a rigid contact, along one direction of slip.
+    """Coulomb friction in a joint or a rigid contact, along one direction of slip, or two in a contact in space.
 
     Subclasses define the velocity of `slip`. The scene has one coordinate, one velocity and one row more for each: its
     mode, `"rub.mode"`, which is 2 where it sticks, 1 or -1 where it slips forwards or backwards, and 0 before the
@@ -29,15 +31,22 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     `static_coefficient` times the normal force; where it slips, the force is `coefficient` times the normal force,
     against the slip. `simulate` finds the times at which one turns into the other.
 
+    In a contact in space all of these are two, along two tangents. Its modes `"rub.mode_1"` and `"rub.mode_2"` are both
+    2 where it sticks, and where it slips the components of a unit vector near the direction of slip, or of half of one
+    where slip has begun from rest and is not to be seen yet.
+
     **Fields:** `joint`, its name; `coefficient` μ ≥ 0 of slip; `static_coefficient` ≥ μ of stick, default μ.
     """
 
     joint: str = fields.name()
     coefficient: fields.Number = fields.parameter(sign="non-negative", constant=True)
     static_coefficient: fields.Number = fields.parameter(sign="non-negative", optional=True, constant=True)
-    rows: ClassVar[int] = 1
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
+
+    @property
+    def rows(self) -> int:
+        return 1
 
     @property
     def sources(self):
@@ -60,13 +69,14 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
                 f"and {self.coefficient}."
             )
 
-    def scalar_coordinates(self, parts):
-        del parts
+    def scalar_coordinates(self, space, parts):
+        if space.dimension == 3 and isinstance(parts.get(self.joint), AbstractRigidContact):
+            return tuple(ScalarCoordinate(f"{self.name}.mode_{k}", moves=True) for k in (1, 2))
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
 
     @abc.abstractmethod
-    def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, ""]:
-        """The velocity of slip [m/s], from poses and velocities of the bodies of the joint."""
+    def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
+        """The velocities of slip [m/s], from poses and velocities of the bodies of the joint."""
 
     def normal_force(self, space: AbstractSpace, poses: Poses, reactions: Wrenches) -> Float[Array, ""]:
         """The normal force [N], from the reactions of the joint on its bodies: the size of the force of a joint, and
@@ -80,30 +90,28 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         del t
-        slip, mode = self._slip(space, poses, velocities), velocities[-1, 0]
-        return jnp.where(self._kind(poses) == _STICK, slip, mode)[None]
+        slip, modes = self._slip(space, poses, velocities), velocities[-self.rows :, 0]
+        return jnp.where(jnp.round(self._modes(poses)) == _STICK, slip, modes)
 
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: float
     ) -> Wrenches:
         """The wrench of slip on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
         del t
-        kind = self._kind(poses)
-        direction = jnp.where(kind == _STICK, 0.0, kind)
-        normal = self.normal_force(space, poses, reactions)
-        along = jax.jacfwd(lambda v: self._slip(space, poses, v))(velocities)
-        return -self.coefficient * normal * direction * along
+        slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
+        force = self.coefficient * self.normal_force(space, poses, reactions)
+        return pull(-force * slip_direction(self._modes(poses), slip))[0]
 
     def _slip(self, space, poses, velocities):
         at = jnp.array(self.places[0])
         return self.slip(space, poses[at], velocities[at])
 
-    def _kind(self, poses):
-        return lax.stop_gradient(jnp.round(poses[-1, 0]))
+    def _modes(self, poses):
+        return lax.stop_gradient(poses[-self.rows :, 0])
 
 
 class DryFriction(AbstractDryFriction):
-    """Coulomb friction in a joint with one coordinate, or in a rigid contact in the plane, which sticks exactly.
+    """Coulomb friction in a joint with one coordinate, or in a rigid contact, which sticks exactly.
 
     ```python
     jaxmb.DryFriction("rub", "slide", coefficient=0.3, static_coefficient=0.4)
@@ -112,10 +120,14 @@ class DryFriction(AbstractDryFriction):
     The slip of a joint is the rate of its displacement, or `radius` times that of its angle; the normal force is the
     size of the joint's reaction force, in which moments do not count. The slip of a contact (`RigidContact`,
     `RigidBallContact`, `RigidPlaneContact`, `RigidBoxContact`) is the velocity of the last body against the other one
-    where they touch, along the tangent that is the outward normal turned clockwise, so that on level ground it points
-    along x; the normal force is that of the contact. In an impact the friction of the contacts has an impulse of at
-    most `static_coefficient` times theirs where slip ends, and of `coefficient` times theirs where it does not; that
-    of joints has none.
+    where they touch: in the plane along the tangent that is the outward normal turned clockwise, so that on level
+    ground it points along x; in space in the tangent plane, where the force has the direction of the slip (there is no
+    moment against a spin about the normal). The normal force is that of the contact. In an impact the friction of the
+    contacts has an impulse of at most `coefficient` times theirs, and just that where slip does not end; friction of
+    joints has none.
+
+    Contacts in space that stick at the same time must not determine each other's slip, as the feet of a table do: the
+    run ends there with a failure that names them.
 
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 
@@ -132,11 +144,16 @@ class DryFriction(AbstractDryFriction):
 
     radius: fields.Number = fields.length(sign="positive", optional=True)
     within: str = eqx.field(static=True, default_factory=str, init=False)
+    pole: int | None = eqx.field(static=True, default=None, init=False)
+
+    @property
+    def rows(self):
+        return 1 if self.pole is None else 2
 
     def complete(self, space, poses):
         held = self.joints["0"]
         if isinstance(held, AbstractUnilateralConstraint):
-            return self._of_contact(space, held)
+            return self._of_contact(space, held, poses)
         coordinates = self.coordinates_of(0, space, poses)
         numbers = [name for name, value in coordinates.items() if value.size == 1]
         if len(coordinates) != 1 or len(numbers) != 1:
@@ -150,21 +167,27 @@ class DryFriction(AbstractDryFriction):
             raise ValueError(f"{self.label}: {held.label} {needs}.")
         return self.with_fields(within=within)
 
-    def _of_contact(self, space, held):
-        if space.dimension == 3:
-            raise ValueError(f"{self.label}: friction of rigid contacts is planar; use a compliant contact in space.")
+    def _of_contact(self, space, held, poses):
         if self.radius is not None:
             raise ValueError(f"{self.label}: {held.label} slides and has no radius.")
         if not isinstance(held, AbstractRigidContact):
             raise ValueError(f"{self.label}: {held.label} has no point at which bodies touch, and no friction.")
-        return self
+        if space.dimension == 2:
+            return self
+        seen = jnp.asarray(held.seen_poses(space, poses[: len(held.bodies)]))
+        normal = held.outward(space, seen)
+        if len(held.bodies) == 2:
+            normal = space.body_direction(seen[0], normal)
+        # The axis nearest to the normal.
+        k = int(np.argmax(np.abs(normal)))
+        return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
 
     def slip(self, space, poses, velocities):
         held = self.joints["0"]
         if isinstance(held, AbstractRigidContact):
             bodies = len(held.bodies)
-            return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]))
+            return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]), self.pole)
         rates = jax.vmap(space.rates)(poses, velocities)
         value = lambda x: held.coordinates_at(space, x)[self.within].reshape(())
-        rate = jax.jvp(value, (poses,), (rates,))[1]
+        rate = jax.jvp(value, (poses,), (rates,))[1][None]
         return rate if self.radius is None else self.radius * rate

@@ -54,8 +54,8 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
         if not self.restitution <= 1:
             raise ValueError(f"{self.label}: restitution must lie between 0 and 1, got {self.restitution}.")
 
-    def scalar_coordinates(self, parts):
-        del parts
+    def scalar_coordinates(self, space, parts):
+        del space, parts
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
 
     @abc.abstractmethod
@@ -137,17 +137,41 @@ class AbstractRigidContact(AbstractGeometricContact):
         out = jax.grad(moved)(poses[-1, : space.dimension])
         return out / norm(out)
 
-    def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, ""]:
-        """The velocity [m/s] of the last body, against that of the other one or of the world, at the point where they
-        touch, along the normal turned clockwise; in the plane.
+    def tangents(self, space: AbstractSpace, poses: Poses, pole: int | None = None) -> Float[Array, "n d"]:
+        """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two, which
+        turn as the normal does from an axis of the first of two bodies, or of the world.
+
+        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it. The normal must not be opposite to it.
         """
-        point, normal = self.touching(space, poses), self.outward(space, poses)
+        normal = self.outward(space, poses)
+        if pole is None:
+            return jnp.stack([normal[1], -normal[0]])[None]
+        first = poses[0] if len(poses) == 2 else None
+        if first is not None:
+            normal = space.body_direction(first, normal)
+        axes = jnp.eye(3, dtype=normal.dtype)
+        k = abs(pole) - 1
+        upwards = np.sign(pole) * axes[k]
+        # The smallest turn from the pole to the normal.
+        turned = [
+            axis - jnp.dot(normal, axis) / (1 + jnp.dot(normal, upwards)) * (upwards + normal)
+            for axis in (axes[(k + 1) % 3], axes[(k + 2) % 3])
+        ]
+        return jnp.stack([v if first is None else space.direction(first, v) for v in turned])
+
+    def slip(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, pole: int | None = None
+    ) -> Float[Array, "n"]:
+        """The velocity [m/s] of the last body, against that of the other one or of the world, at the point where they
+        touch, along the `tangents`.
+        """
+        point = self.touching(space, poses)
 
         def velocity(k):
             return space.point_velocity(poses[k], velocities[k], space.body_point(poses[k], point))
 
         relative = velocity(-1) - velocity(0) if len(poses) == 2 else velocity(-1)
-        return normal[1] * relative[0] - normal[0] * relative[1]
+        return self.tangents(space, poses, pole) @ relative
 
 
 class RigidContact(AbstractRigidContact):

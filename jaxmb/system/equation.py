@@ -43,12 +43,13 @@ class Ranks(eqx.Module):
 class Frictions(eqx.Module):
     """The dry friction of a system, which sticks or slips.
 
-    Each has a row of A and a coordinate of its own, its mode, as a contact has. The row says `slip = 0` where it
-    sticks.
+    Each direction of slip has a row of A and a coordinate of its own, its mode, as a contact has. The row says
+    `slip = 0` where it sticks.
 
-    **Fields:** their `names`; for each the number of its `rows` of A, among those of velocities, the index of its mode
-    in q, `modes`, and the number of its contact in `contacts`, -1 in a joint; the `coefficient` of slip, and the
-    `limit`, that of stick; `releases`: whether these differ, so that accelerations jump where slip begins. Static.
+    **Fields:** for each direction the `names`; the number of its row of A, among those of velocities, in `rows`; the
+    index of its mode in q, `modes`; the number of its contact in `contacts`, -1 in a joint; the `coefficient` of slip,
+    and the `limit`, that of stick; `releases`: whether these differ, so that accelerations jump where slip begins.
+    `pairs`: the numbers of the first directions of those friction that has two, one after the other. Static.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -56,6 +57,7 @@ class Frictions(eqx.Module):
     modes: tuple[int, ...] = eqx.field(static=True)
     contacts: tuple[int, ...] = eqx.field(static=True)
     releases: tuple[bool, ...] = eqx.field(static=True)
+    pairs: tuple[int, ...] = eqx.field(static=True)
     coefficient: Float[Array, "frictions"]
     limit: Float[Array, "frictions"]
 

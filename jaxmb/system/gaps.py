@@ -8,15 +8,19 @@ forces act: normal to a contact, along the slip of friction.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, Velocities
+from ..linalg.complementarity import of_pairs
+from ..linalg.rotations import norm
 from .equation import AbstractEquation, Contacts, Frictions
 
 # Modes of a contact: open; closed; closed, where others that are closed as well imply it and take the force.
 OPEN, CLOSED, IMPLIED = 0, 1, 2
-# Modes of dry friction: without a force; slip along its direction, and against it; stick.
+# Modes of dry friction: without a force; slip along its direction, and against it; stick. Those of friction with two
+# directions that slips are the components of a vector of length one, or `BEGUN` where slip has just begun.
 FREE, FORWARD, BACKWARD, STICK = 0, 1, -1, 2
+BEGUN = 0.5
 
 
 def contacts_of(system: AbstractEquation) -> Contacts:
@@ -33,13 +37,13 @@ def frictions_of(system: AbstractEquation) -> Frictions:
 
 
 def counts(system: AbstractEquation) -> tuple[int, int]:
-    """The numbers of contacts and of dry frictions."""
+    """The numbers of contacts and of the directions of dry friction."""
     contacts = contacts_of(system)
     return len(contacts.names), 0 if contacts.frictions is None else len(contacts.frictions.names)
 
 
 def names_of(system: AbstractEquation) -> tuple[str, ...]:
-    """The names of contacts and friction."""
+    """The names of contacts and friction, one for each direction."""
     contacts = contacts_of(system)
     return contacts.names + (() if contacts.frictions is None else contacts.frictions.names)
 
@@ -51,8 +55,27 @@ def mode_places(system: AbstractEquation) -> np.ndarray:
 
 
 def modes_of(system: AbstractEquation, q: Coordinates) -> Float[Array, "laws"]:
-    """The modes of contacts and friction in some coordinates, whole numbers."""
-    return jnp.round(q[mode_places(system)])
+    """The modes of contacts and friction in some coordinates; whole numbers but for slip in two directions."""
+    modes, own = q[mode_places(system)], pairs_of(system)
+    if not own.size:
+        return jnp.round(modes)
+    return jnp.where(np.isin(np.arange(modes.size), own), modes, jnp.round(modes))
+
+
+def kinds_of(system: AbstractEquation, modes: Float[Array, "laws"]) -> Float[Array, "laws"]:
+    """The modes as whole numbers: of friction that slips in two directions 1."""
+    own = pairs_of(system)
+    if not own.size:
+        return modes
+    sizes = norm(modes[own])
+    kinds = jnp.where(sizes > STICK, STICK, jnp.where(sizes > 0, FORWARD, FREE)).astype(modes.dtype)
+    return modes.at[own].set(kinds[:, None])
+
+
+def pairs_of(system: AbstractEquation) -> Int[np.ndarray, "pairs 2"]:
+    """The numbers of both directions of friction with two of them, among contacts and friction."""
+    frictions = contacts_of(system).frictions
+    return counts(system)[0] + of_pairs(() if frictions is None else frictions.pairs)
 
 
 def are_open(system: AbstractEquation, q: Coordinates) -> Bool[Array, "contacts"]:
