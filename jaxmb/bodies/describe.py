@@ -48,7 +48,11 @@ def describe_scene(system: Any) -> Description:
         "contacts": [
             *((kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)),
             *(
-                (kind(g), shorten(g.group.names), f"of {shorten(g.joints)}, where it sticks {g.rows} row{'s' * (g.rows > 1)} each")
+                (
+                    kind(g),
+                    shorten(g.group.names),
+                    f"of {shorten(g.joints)}, where it sticks {g.rows} row{'s' * (g.rows > 1)} each",
+                )
                 for g in frictions
             ),
         ],

@@ -325,8 +325,16 @@ class RigidBodySystem(AbstractSystem):
         coefficient, limit = (
             jnp.concatenate([_of_rows(getattr(p, own), n) for p, n in parts]) for own in ("coefficient", "limit")
         )
-        static = map(tuple, (names, rows, modes, of_contacts, releases, pairs))
-        return Frictions(*static, coefficient, limit)
+        return Frictions(
+            names=tuple(names),
+            rows=tuple(rows),
+            modes=tuple(modes),
+            contacts=tuple(of_contacts),
+            releases=tuple(releases),
+            pairs=tuple(pairs),
+            coefficient=coefficient,
+            limit=limit,
+        )
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):

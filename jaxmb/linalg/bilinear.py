@@ -76,7 +76,7 @@ class BilinearMap:
 
     def __call__(self, a: Float[Array, "*n j"], b: Float[Array, "*n k"]) -> Float[Array, "*n i"]:
         if namespace(a, b) is np:
-            return np.einsum("ijk,...j,...k->...i", self.table, a, b)
+            return np.einsum("ijk,...j,...k->...i", self.table.astype(np.result_type(a, b, np.float32)), a, b)
         return _apply(a, b, of=self)
 
 

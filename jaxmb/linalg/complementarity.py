@@ -26,6 +26,8 @@ _APART = 1e-10
 _TURN, _TURNS, _CORRECTIONS = 1e-4, 100, 4
 # Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
 _ASIDE = 1e-8
+# Several contacts that stick share forces that are not determined as if they yielded by this fraction of `W`.
+_YIELD = 1e-8
 
 
 def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
@@ -102,13 +104,15 @@ class Dry(NamedTuple):
 class Answers(NamedTuple):
     """Which laws hold: contacts that are `closed`; friction that `sticks`; the direction in which other friction
     `slips`, 1 or -1, of pairs the components of a unit vector, and 0 where there is no force; whether there is a
-    solution, and no contact that slips has two.
+    solution, and no contact that slips has two; friction of pairs that sticks as well, but is `implied` by others, to
+    which its force is given.
     """
 
     closed: Bool[Array, "n"]
     sticks: Bool[Array, "m"]
     slips: Float[Array, "m"]
     solvable: Bool[Array, ""]
+    implied: Bool[Array, "m"]
 
 
 def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among: Bool[Array, "n_m"]) -> Answers:
@@ -155,6 +159,9 @@ def _in_directions(W, b, dry, among):
     known, touches = dry.slips[pairs], among[both[:, 0]]
     may = touches & (known == 0).all(1)
     among = among.at[both[:, 1]].set(may)
+    rigid = W
+    if len(pairs) > 1:
+        W = W + _YIELD * jnp.max(jnp.diag(W)) * jnp.diag(np.isin(np.arange(n + m), both).astype(W.dtype))
     # The inverse of the largest change of a slip by its force, at most.
     step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
 
@@ -183,7 +190,7 @@ def _in_directions(W, b, dry, among):
     first = jnp.where(may[:, None], b[both], known) / jnp.where(size > 0, size, 1.0)[:, None]
     first = jnp.where(size[:, None] > 0, first, jnp.array([1.0, 0.0], b.dtype))
     nothing = jnp.zeros(m, b.dtype)
-    start = Answers(nothing[:0] > 0, nothing > 0, nothing, jnp.array(True))._replace(closed=jnp.zeros(n, bool))
+    start = Answers(jnp.zeros(n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
     start = first, start, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
     goes_on = lambda carry: (carry[3] > _TURN) & (carry[4] < _TURNS)
     e, answers, x, _, _ = lax.while_loop(goes_on, advance, start)
@@ -209,15 +216,40 @@ def _in_directions(W, b, dry, among):
             asked = -load * jnp.dot(across, b[own]) / size
             rows = jnp.outer(e[k], e[k] @ matrix[own]) + jnp.outer(across, sideways)
             matrix = matrix.at[own].set(jnp.where(slides[k], rows, matrix[own]))
-            right = right.at[own].set(jnp.where(slides[k], e[k] * jnp.dot(e[k], right[own]) + across * asked, right[own]))
+            right = right.at[own].set(
+                jnp.where(slides[k], e[k] * jnp.dot(e[k], right[own]) + across * asked, right[own])
+            )
         return e, jnp.linalg.solve(matrix, right)
 
     e, x = lax.fori_loop(0, _CORRECTIONS, correct, (e, x))
     e, rates = direction(e, x), (W @ x + b)[both]
     aside, back = jnp.abs(e[:, 0] * x[both[:, 1]] - e[:, 1] * x[both[:, 0]]), jnp.sum(e * rates, axis=1)
     wrong = (aside > _ASIDE * jnp.max(jnp.abs(x))) | (back < -_ASIDE * jnp.max(jnp.abs(b)))
-    found = with_slips(e)
+    found = with_slips(e) if len(pairs) == 1 else _with_implied(rigid, with_slips(e))
     return found._replace(solvable=found.solvable & ~jnp.any(slides & wrong) & jnp.all(jnp.isfinite(x)))
+
+
+def _with_implied(W, answers):
+    """With as many laws of stick as are independent of each other and of the contacts."""
+    n, sticks = answers.closed.size, answers.sticks
+    closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
+    columns = jnp.where(closed[:, None], W, 0.0)
+    matrix = jnp.where(closed[:, None] & closed[None, :], W, jnp.eye(W.shape[0], dtype=W.dtype))
+    left = (W - columns.T @ jnp.linalg.solve(matrix, columns))[n:, n:]
+    own = independent_components(left, sticks)
+    return answers._replace(sticks=own, implied=sticks & ~own)
+
+
+def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> Bool[Array, "k"]:
+    """Some components whose columns are independent, of which those of all others among some are combinations; for a
+    positive semidefinite W; without derivative.
+    """
+    W, among = lax.stop_gradient((W, among))
+    both = among[:, None] & among[None, :]
+    # What must be cancelled in a random direction is nearly always cancelled by a basis.
+    asked = -jnp.where(both, W, 0.0) @ (1 + jnp.arange(among.size, dtype=W.dtype))
+    matrix = jnp.where(both, W, jnp.eye(among.size, dtype=W.dtype))
+    return positive_components(matrix, jnp.where(among, asked, 1.0))[0]
 
 
 def _in_lines(W, b, dry, among):
@@ -270,7 +302,8 @@ def _in_lines(W, b, dry, among):
     force = among[n:] & pressed
     sticks = force & may & inside & ~backward
     direction = jnp.where(may, jnp.where(backward, -1.0, 1.0), dry.slips)
-    return Answers(closed & ~idle, sticks, jnp.where(force & ~sticks, direction, 0.0), solvable & unique)
+    slips = jnp.where(force & ~sticks, direction, 0.0)
+    return Answers(closed & ~idle, sticks, slips, solvable & unique, jnp.zeros(m, bool))
 
 
 def laws_of(

@@ -29,6 +29,7 @@ from ..linalg.complementarity import (
     Answers,
     Dry,
     frictional,
+    independent_components,
     laws_of,
     of_pairs,
     positive_components,
@@ -45,6 +46,7 @@ from ..system.gaps import (
     FORWARD,
     FREE,
     IMPLIED,
+    IMPLIED_STICK,
     OPEN,
     STICK,
     bound,
@@ -75,6 +77,8 @@ _FAR = 1e6
 _SLOW, _SEEN = 1e4, 4
 # Modes of slip are longer than this, and those of slip that has begun shorter.
 _HALFWAY = 0.75
+# Forces of several contacts that stick are as small as they can be up to this fraction of them.
+_YIELD = 1e-10
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e3
 # Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
@@ -109,7 +113,7 @@ class ContactGuards(AbstractGuards):
         if frictions is None:
             acts = modes == CLOSED
         else:
-            acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] == STICK])
+            acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] >= STICK])
             rates = direction_rates(system, t, q, y.u)
             slips, slip = jnp.abs(modes[n:]) == FORWARD, modes[n:] * rates[n:]
             free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
@@ -164,7 +168,16 @@ def _reserve(system, t, q, u, multipliers):
     """By how much the forces [N] of friction that sticks are within their limits."""
     frictions = frictions_of(system)
     normal = norm(system.friction_reactions(t, q, u, multipliers))
-    forces = jnp.abs(multipliers[np.array(frictions.rows)])
+    forces = multipliers[np.array(frictions.rows)]
+    if len(frictions.pairs) > 1:
+        # Those that are not determined are as small as they can be.
+        n = counts(system)[0]
+        stick = modes_of(system, q)[n:] >= STICK
+        gradients = jnp.where(stick[:, None], direction_gradients(system, t, q, u)[n:], 0.0)
+        gram = gradients @ gradients.T
+        size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
+        shared = jnp.linalg.solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ forces)
+        forces = jnp.where(stick, shared, forces)
     return frictions.limit * normal - _sizes(frictions.pairs, forces)
 
 
@@ -274,7 +287,7 @@ def impact(
     """
     t = jnp.asarray(t, y.q.dtype)
     after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype), dated)
-    modes = tuple(kinds_of(system, modes) for modes in event.modes)
+    modes = kinds_of(system, event.modes[0]), kinds_of(system, event.modes[1])
     return Impact(after, event.late, event.impulses, modes, event.rest, event.energy, event.solvable)
 
 
@@ -358,10 +371,11 @@ def _impact_jvp(primals, tangents):
         more = jnp.concatenate([more[:n], -coefficient * event.slips * normal])
         for k in np.flatnonzero(of_contact):
             law = law.at[n + k, frictions.contacts[k]].set(known[k] * event.slips[k])
+        rates_after = lambda system, t, q: direction_rates(system, t, q, event.u)
         for k in frictions.pairs:
             # The direction of slip changes with the velocity after the impact.
-            own, of_q = np.array([k, k + 1]), (dsystem, dt, dq)
-            turned = push(lambda *at: direction_rates(*at, event.u)[n + own], (system, t, y.q), of_q)
+            own = np.array([k, k + 1])
+            turned = push(rates_after, (system, t, y.q), (dsystem, dt, dq))[n + own]
             last, speed = direction_rates(system, t, y.q, event.u)[n + own], norm(event.slips[own])
             across = jnp.eye(2, dtype=q.dtype) - jnp.outer(event.slips[own], event.slips[own])
             by = known[k] * normal[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
@@ -575,7 +589,7 @@ def _event(system, formulation, touch, t, y) -> _Event:
         )
 
     none = jnp.zeros(n + m, q.dtype)
-    no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True))
+    no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True), none[n:] > 0)
     one, yes = jnp.ones((), q.dtype), jnp.array(True)
     trial = _Trial(one, 0 * one, one, 0 * one, one, jnp.array(False))
     nothing = _Settled(
@@ -589,7 +603,8 @@ def _event(system, formulation, touch, t, y) -> _Event:
 
     implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
     new = jnp.where(last.closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
-    new = jnp.concatenate([new, jnp.where(last.sticks, STICK, laws.begun(ended) * last.slips)]).astype(q.dtype)
+    dry = jnp.where(last.implied, IMPLIED_STICK, laws.begun(ended) * last.slips)
+    new = jnp.concatenate([new, jnp.where(last.sticks, STICK, dry)]).astype(q.dtype)
     if m:
         # Slips that have ended are zero to all digits.
         # Slip in two directions begins at rest.
@@ -599,7 +614,7 @@ def _event(system, formulation, touch, t, y) -> _Event:
         cancelled = held & jnp.concatenate([staying, rests])
     else:
         left, cancelled = jnp.where(staying, rate, 0.0), held & low
-    held = held & _independent(influence, held)
+    held = held & independent_components(influence, held)
     lost = jnp.where(held & cancelled, solved_components(influence, left, held & cancelled), 0.0)
     after = after + lost @ moves
     # Impulses of rounding errors are none.
@@ -689,7 +704,7 @@ class _Laws(NamedTuple):
         if self.pairs:
             own = of_pairs(self.pairs)
             slips = slips.at[own].set(jax.vmap(slip_direction)(dry[own], slip[own]))
-        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True))
+        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True), dry == IMPLIED_STICK)
 
     @property
     def pairs(self) -> tuple[int, ...]:
@@ -743,9 +758,9 @@ class _Laws(NamedTuple):
         none = jnp.zeros(self.m, approach.dtype)
         if not self.m:
             impulses, closed, solvable = _complementary(self.influence, approach, touching)
-            return Answers(closed, none > 0, none, solvable), impulses, solvable
+            return Answers(closed, none > 0, none, solvable, none > 0), impulses, solvable
         if not self.n:
-            answers = Answers(none[:0] > 0, none > 0, none, jnp.array(True))
+            answers = Answers(none[:0] > 0, none > 0, none, jnp.array(True), none > 0)
             return answers, jnp.zeros_like(approach), jnp.array(True)
         # Friction in joints has no impulse.
         among = self._may(touching) & ~self.of_joints
@@ -763,7 +778,7 @@ class _Laws(NamedTuple):
         none = jnp.zeros(self.m, opening.dtype)
         if not self.m:
             _, closed, solvable = _complementary(self.influence, opening, staying)
-            return Answers(closed, none > 0, none, solvable)
+            return Answers(closed, none > 0, none, solvable, none > 0)
         # Friction that has just reached its limit is beyond it up to rounding errors.
         limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REST, 1.0)
         coefficient, bounds = jnp.where(self.sizes(slips) == 0, limit, self.coefficient), none
@@ -781,16 +796,6 @@ class _Laws(NamedTuple):
 
     def _dry(self, coefficient, slips, bound) -> Dry:
         return Dry(self.frictions.contacts, self.pairs, coefficient, slips, bound)
-
-
-def _independent(influence, among):
-    """Contacts of some ones whose impulses can all be found from the changes of the rates of their gaps."""
-    among = lax.stop_gradient(among)
-    both = among[:, None] & among[None, :]
-    # What must be cancelled in a random direction is nearly always cancelled by a basis.
-    asked = -jnp.where(both, influence, 0.0) @ (1 + jnp.arange(among.size, dtype=influence.dtype))
-    matrix = jnp.where(both, influence, jnp.eye(among.size, dtype=influence.dtype))
-    return positive_components(matrix, jnp.where(among, asked, 1.0))[0]
 
 
 def _is_implied(influence, closed):

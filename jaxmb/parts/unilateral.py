@@ -141,7 +141,8 @@ class AbstractRigidContact(AbstractGeometricContact):
         """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two, which
         turn as the normal does from an axis of the first of two bodies, or of the world.
 
-        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it. The normal must not be opposite to it.
+        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it. The normal must not be opposite to
+        it.
         """
         normal = self.outward(space, poses)
         if pole is None:
@@ -151,7 +152,7 @@ class AbstractRigidContact(AbstractGeometricContact):
             normal = space.body_direction(first, normal)
         axes = jnp.eye(3, dtype=normal.dtype)
         k = abs(pole) - 1
-        upwards = np.sign(pole) * axes[k]
+        upwards = axes[k] if pole > 0 else -axes[k]
         # The smallest turn from the pole to the normal.
         turned = [
             axis - jnp.dot(normal, axis) / (1 + jnp.dot(normal, upwards)) * (upwards + normal)

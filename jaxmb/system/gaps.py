@@ -17,9 +17,10 @@ from .equation import AbstractEquation, Contacts, Frictions
 
 # Modes of a contact: open; closed; closed, where others that are closed as well imply it and take the force.
 OPEN, CLOSED, IMPLIED = 0, 1, 2
-# Modes of dry friction: without a force; slip along its direction, and against it; stick. Those of friction with two
-# directions that slips are the components of a vector of length one, or `BEGUN` where slip has just begun.
-FREE, FORWARD, BACKWARD, STICK = 0, 1, -1, 2
+# Modes of dry friction: without a force; slip along its direction, and against it; stick; stick, where others that
+# stick as well imply it and take the force. Those of friction with two directions that slips are the components of a
+# vector of length one, or `BEGUN` where slip has just begun.
+FREE, FORWARD, BACKWARD, STICK, IMPLIED_STICK = 0, 1, -1, 2, 3
 BEGUN = 0.5
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import lagrangian, mechanisms, planar, spatial
-from jaxmb.bodies import independence, structure
+from jaxmb.bodies.independence import JointBlocks
 from jaxmb.manifold import Baumgarte
 
 GRAVITY = mb.Gravity((0.0, -9.81))
@@ -130,14 +130,14 @@ def ladder(n):
 @pytest.fixture
 def sparse(monkeypatch):
     """Let all components count as those of many rows."""
-    monkeypatch.setattr(structure, "subsets", functools.partial(independence.subsets, dense=-1))
+    monkeypatch.setattr(JointBlocks, "subsets", functools.partialmethod(JointBlocks.subsets, dense=-1))
 
 
 @pytest.mark.long
 def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
     n = 4
     systems = [ladder(n).compile()]
-    monkeypatch.setattr(structure, "subsets", functools.partial(independence.subsets, dense=-1))
+    monkeypatch.setattr(JointBlocks, "subsets", functools.partialmethod(JointBlocks.subsets, dense=-1))
     systems.append(ladder(n).compile())
     for system in systems:
         A = np.asarray(system.jacobian(0.0, system.guess.q, system.guess.u))

@@ -89,3 +89,9 @@ def test_norm_at_zero():
     assert float(rot.norm(np.array([3.0, 0.0, -4.0]))) == 5.0
     np.testing.assert_array_equal(jax.grad(rot.norm)(zero), 0.0)
     np.testing.assert_allclose(jax.grad(rot.norm)(jnp.array([3.0, 0.0, 4.0])), [0.6, 0.0, 0.8], rtol=0, atol=1e-15)
+
+
+def test_single_precision_stays():
+    """Of arrays of NumPy as of those of JAX: scenes are checked with the former."""
+    p = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+    assert rot.rotation_matrix(p).dtype == rot.rotation_matrix(jnp.asarray(p)).dtype == np.float32
