@@ -126,8 +126,9 @@ class DryFriction(AbstractDryFriction):
     contacts has an impulse of at most `coefficient` times theirs, and just that where slip does not end; friction of
     joints has none.
 
-    Contacts in space that stick at the same time must not determine each other's slip, as the feet of a table do: the
-    run ends there with a failure that names them.
+    Several contacts in space that stick, as the feet of a table do, share forces that are not determined: they are as
+    small as they can be, and where one reaches its limit others take more. Where the normal forces are not determined
+    either, as those of four feet, the motion that slips may not be, and the run may end with a failure.
 
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 
@@ -144,11 +145,12 @@ class DryFriction(AbstractDryFriction):
 
     radius: fields.Number = fields.length(sign="positive", optional=True)
     within: str = eqx.field(static=True, default_factory=str, init=False)
-    pole: int | None = eqx.field(static=True, default=None, init=False)
+    # In a contact in space the axis from which its tangents turn, see `AbstractRigidContact.tangents`; otherwise zero.
+    pole: int = eqx.field(static=True, default_factory=int, init=False)
 
     @property
     def rows(self):
-        return 1 if self.pole is None else 2
+        return 2 if self.pole else 1
 
     def complete(self, space, poses):
         held = self.joints["0"]

@@ -137,15 +137,15 @@ class AbstractRigidContact(AbstractGeometricContact):
         out = jax.grad(moved)(poses[-1, : space.dimension])
         return out / norm(out)
 
-    def tangents(self, space: AbstractSpace, poses: Poses, pole: int | None = None) -> Float[Array, "n d"]:
+    def tangents(self, space: AbstractSpace, poses: Poses, pole: int = 0) -> Float[Array, "n d"]:
         """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two, which
         turn as the normal does from an axis of the first of two bodies, or of the world.
 
-        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it. The normal must not be opposite to
-        it.
+        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it; zero in the plane. The normal must
+        not be opposite to it.
         """
         normal = self.outward(space, poses)
-        if pole is None:
+        if not pole:
             return jnp.stack([normal[1], -normal[0]])[None]
         first = poses[0] if len(poses) == 2 else None
         if first is not None:
@@ -160,9 +160,7 @@ class AbstractRigidContact(AbstractGeometricContact):
         ]
         return jnp.stack([v if first is None else space.direction(first, v) for v in turned])
 
-    def slip(
-        self, space: AbstractSpace, poses: Poses, velocities: Velocities, pole: int | None = None
-    ) -> Float[Array, "n"]:
+    def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities, pole: int = 0) -> Float[Array, "n"]:
         """The velocity [m/s] of the last body, against that of the other one or of the world, at the point where they
         touch, along the `tangents`.
         """

@@ -54,7 +54,7 @@ def about_contacts(system, outcome: Outcome) -> str:
     q = system.normalize(outcome.y.q)
     touch = np.asarray(gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
     touch = np.append(touch, [True] * counts(system)[1])
-    names = ", ".join(repr(name) for name, own in zip(names_of(system), touch, strict=True) if own)
+    names = ", ".join(dict.fromkeys(repr(name) for name, own in zip(names_of(system), touch, strict=True) if own))
     return f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
 
 

@@ -132,13 +132,15 @@ def run(system, state, policy, rtol, **options):
 @pytest.mark.long
 @pytest.mark.parametrize("ratio", [1e-8, 1e8])
 def test_steps_are_those_of_partitioning(ratio):
-    """Sparse elimination takes as many steps as partitioning with the same accelerations."""
+    """Sparse elimination takes as many steps as partitioning with the same accelerations, but for some at the start,
+    where the factor is that of a state before the step.
+    """
     system = alternating(planar_chain(16).compile(), ratio)
     state = mb.assemble(system, rates={f"rod{i}.angle": 1.0 for i in range(16)})
     for rtol in (1e-6, 1e-10):
         projected = run(system, state, manifold.Projection(), rtol)
         partitioned = run(system, state, manifold.Partition(), rtol, formulation=Multipliers())
-        assert projected.stats["num_steps"] <= 1.05 * partitioned.stats["num_steps"]
+        assert projected.stats["num_steps"] <= 1.05 * partitioned.stats["num_steps"] + 8
         np.testing.assert_allclose(projected.ys.q[-1], partitioned.ys.q[-1], rtol=0, atol=100 * rtol)
 
 

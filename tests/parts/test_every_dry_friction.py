@@ -22,22 +22,27 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     system = friction_scene(name)
     state = state_of(system)
     t, q, u = jnp.zeros(()), state.q, state.u
-    modes = of.modes_of(system, q)
-    at = lambda mode: of.with_modes(system, q, modes.at[-1].set(mode))
-    slip = of.direction_rates(system, t, q, u)[-1]
-    assert abs(slip) > 1e-3
+    modes, directions = of.modes_of(system, q), of.counts(system)[1]
+    at = lambda mode: of.with_modes(system, q, modes.at[-directions:].set(mode))
+    slip = np.asarray(of.direction_rates(system, t, q, u)[-directions:])
+    speed = np.linalg.norm(slip)
+    assert directions == (2 if "ball" in name else 1) and speed > 1e-3
 
-    # Where it sticks, its row is that of the slip.
+    # Where it sticks, its rows are those of the slip.
     udot, multipliers = accelerations(system, Multipliers(), t, at(of.STICK), u)
-    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, udot)[-1], 0.0, atol=1e-11)
-    row = system.contacts.frictions.rows[0]
-    np.testing.assert_allclose(of.direction_gradients(system, t, q, u)[-1] @ u, slip, rtol=1e-12)
-    assert name in ("pin", "two discs", "point on a plane that moves") or multipliers[row] != 0
+    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, udot)[-directions:], 0.0, atol=1e-11)
+    rows = np.array(system.contacts.frictions.rows)
+    np.testing.assert_allclose(of.direction_gradients(system, t, q, u)[-directions:] @ u, slip, rtol=1e-11)
+    touching = ("pin", "two discs", "point on a plane that moves", "two balls", "ball on a plane that moves")
+    assert name in touching or np.all(multipliers[rows] != 0)
 
-    # Where it slips, it takes μ N |s|, and N is the force of the joint.
-    mode = of.FORWARD if slip > 0 else of.BACKWARD
+    # Where it slips, it takes μ N |s|, and N is the force of the joint; in space also where its mode is another
+    # direction, on the same side.
+    mode = slip / speed
+    if directions == 2:
+        mode = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]) @ mode
     udot, multipliers = accelerations(system, Multipliers(), t, at(mode), u)
-    assert multipliers[row] == 0
+    assert np.all(multipliers[rows] == 0)
     times, states = t[None], mb.State(at(mode)[None], u[None])
     reaction = system.reaction("joint", times, states, multipliers[None])
     normal = np.linalg.norm(reaction.force[0])
@@ -45,15 +50,38 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
         # That of a contact has a sign, so that the law is smooth where an iteration passes through zero.
         normal = normal * np.sign(multipliers[system.contacts.rows[0]])
     power = jnp.dot(system.nonideal_force(t, at(mode), u, multipliers), u)
-    np.testing.assert_allclose(power, -0.3 * normal * abs(slip), rtol=1e-10)
+    np.testing.assert_allclose(power, -0.3 * normal * speed, rtol=1e-10)
     reactions = system.friction_reactions(t, q, u, multipliers)
-    np.testing.assert_allclose(jnp.linalg.norm(reactions), abs(normal), rtol=1e-10)
+    np.testing.assert_allclose(jnp.linalg.norm(reactions, axis=1), np.full(directions, abs(normal)), rtol=1e-10)
     residual = system.inertia(t, q, u).product(udot) - system.force(t, q, u)
     force = system.constraint_force(t, at(mode), u, multipliers) + system.nonideal_force(t, at(mode), u, multipliers)
     np.testing.assert_allclose(residual, force, atol=1e-10)
 
     # And otherwise nothing.
     assert jnp.all(system.nonideal_force(t, at(of.FREE), u, multipliers) == 0)
+
+
+@pytest.mark.parametrize("name", ["ball on a slope", "ball on an edge"])
+def test_the_direction_of_slip_has_a_sense_at_rest_and_beyond(name):
+    """Slip that has begun has the direction of its modes; that of slip which has passed through zero does not jump."""
+    system = friction_scene(name)
+    state = state_of(system)
+    t, q, u = jnp.zeros(()), state.q, state.u
+    slip = np.asarray(of.direction_rates(system, t, q, u)[-2:])
+    at = lambda mode: of.with_modes(system, q, of.modes_of(system, q).at[-2:].set(mode))
+    rows = of.direction_gradients(system, t, q, u)[-2:]
+
+    def direction(mode):
+        _, multipliers = accelerations(system, Multipliers(), t, at(mode), u)
+        force = system.nonideal_force(t, at(mode), u, multipliers)
+        load = 0.3 * np.linalg.norm(system.friction_reactions(t, q, u, multipliers)[0])
+        return -np.linalg.lstsq(np.asarray(rows).T, np.asarray(force))[0] / load
+
+    along = slip / np.linalg.norm(slip)
+    other = np.array([0.6, -0.8])
+    np.testing.assert_allclose(np.abs(direction(0.5 * other)), np.abs(other), rtol=1e-9)
+    np.testing.assert_allclose(direction(along), -direction(-along), rtol=1e-9)
+    np.testing.assert_allclose(np.abs(direction(along)), np.abs(along), rtol=1e-9)
 
 
 def test_words_and_numbers():
@@ -92,12 +120,6 @@ BAD = {
         "must have one coordinate, a number, as a pin or a slide has; it has",
     ),
     "a rope": (BODY, [mb.Slack("joint", "ground", "a", length=2.0)], {"coefficient": 0.3}, "has no point at which"),
-    "space": (
-        spatial.Body("a", mass=1.0, inertia=(1.0, 1.0, 1.0)),
-        [FLOOR],
-        {"coefficient": 0.3},
-        "friction of rigid contacts is planar; use a compliant contact in space",
-    ),
     "no such joint": (BODY, [PIN.named("other")], {"coefficient": 0.3}, "joint"),
     "a redundant joint": (
         BODY,

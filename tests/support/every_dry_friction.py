@@ -66,6 +66,26 @@ FRICTIONS = {
         [mb.RigidBallContact("joint", "a", "b", radius_a=0.2, radius_b=0.4)],
         _rub(static_coefficient=0.4),
     ),
+    "ball on a slope": (
+        [_body_3d("a")],
+        [mb.RigidContact("joint", "a", terrain=terrain.Bump(start=0.0, length=2.0, peak=0.2), radius=0.1)],
+        _rub(),
+    ),
+    "ball on a plane that moves": (
+        [_body_3d("a", z=0.0), _body_3d("b")],
+        [mb.RigidPlaneContact("joint", "a", "b", normal=(0.0, 0.6, 0.8), point_b=(0.1, 0.0, -0.3), radius=0.2)],
+        _rub(static_coefficient=0.4),
+    ),
+    "ball on an edge": (
+        [_body_3d("a", z=0.0), _body_3d("b", x=0.7)],
+        [mb.RigidBoxContact("joint", "a", "b", size=(0.4, 2.0, 1.0), radius=0.2)],
+        _rub(),
+    ),
+    "two balls": (
+        [_body_3d("a", z=0.0), _body_3d("b", x=0.6)],
+        [mb.RigidBallContact("joint", "a", "b", radius_a=0.2, radius_b=0.4)],
+        _rub(),
+    ),
 }
 
 

@@ -85,7 +85,7 @@ def linearise(
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
     if system.contacts is not None and system.contacts.frictions is not None:
-        names = ", ".join(system.contacts.frictions.names)
+        names = ", ".join(dict.fromkeys(system.contacts.frictions.names))
         raise ValueError(f"linearise: {names} may stick or slip, which no linear equation describes. Remove it.")
     opens = are_open(system, state.q)
     if not is_traced(opens) and not np.all(opens):
