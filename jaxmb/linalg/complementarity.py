@@ -21,9 +21,9 @@ _PIVOT = 1e-9
 # Right-hand sides are displaced by this multiple of their largest entry, differently in each row, since equal ones
 # could make the method return to where it was.
 _APART = 1e-10
-# Directions of slip are turned until they change by less than this, in this many rounds at most, and then made precise
-# by this many steps of Newton's method.
-_TURN, _TURNS, _CORRECTIONS = 1e-4, 100, 4
+# Directions of slip are found when they change by less than this, in this many rounds at most, each with this many
+# steps of Newton's method.
+_TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
 # Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
 _ASIDE = 1e-8
 # Several contacts that stick share forces that are not determined as if they yielded by this fraction of `W`.
@@ -180,32 +180,18 @@ def _in_directions(W, b, dry, among):
         size = norm(ahead)
         return jnp.where((may & (size > 0))[:, None], ahead / jnp.where(size > 0, size, 1.0)[:, None], e)
 
-    def advance(carry):
-        e, _, x, _, count = carry
-        new = jnp.where(count == 0, e, direction(e, x))
-        turned = jnp.where(count == 0, jnp.inf, jnp.max(jnp.abs(new - e)))
-        return new, *solved(new), turned, count + 1
-
-    size = norm(jnp.where(may[:, None], b[both], known))
-    first = jnp.where(may[:, None], b[both], known) / jnp.where(size > 0, size, 1.0)[:, None]
-    first = jnp.where(size[:, None] > 0, first, jnp.array([1.0, 0.0], b.dtype))
-    nothing = jnp.zeros(m, b.dtype)
-    start = Answers(jnp.zeros(n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
-    start = first, start, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
-    goes_on = lambda carry: (carry[3] > _TURN) & (carry[4] < _TURNS)
-    e, answers, x, _, _ = lax.while_loop(goes_on, advance, start)
-    pressed, sticks = answers.closed[contact], answers.sticks[pairs].all(1)
-    slides = may & pressed & ~sticks
-    answers = answers._replace(sticks=answers.sticks.at[pairs].set(sticks[:, None]))
-
-    def with_slips(e):
+    def with_slips(answers, e):
+        """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
+        pressed, sticks = answers.closed[contact], answers.sticks[pairs].all(1)
         slips = jnp.where((touches & pressed & ~sticks)[:, None], jnp.where(may[:, None], e, known), 0.0)
-        return answers._replace(slips=answers.slips.at[pairs].set(slips))
+        slips, sticks_both = answers.slips.at[pairs].set(slips), answers.sticks.at[pairs].set(sticks[:, None])
+        return answers._replace(sticks=sticks_both, slips=slips), may & pressed & ~sticks
 
-    def correct(_, carry):
-        e, x = carry
+    def corrected(answers, e, x):
+        """A step of Newton's method for the directions of slip and the forces."""
         e = direction(e, x)
-        matrix, right = laws_of(W, b, dry, with_slips(e))
+        laws, slides = with_slips(answers, e)
+        matrix, right = laws_of(W, b, dry, laws)
         rates, normal = W @ x + b, jnp.maximum(x[contact], 0.0)
         for k, own in enumerate(both):
             # Along the direction the force is that of slip. Across, force and slip are zero together.
@@ -215,18 +201,39 @@ def _in_directions(W, b, dry, among):
             sideways = (load * (across @ W[own])).at[own].add(speed * across) / size
             asked = -load * jnp.dot(across, b[own]) / size
             rows = jnp.outer(e[k], e[k] @ matrix[own]) + jnp.outer(across, sideways)
+            asked = e[k] * jnp.dot(e[k], right[own]) + across * asked
             matrix = matrix.at[own].set(jnp.where(slides[k], rows, matrix[own]))
-            right = right.at[own].set(
-                jnp.where(slides[k], e[k] * jnp.dot(e[k], right[own]) + across * asked, right[own])
-            )
+            right = right.at[own].set(jnp.where(slides[k], asked, right[own]))
         return e, jnp.linalg.solve(matrix, right)
 
-    e, x = lax.fori_loop(0, _CORRECTIONS, correct, (e, x))
-    e, rates = direction(e, x), (W @ x + b)[both]
+    def advance(carry):
+        e, _, _, _, count = carry
+        answers, x = solved(e)
+        _, x = lax.fori_loop(0, _CORRECTIONS, lambda _, own: corrected(answers, *own), (e, x))
+        new = direction(e, x)
+        # Directions between which the method goes to and fro are halved.
+        between = e + new
+        size = norm(between)
+        halved = (count % 4 == 3) & (size > 0.1)
+        turned = jnp.max(jnp.abs(new - e))
+        new = jnp.where(halved[:, None], between / jnp.where(size > 0, size, 1.0)[:, None], new)
+        return new, answers, x, turned, count + 1
+
+    size = norm(jnp.where(may[:, None], b[both], known))
+    first = jnp.where(may[:, None], b[both], known) / jnp.where(size > 0, size, 1.0)[:, None]
+    first = jnp.where(size[:, None] > 0, first, jnp.array([1.0, 0.0], b.dtype))
+    nothing = jnp.zeros(m, b.dtype)
+    start = Answers(jnp.zeros(n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
+    start = first, start, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
+    _, answers, x, turned, _ = lax.while_loop(lambda own: (own[3] > _TURN) & (own[4] < _TURNS), advance, start)
+    found, slides = with_slips(answers, direction(first, x))
+    if len(pairs) > 1:
+        found = _with_implied(rigid, found)
+    e, rates = found.slips[pairs], (W @ x + b)[both]
     aside, back = jnp.abs(e[:, 0] * x[both[:, 1]] - e[:, 1] * x[both[:, 0]]), jnp.sum(e * rates, axis=1)
     wrong = (aside > _ASIDE * jnp.max(jnp.abs(x))) | (back < -_ASIDE * jnp.max(jnp.abs(b)))
-    found = with_slips(e) if len(pairs) == 1 else _with_implied(rigid, with_slips(e))
-    return found._replace(solvable=found.solvable & ~jnp.any(slides & wrong) & jnp.all(jnp.isfinite(x)))
+    solvable = found.solvable & (turned <= _TURN) & ~jnp.any(slides & wrong) & jnp.all(jnp.isfinite(x))
+    return found._replace(solvable=solvable)
 
 
 def _with_implied(W, answers):
