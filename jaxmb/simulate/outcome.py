@@ -18,7 +18,7 @@ from ..system.gaps import counts, gaps, names_of
 # Gaps below this fraction of the system's size are named where contacts have no solution.
 _TOUCH = 1e-6
 # Stiffness is not looked for after fewer steps than this, and found in this number.
-_ENOUGH, _LOOKED = 200, 256
+_ENOUGH, _LOOKED = 200, 512
 
 
 class Outcome(NamedTuple):

@@ -55,7 +55,8 @@ def test_few_steps_at_every_tolerance():
     mechanism = library("stiff_four_bar")
     references = mechanism.references
     assert references.labels[:3] == ("crank", "coupler", "rocker") and references.times[-1] == 1.0
-    for rtol, steps, bound in ((1e-4, 800, 1e-4), (1.2e-6, 2000, 1e-6), (1e-8, 6000, 1e-8)):
+    # The number of steps varies by some per cent from one tolerance to the next.
+    for rtol, steps, bound in ((1e-4, 800, 1e-4), (1.5e-6, 2000, 1e-6), (1e-8, 6000, 1e-8)):
         # Steps err by a twentieth of the tolerance, so at 20 times as much each may err by `rtol`.
         for coarser in (1, 20):
             ys, stats, successful = bushing()(rtol=coarser * rtol)
