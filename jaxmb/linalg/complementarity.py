@@ -24,6 +24,8 @@ _APART = 1e-10
 # Directions of slip are found when they change by less than this, in this many rounds at most, each with this many
 # steps of Newton's method.
 _TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
+# The least limit of a force across its direction, as a fraction of that along it.
+_ACROSS = 0.01
 # Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
 _ASIDE = 1e-8
 # Several contacts that stick share forces that are not determined as if they yielded by this fraction of `W`.
@@ -165,12 +167,13 @@ def _in_directions(W, b, dry, among):
     # The inverse of the largest change of a slip by its force, at most.
     step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
 
-    def solved(e):
+    def solved(e, across):
         turn = jnp.eye(n + m, dtype=b.dtype)
         for own, (c, s) in zip(both, e, strict=True):
             turn = turn.at[np.ix_(own, own)].set(jnp.array([[c, s], [-s, c]]))
         matrix, right = turn @ W @ turn.T, turn @ b
-        laws = dry._replace(slips=turn[n:, n:] @ dry.slips)
+        coefficient = dry.coefficient * jnp.where(np.isin(np.arange(m), pairs[:, 1]), across, 1.0)
+        laws = dry._replace(slips=turn[n:, n:] @ dry.slips, coefficient=coefficient)
         answers = _in_lines(matrix, right, laws, among)
         return answers, turn.T @ jnp.linalg.solve(*laws_of(matrix, right, laws, answers))
 
@@ -208,7 +211,8 @@ def _in_directions(W, b, dry, among):
 
     def advance(carry):
         e, _, _, _, count = carry
-        answers, x = solved(e)
+        # The force across is less and less, so that the square of both is near the circle.
+        answers, x = solved(e, jnp.maximum(0.5**count, _ACROSS))
         _, x = lax.fori_loop(0, _CORRECTIONS, lambda _, own: corrected(answers, *own), (e, x))
         new = direction(e, x)
         # Directions between which the method goes to and fro are halved.

@@ -568,6 +568,9 @@ def _event(system, formulation, touch, t, y) -> _Event:
         # Where the impact would give energy back, rebounds are less.
         trial = before.trial
         approach = (at + rows @ jump).at[:n].add(-jnp.where(low, 0.0, trial.share * bounce))
+        if laws.pairs:
+            # Directions of rounding errors have no sense.
+            approach = jnp.where(jnp.abs(approach) <= _REST * (jnp.abs(rows) @ jnp.abs(u)), 0.0, approach)
         struck, impulses, solvable = laws.impulses(approach, touching)
         after = u + jump + impulses @ moves
         rate = direction_rates(system, t, q, after)
