@@ -101,9 +101,8 @@ class ContactEvents(eqx.Module):
         for k in np.flatnonzero(np.isfinite(times)):
             for i, name in enumerate(self.names):
                 if i >= self.contacts:
-                    if self.names[i - 1] == name:
-                        continue
-                    # Both directions of friction that has two.
+                    if self.names.index(name) < i:
+                        continue  # the second direction: the row of the first one has both
                     own = slice(i, i + self.names.count(name))
                     changed = before[k, i] != after[k, i]
                     impulse = float(impulses[k, i] if own.stop == i + 1 else np.linalg.norm(impulses[k, own]))
