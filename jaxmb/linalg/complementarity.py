@@ -53,36 +53,33 @@ def _lemke(W, b):
     # Columns: w, x, the artificial variable, the right-hand side; `basis`: the variable of each row.
     table = jnp.concatenate([jnp.eye(k, dtype=dtype), -W, -jnp.ones((k, 1), dtype), right[:, None]], axis=1)
 
-    def pivoted(table, basis, row, column):
-        own = table[row] / table[row, column]
-        table = table - table[:, column][:, None] * own[None, :]
-        return table.at[row].set(own), basis.at[row].set(column), basis[row]
-
     def proceed(carry):
         _, _, left, solvable, count = carry
         return (left != 2 * k) & solvable & (count < 20 + 10 * k)
 
     def advance(carry):
         table, basis, left, _, count = carry
-        entering = jnp.where(left < k, left + k, left - k)
+        # At first the artificial variable enters, for the row that is furthest from a solution.
+        is_first = count == 0
+        entering = jnp.where(is_first, 2 * k, jnp.where(left < k, left + k, left - k))
         column, right = table[:, entering], table[:, -1]
         least = _PIVOT * jnp.max(jnp.abs(column), initial=0.0)
         ratio = jnp.where(column > least, right / jnp.where(column > least, column, 1.0), jnp.inf)
+        ratio = jnp.where(is_first, right, ratio)
         # Of equal ratios the artificial variable leaves.
         tied = (basis == 2 * k) & (ratio <= jnp.min(ratio) * (1 + 1e-12) + jnp.finfo(dtype).tiny)
         row = jnp.where(jnp.any(tied), jnp.argmax(tied), jnp.argmin(ratio))
         solvable = jnp.isfinite(ratio[row])
-        new = pivoted(table, basis, row, entering)
-        kept = lambda new, old: jnp.where(solvable, new, old)
-        return kept(new[0], table), kept(new[1], basis), kept(new[2], left), solvable, count + 1
+        own, changes = np.arange(k) == row, solvable & (np.arange(k) == row)
+        pivot = table[row] / table[row, entering]
+        table = jnp.where(own[:, None], 0.0, table) + jnp.where(own, 1.0, -column)[:, None] * pivot[None, :]
+        left = jnp.where(solvable, basis[row], left)
+        return table, jnp.where(changes, entering, basis), left, solvable, count + 1
 
-    basis, row = jnp.arange(k), jnp.argmin(right)
-    nothing = right[row] >= 0
-    started = pivoted(table, basis, row, 2 * k)
-    table, basis, left = (
-        jnp.where(nothing, old, new) for new, old in zip(started, (table, basis, jnp.asarray(2 * k)), strict=True)
-    )
-    _, basis, left, solvable, _ = lax.while_loop(proceed, advance, (table, basis, left, jnp.array(True), jnp.array(0)))
+    # A solution without forces needs no step.
+    left = jnp.where(jnp.min(right) >= 0, 2 * k, -1)
+    first = table, jnp.arange(k), left, jnp.array(True), jnp.array(0)
+    _, basis, left, solvable, _ = lax.while_loop(proceed, advance, first)
     found = jnp.zeros(2 * k + 1, bool).at[basis].set(True)[k : 2 * k]
     return found, solvable & (left == 2 * k)
 
@@ -133,6 +130,20 @@ def of_pairs(pairs: tuple[int, ...]) -> np.ndarray:
     return np.array(pairs, int)[:, None] + np.arange(2)
 
 
+def placed_pairs(pairs: tuple[int, ...], values: Array, others: Array, first: int = 0) -> Array:
+    """Values of each law of `pairs`, shape (pairs, 2, …), among those of `others`, whose places they take; before them
+    `first` zeros.
+    """
+    # A gather, which is compiled in less time than a scatter.
+    m, own = len(others), of_pairs(pairs).reshape(-1)
+    place = np.zeros(m, int)
+    place[own] = np.arange(own.size)
+    taken = values.reshape(-1, *values.shape[2:])[place]
+    mask = np.isin(np.arange(m), own).reshape(-1, *(1,) * (values.ndim - 2))
+    placed = jnp.where(mask, taken, others)
+    return jnp.concatenate([jnp.zeros((first, *placed.shape[1:]), placed.dtype), placed]) if first else placed
+
+
 def slip_direction(modes: Float[Array, "rows"], slip: Float[Array, "rows"]) -> Float[Array, "rows"]:
     """The unit vector against which dry friction acts, by its modes, which are whole numbers in one direction; zero
     where it sticks or is free.
@@ -160,22 +171,28 @@ def _in_directions(W, b, dry, among):
     both, contact = n + pairs, np.array(dry.contacts)[pairs[:, 0]]
     known, touches = dry.slips[pairs], among[both[:, 0]]
     may = touches & (known == 0).all(1)
-    among = among.at[both[:, 1]].set(may)
+    both_may = placed_pairs(dry.pairs, jnp.stack([touches, may], axis=1), among[n:])
+    among = jnp.concatenate([among[:n], both_may])
     rigid = W
     if len(pairs) > 1:
         W = W + _YIELD * jnp.max(jnp.diag(W)) * jnp.diag(np.isin(np.arange(n + m), both).astype(W.dtype))
     # The inverse of the largest change of a slip by its force, at most.
     step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
+    # Turned are pairs by `c` times the first matrix of each, and `s` times the second.
+    others = np.diag(~np.isin(np.arange(n + m), both)).astype(W.dtype)
+    turns = np.zeros((len(pairs), 2, n + m, n + m), W.dtype)
+    for turn, (i, j) in zip(turns, both, strict=True):
+        turn[0, [i, j], [i, j]], turn[1, [i, j], [j, i]] = 1, (1, -1)
 
-    def solved(e, across):
-        turn = jnp.eye(n + m, dtype=b.dtype)
-        for own, (c, s) in zip(both, e, strict=True):
-            turn = turn.at[np.ix_(own, own)].set(jnp.array([[c, s], [-s, c]]))
+    def in_lines(e, across):
+        """The answers where pairs act along directions and across them, and the equations for the forces."""
+        turn = others + jnp.tensordot(e, turns, 2)
         matrix, right = turn @ W @ turn.T, turn @ b
         coefficient = dry.coefficient * jnp.where(np.isin(np.arange(m), pairs[:, 1]), across, 1.0)
         laws = dry._replace(slips=turn[n:, n:] @ dry.slips, coefficient=coefficient)
         answers = _in_lines(matrix, right, laws, among)
-        return answers, turn.T @ jnp.linalg.solve(*laws_of(matrix, right, laws, answers))
+        matrix, right = laws_of(matrix, right, laws, answers)
+        return answers, matrix @ turn, right
 
     def direction(e, x):
         """Where slip goes if the force is the nearest one in the cone to what would end it."""
@@ -187,33 +204,43 @@ def _in_directions(W, b, dry, among):
         """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
         pressed, sticks = answers.closed[contact], answers.sticks[pairs].all(1)
         slips = jnp.where((touches & pressed & ~sticks)[:, None], jnp.where(may[:, None], e, known), 0.0)
-        slips, sticks_both = answers.slips.at[pairs].set(slips), answers.sticks.at[pairs].set(sticks[:, None])
+        slips = placed_pairs(dry.pairs, slips, answers.slips)
+        sticks_both = placed_pairs(dry.pairs, jnp.stack([sticks, sticks], axis=1), answers.sticks)
         return answers._replace(sticks=sticks_both, slips=slips), may & pressed & ~sticks
 
     def corrected(answers, e, x):
-        """A step of Newton's method for the directions of slip and the forces."""
-        e = direction(e, x)
+        """The equations of a step of Newton's method for the directions of slip and the forces."""
         laws, slides = with_slips(answers, e)
         matrix, right = laws_of(W, b, dry, laws)
-        rates, normal = W @ x + b, jnp.maximum(x[contact], 0.0)
-        for k, own in enumerate(both):
-            # Along the direction the force is that of slip. Across, force and slip are zero together.
-            across, load = jnp.stack([-e[k, 1], e[k, 0]]), dry.coefficient[pairs[k, 0]] * normal[k]
-            speed = jnp.abs(jnp.dot(e[k], rates[own]))
-            size = load / step[k] + speed + jnp.finfo(b.dtype).tiny
-            sideways = (load * (across @ W[own])).at[own].add(speed * across) / size
-            asked = -load * jnp.dot(across, b[own]) / size
-            rows = jnp.outer(e[k], e[k] @ matrix[own]) + jnp.outer(across, sideways)
-            asked = e[k] * jnp.dot(e[k], right[own]) + across * asked
-            matrix = matrix.at[own].set(jnp.where(slides[k], rows, matrix[own]))
-            right = right.at[own].set(jnp.where(slides[k], asked, right[own]))
-        return e, jnp.linalg.solve(matrix, right)
+        rates, load = (W @ x + b)[both], dry.coefficient[pairs[:, 0]] * jnp.maximum(x[contact], 0.0)
+        # Along the direction the force is that of slip. Across, force and slip are zero together.
+        across = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
+        speed = jnp.abs(jnp.sum(e * rates, axis=1))
+        size = load / step + speed + jnp.finfo(b.dtype).tiny
+        turned = (load / size)[:, None] * jnp.einsum("pi,pik->pk", across, W[both])
+        turned = turned + (speed / size)[:, None] * jnp.einsum("pi,pik->pk", across, np.eye(n + m, dtype=b.dtype)[both])
+        along = jnp.einsum("pi,pik->pk", e, matrix[both])
+        rows = e[:, :, None] * along[:, None] + across[:, :, None] * turned[:, None]
+        asked = -load / size * jnp.sum(across * b[both], axis=1)
+        asked = e * jnp.sum(e * right[both], axis=1)[:, None] + across * asked[:, None]
+        own = placed_pairs(dry.pairs, jnp.stack([slides, slides], axis=1), jnp.zeros(m, bool), first=n)
+        rows = placed_pairs(dry.pairs, rows, matrix[n:], first=n)
+        asked = placed_pairs(dry.pairs, asked, right[n:], first=n)
+        return jnp.where(own[:, None], rows, matrix), jnp.where(own, asked, right)
 
     def advance(carry):
         e, _, _, _, count = carry
         # The force across is less and less, so that the square of both is near the circle.
-        answers, x = solved(e, jnp.maximum(0.5**count, _ACROSS))
-        _, x = lax.fori_loop(0, _CORRECTIONS, lambda _, own: corrected(answers, *own), (e, x))
+        answers, *straight = in_lines(e, jnp.maximum(0.5**count, _ACROSS))
+
+        def correct(k, own):
+            last = direction(*own)
+            e = jnp.where(k == 0, own[0], last)
+            newton = corrected(answers, e, own[1])
+            matrix, right = (jnp.where(k == 0, first, other) for first, other in zip(straight, newton, strict=True))
+            return e, jnp.linalg.solve(matrix, right)
+
+        _, x = lax.fori_loop(0, 1 + _CORRECTIONS, correct, (e, jnp.zeros_like(b)))
         new = direction(e, x)
         # Directions between which the method goes to and fro are halved.
         between = e + new
@@ -223,14 +250,14 @@ def _in_directions(W, b, dry, among):
         new = jnp.where(halved[:, None], between / jnp.where(size > 0, size, 1.0)[:, None], new)
         return new, answers, x, turned, count + 1
 
-    size = norm(jnp.where(may[:, None], b[both], known))
-    first = jnp.where(may[:, None], b[both], known) / jnp.where(size > 0, size, 1.0)[:, None]
-    first = jnp.where(size[:, None] > 0, first, jnp.array([1.0, 0.0], b.dtype))
+    start = jnp.where(may[:, None], b[both], known)
+    size = norm(start)[:, None]
+    start = jnp.where(size > 0, start / jnp.where(size > 0, size, 1.0), jnp.array([1.0, 0.0], b.dtype))
     nothing = jnp.zeros(m, b.dtype)
-    start = Answers(jnp.zeros(n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
-    start = first, start, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
-    _, answers, x, turned, _ = lax.while_loop(lambda own: (own[3] > _TURN) & (own[4] < _TURNS), advance, start)
-    found, slides = with_slips(answers, direction(first, x))
+    none = Answers(jnp.zeros(n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
+    first = start, none, jnp.zeros_like(b), jnp.array(jnp.inf, b.dtype), jnp.array(0)
+    _, answers, x, turned, _ = lax.while_loop(lambda own: (own[3] > _TURN) & (own[4] < _TURNS), advance, first)
+    found, slides = with_slips(answers, direction(start, x))
     if len(pairs) > 1:
         found = _with_implied(rigid, found)
     e, rates = found.slips[pairs], (W @ x + b)[both]
@@ -328,10 +355,12 @@ def laws_of(
     m = len(dry.contacts)
     n = b.size - m
     held = jnp.concatenate([answers.closed, answers.sticks])
-    law = jnp.eye(n + m, dtype=b.dtype)
+    of_normal = np.zeros((n + m, n + m), b.dtype)
     for k, contact in enumerate(dry.contacts):
         if contact >= 0:
-            law = law.at[n + k, contact].set(dry.coefficient[k] * answers.slips[k])
+            of_normal[n + k, contact] = 1
+    slope = jnp.concatenate([jnp.zeros(n, b.dtype), dry.coefficient * answers.slips])
+    law = np.eye(n + m, dtype=b.dtype) + slope[:, None] * of_normal
     bounds = jnp.concatenate([jnp.zeros(n, b.dtype), -dry.bound * answers.slips])
     return jnp.where(held[:, None], W, law), jnp.where(held, -b, bounds)
 

@@ -27,13 +27,9 @@ from .._types import Scalar, State
 from ..formulations import AbstractFormulation, accelerations
 from ..linalg.complementarity import (
     Answers,
-    Dry,
-    frictional,
     independent_components,
-    laws_of,
     of_pairs,
-    positive_components,
-    slip_direction,
+    placed_pairs,
     solved_components,
 )
 from ..linalg.rotations import norm
@@ -44,7 +40,6 @@ from ..system.gaps import (
     BEGUN,
     CLOSED,
     FORWARD,
-    FREE,
     IMPLIED,
     IMPLIED_STICK,
     OPEN,
@@ -66,6 +61,7 @@ from ..system.gaps import (
 )
 from ..system.residuals import binding_velocities, velocity_rows
 from .constraints import dense, push
+from .contact_laws import REST, Laws, Problem, is_implied, sizes_of
 from .impulse import after_impulse
 
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
@@ -81,11 +77,9 @@ _HALFWAY = 0.75
 _YIELD = 1e-10
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e3
-# Rates of gaps, and squares of their gradients, below this fraction of what adds up in them are zero.
-_REST = 1e-9
-# The normal forces of joints, which depend on the friction in them, are found by this many corrections. They, and low
-# bounces, decide on what stays closed and sticks in this many rounds.
-_CORRECTIONS, _ROUNDS = 6, 4
+# Low bounces, and the normal forces of joints, which depend on the friction in them, decide on what stays closed and
+# sticks in this many rounds.
+_ROUNDS = 4
 # Rebounds at which no energy is gained are found in this many trials, to this fraction of what adds up in it.
 _TRIALS, _GAIN = 40, 1e-12
 
@@ -125,7 +119,7 @@ class ContactGuards(AbstractGuards):
             largest = _largest_force(own, t, dataclasses.replace(y, q=q), multipliers)
             taken = multipliers[np.array(direction_rows(system))]
             if frictions is not None:
-                taken = taken.at[n:].set(_reserve(own, t, q, y.u, multipliers))
+                taken = jnp.concatenate([taken[:n], _reserve(own, t, q, y.u, multipliers)])
             return taken / largest
 
         held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
@@ -144,7 +138,8 @@ class ContactGuards(AbstractGuards):
         has_begun, slides = (size > 0) & (size < _HALFWAY), (size > _HALFWAY) & (size < STICK)
         turned = jnp.where(has_begun, along / BEGUN, jnp.where(slides, along - 0.5 * speed, length))
         fast = jnp.where(has_begun, _SEEN * slow - speed, jnp.where(slides, speed - slow, length))
-        return free.at[own].set(jnp.stack([turned, fast], axis=1))
+        n, pairs = counts(self.system)[0], frictions_of(self.system).pairs
+        return jnp.concatenate([free[:n], placed_pairs(pairs, jnp.stack([turned, fast], axis=1), free[n:])])
 
     def impact(self, t: Scalar, y: State, dated: bool = False) -> "Impact":
         """The event at a state; see `impact`."""
@@ -178,15 +173,7 @@ def _reserve(system, t, q, u, multipliers):
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
         shared = jnp.linalg.solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ forces)
         forces = jnp.where(stick, shared, forces)
-    return frictions.limit * normal - _sizes(frictions.pairs, forces)
-
-
-def _sizes(pairs, values):
-    """The sizes of what friction in one direction has, and of both where it has two."""
-    if not pairs:
-        return jnp.abs(values)
-    own = of_pairs(pairs)
-    return jnp.abs(values).at[own].set(norm(values[own])[:, None], unique_indices=True)
+    return frictions.limit * normal - sizes_of(frictions.pairs, forces)
 
 
 def _coefficients(system, t, q, u):
@@ -475,7 +462,7 @@ def _of_both(pairs, modes, rates, curve, slow, single):
     may = (size > 0) & (size < STICK) & (norm(rates[own]) <= 2 * slow)
     both = may, jnp.sum(along * rates[own], axis=1), jnp.sum(along * curve[own], axis=1)
     # The second number says nothing.
-    pairwise = lambda new, old: old.at[own].set(jnp.stack([new, jnp.zeros_like(new)], axis=1))
+    pairwise = lambda new, old: placed_pairs(pairs, jnp.stack([new, jnp.zeros_like(new)], axis=1), old)
     return tuple(map(pairwise, both, single))
 
 
@@ -502,7 +489,7 @@ def _event(system, formulation, touch, t, y) -> _Event:
     moves, answers = jax.vmap(projector.solve)(forces, asked)
     moves, jump, answers = moves[:-1], moves[-1], answers[:-1]
     influence = rows @ moves.T
-    laws = _Laws(influence, frictions, n, m, *(_coefficients(system, t, q, u) if m else (zero, zero)))
+    laws = Laws(influence, frictions, n, m, *(_coefficients(system, t, q, u) if m else (zero[:0], zero[:0])))
 
     def accelerated(u):
         """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
@@ -516,95 +503,156 @@ def _event(system, formulation, touch, t, y) -> _Event:
         return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
 
     slow = _slow(system, touch, u)
-
-    # What is next, of the equations before.
-    udot, opening, reactions = accelerated(u)
     rates = direction_rates(system, t, q, u)
-    before = udot + laws.forces(opening, reactions, laws.of_modes(modes, rates)) @ moves
-    gap, closing = gaps(system, t, q), rates[:n]
-    about_to = (modes[:n] == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
-    # The first zero of a parabola.
-    curve = direction_accelerations(system, t, q, u, before)
-    root = jnp.sqrt(jnp.maximum(closing**2 - 2 * curve[:n] * gap, 0.0))
-    until = 2 * gap / (root + jnp.where(about_to, -closing, 1.0))
-    if m:
-        slip, slowing = modes[n:] * rates[n:], modes[n:] * curve[n:]
-        slides = jnp.abs(modes[n:]) == FORWARD
-        if laws.pairs:
-            single = slides, slip, slowing
-            slides, slip, slowing = _of_both(laws.pairs, modes[n:], rates[n:], curve[n:], slow, single)
-        ends = slides & (slip <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch)) & (slowing < 0)
-        until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
-        about_to = jnp.concatenate([about_to, ends])
-    # A zero that is far off in time, since rates are rounding errors, is none.
-    speed = jnp.max(jnp.maximum(jnp.abs(u), jnp.abs(before)) / system.velocity_scale()) * system.length
-    about_to = about_to & (jnp.abs(until) * speed <= _FAR * touch)
-    first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
-    hits = about_to[first]
-    late = jnp.where(hits, until[first], 0.0)
-    u = u + late * before
+    rates_at = lambda other: rates + rows @ (other - u)
+    gap = gaps(system, t, q)
 
-    is_first = jnp.arange(n) == first
-    touching = (modes[:n] != OPEN) | (about_to[:n] & is_first) | (gap + late * closing <= touch)
-    at = direction_rates(system, t, q, u)
-    bounce = contacts.restitution * jnp.maximum(-at[:n], 0.0)
+    def strike(k, before: _Round, answers, impulses):
+        """The velocities after an impulse, and the forces that are asked for there."""
+        after = before.when.u + jnp.where(k == 0, 0.0, jump) + impulses @ moves
+        rate = rates_at(after)
+        both = before.when.at + rate
+        gained = jnp.dot(impulses, both)
+        size = jnp.dot(jnp.abs(impulses), jnp.abs(before.when.at) + jnp.abs(rate))
+        trial = _next_trial(before.trial, gained, size, k // 2 - 1)
+        udot, opening, reactions = accelerated(after)
+        sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(before.when.u))
+        resting = before.when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
+        # Slip that is not to be seen has ended.
+        speed = laws.sizes(rate[n:])
+        ended = (speed <= REST * laws.sizes(sizes[n:])) | (speed <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch))
+        slips = jnp.where(ended, 0.0, rate[n:] / jnp.where(ended, 1.0, speed))
+        return before._replace(
+            problem=laws.of_forces(opening, reactions, resting, slips, modes, before.forces),
+            struck=answers,
+            impulses=impulses,
+            after=after,
+            rate=rate,
+            udot=udot,
+            resting=resting,
+            ended=ended,
+            solvable=answers.solvable,
+            trial=trial,
+            share=before.trial.share,
+        )
 
-    def settle(k, before):
-        """The impact, the contacts that stay closed, and the laws that hold then with their forces, in a further round,
+    def begin(k, before: _Round, answers, forces):
+        """What is next, of the equations before, and when."""
+        del k, answers
+        when = at_event(before.udot + forces @ moves, before.problem.free + influence @ forces)
+        return before._replace(problem=impulse_of(when, before.low, before.trial.share), when=when)
+
+    def settle(k, before: _Round, answers, forces):
+        """The laws that hold after an impact with their forces, and the impulses that are asked for in a further round,
         in which other contacts may bounce too low to be seen.
         """
         # Contacts that would open by less than can be seen, before they close again, stay closed: of those that open in
         # the first round.
-        curve = (before.opening + influence @ before.forces)[:n]
+        when, is_first = before.when, k == 3
+        bounce = bounces(when)
+        curve = (before.problem.free + influence @ forces)[:n]
         falls = jnp.where(curve < 0, -curve, 1.0)
         opens = before.rate[:n] ** 2 <= 2 * falls * _BOUNCE * touch
-        bounces = touching & ~before.resting & (curve < 0) & opens & (contacts.restitution < 1)
-        low = jnp.where(k == 1, bounces, before.low)
+        low = when.touching & ~before.resting & (curve < 0) & opens & (contacts.restitution < 1)
+        low = jnp.where(is_first, low, before.low)
         # Each bounce takes `restitution` times the time of the one before.
         ratio = jnp.where(low & (bounce > 0), contacts.restitution, 0.0)
         rest = jnp.where(low & (bounce > 0), 2 * before.rate[:n] / (falls * (1 - ratio)), 0.0)
-        rest = jnp.where(k == 1, rest, before.rest)
-
-        # Where the impact would give energy back, rebounds are less.
-        trial = before.trial
-        approach = (at + rows @ jump).at[:n].add(-jnp.where(low, 0.0, trial.share * bounce))
-        if laws.pairs:
-            # Directions of rounding errors have no sense.
-            approach = jnp.where(jnp.abs(approach) <= _REST * (jnp.abs(rows) @ jnp.abs(u)), 0.0, approach)
-        struck, impulses, solvable = laws.impulses(approach, touching)
-        after = u + jump + impulses @ moves
-        rate = direction_rates(system, t, q, after)
-        gained, size = jnp.dot(impulses, at + rate), jnp.dot(jnp.abs(impulses), jnp.abs(at) + jnp.abs(rate))
-        trial = _next_trial(trial, gained, size, k)
-        udot, opening, reactions = accelerated(after)
-        sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
-        resting = touching & ((rate[:n] <= _REST * sizes[:n]) | low)
-        # Slip that is not to be seen has ended.
-        speed = laws.sizes(rate[n:])
-        ended = (speed <= _REST * laws.sizes(sizes[n:])) | (speed <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch))
-        slips = jnp.where(ended, 0.0, rate[n:] / jnp.where(ended, 1.0, speed))
-        answers = laws.decided(opening, reactions, resting, slips, modes, before.forces)
-        forces = laws.forces(opening, reactions, answers)
-        ok = solvable & answers.solvable
-        share = before.trial.share
-        return _Settled(
-            low, rest, struck, impulses, after, rate, udot, opening, resting, ended, answers, forces, ok, trial, share
+        return before._replace(
+            problem=impulse_of(when, low, before.trial.share),
+            low=low,
+            rest=jnp.where(is_first, rest, before.rest),
+            answers=answers,
+            forces=forces,
+            solvable=before.solvable & answers.solvable,
         )
 
-    none = jnp.zeros(n + m, q.dtype)
-    no = Answers(none[:n] > 0, none[n:] > 0, none[n:], jnp.array(True), none[n:] > 0)
-    one, yes = jnp.ones((), q.dtype), jnp.array(True)
-    trial = _Trial(one, 0 * one, one, 0 * one, one, jnp.array(False))
-    nothing = _Settled(
-        none[:n] > 0, none[:n], no, none, u, none, u, none, none[:n] > 0, none[n:] > 0, no, none, yes, trial, one
-    )
-    going = lambda carry: (carry[0] < _ROUNDS) | (carry[1].trial.again & (carry[0] < _ROUNDS + _TRIALS))
-    advance = lambda carry: (carry[0] + 1, settle(*carry))
-    _, settled = lax.while_loop(going, advance, (jnp.array(0), nothing))
-    low, rest, struck, impulses, after, rate, udot, _, staying, ended, last, forces, solvable, _, share = settled
-    held = struck.closed | low
+    def at_event(before, curve) -> _When:
+        """The first of the zeros that are next, with accelerations until then, and those along the directions."""
+        closing = rates[:n]
+        about_to = (modes[:n] == OPEN) & (gap <= _NEAR * touch) & (closing < 0)
+        # The first zero of a parabola.
+        root = jnp.sqrt(jnp.maximum(closing**2 - 2 * curve[:n] * gap, 0.0))
+        until = 2 * gap / (root + jnp.where(about_to, -closing, 1.0))
+        if m:
+            slip, slowing = modes[n:] * rates[n:], modes[n:] * curve[n:]
+            slides = jnp.abs(modes[n:]) == FORWARD
+            if laws.pairs:
+                single = slides, slip, slowing
+                slides, slip, slowing = _of_both(laws.pairs, modes[n:], rates[n:], curve[n:], slow, single)
+            ends = slides & (slip <= jnp.where(laws.are_pairs, 2 * slow, _NEAR * touch)) & (slowing < 0)
+            until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
+            about_to = jnp.concatenate([about_to, ends])
+        # A zero that is far off in time, since rates are rounding errors, is none.
+        speed = jnp.max(jnp.maximum(jnp.abs(u), jnp.abs(before)) / system.velocity_scale()) * system.length
+        about_to = about_to & (jnp.abs(until) * speed <= _FAR * touch)
+        first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
+        hits = about_to[first]
+        late = jnp.where(hits, until[first], 0.0)
+        is_first = np.arange(n) == first
+        touching = (modes[:n] != OPEN) | (about_to[:n] & is_first) | (gap + late * closing <= touch)
+        at = u + late * before
+        return _When(late, first, hits, before, at, rates_at(at), touching)
 
-    implied = staying & ~last.closed & _is_implied(influence[:n, :n], last.closed)
+    def bounces(when: _When):
+        return contacts.restitution * jnp.maximum(-when.at[:n], 0.0)
+
+    def impulse_of(when: _When, low, share) -> Problem:
+        """What is asked of the impulses, where contacts that are `low` do not bounce, and others with a share of the
+        whole rebound.
+        """
+        back = jnp.where(low, 0.0, share * bounces(when))
+        approach = when.at + rows @ jump - jnp.pad(back, (0, m))
+        if laws.pairs:
+            # Directions of rounding errors have no sense.
+            approach = jnp.where(jnp.abs(approach) <= REST * (jnp.abs(rows) @ jnp.abs(when.u)), 0.0, approach)
+        return laws.of_impulses(approach, when.touching, reactions)
+
+    # Impulses and forces take turns, so that the program that finds one of them is compiled once. The first impulse is
+    # none, and the forces after it are those before the event.
+    none, one, yes = jnp.zeros(n + m, q.dtype), jnp.ones((), q.dtype), jnp.array(True)
+    no, idle = Answers(none[:n] > 0, none[n:] > 0, none[n:], yes, none[n:] > 0), none[:n] > 0
+    reactions = jax.tree.map(jnp.zeros_like, jax.eval_shape(accelerated, u)[2])
+    when = _When(0 * one, jnp.argmin(none), ~yes, u, u, rates, idle)
+    start = _Round(
+        problem=laws.of_impulses(none, idle, reactions),
+        when=when,
+        low=idle,
+        rest=none[:n],
+        struck=no,
+        impulses=none,
+        after=u,
+        rate=none,
+        udot=u,
+        resting=idle,
+        ended=none[n:] > 0,
+        answers=no,
+        forces=none,
+        solvable=yes,
+        trial=_Trial(one, 0 * one, one, 0 * one, one, ~yes),
+        share=one,
+    )
+
+    def going(carry):
+        k, last = carry
+        rounds = k // 2 - 1
+        return (k % 2 == 1) | (rounds < _ROUNDS) | (last.trial.again & (rounds < _ROUNDS + _TRIALS))
+
+    def advance(carry):
+        k, last = carry
+        answers = laws.answers(last.problem)
+        known = laws.of_modes(modes, rates)
+        answers = jax.tree.map(lambda known, found: jnp.where(k == 1, known, found), known, answers)
+        found = laws.solved(last.problem, answers)
+        which = jnp.where(k % 2 == 0, 0, jnp.where(k == 1, 1, 2))
+        return k + 1, lax.switch(which, [strike, begin, settle], k, last, answers, found)
+
+    _, settled = lax.while_loop(going, advance, (jnp.array(0), start))
+    when, struck, last = settled.when, settled.struck, settled.answers
+    rate, staying, ended = settled.rate, settled.resting, settled.ended
+    held = struck.closed | settled.low
+
+    implied = staying & ~last.closed & is_implied(influence[:n, :n], last.closed)
     new = jnp.where(last.closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
     dry = jnp.where(last.implied, IMPLIED_STICK, laws.begun(ended) * last.slips)
     new = jnp.concatenate([new, jnp.where(last.sticks, STICK, dry)]).astype(q.dtype)
@@ -616,32 +664,47 @@ def _event(system, formulation, touch, t, y) -> _Event:
         left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(rests, rate[n:], 0.0)])
         cancelled = held & jnp.concatenate([staying, rests])
     else:
-        left, cancelled = jnp.where(staying, rate, 0.0), held & low
+        left, cancelled = jnp.where(staying, rate, 0.0), held & settled.low
     held = held & independent_components(influence, held)
     lost = jnp.where(held & cancelled, solved_components(influence, left, held & cancelled), 0.0)
-    after = after + lost @ moves
+    after = settled.after + lost @ moves
     # Impulses of rounding errors are none.
-    sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(u))
-    impulses = jnp.where(jnp.abs(jnp.diag(influence) * impulses) <= _REST * sizes, 0.0, impulses)
-    energy = 0.5 * (jnp.dot(u, inertia.product(u)) - jnp.dot(after, inertia.product(after)))
+    sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(when.u))
+    impulses = settled.impulses
+    impulses = jnp.where(jnp.abs(jnp.diag(influence) * impulses) <= REST * sizes, 0.0, impulses)
+    energy = 0.5 * (jnp.dot(when.u, inertia.product(when.u)) - jnp.dot(after, inertia.product(after)))
     return _Event(
-        late=late,
-        first=first,
-        hits=hits,
-        before=before,
-        after=udot + forces @ moves,
-        at=u,
+        late=when.late,
+        first=when.first,
+        hits=when.hits,
+        before=when.before,
+        after=settled.udot + settled.forces @ moves,
+        at=when.u,
         u=after,
         held=held,
-        low=low,
+        low=settled.low,
         slips=struck.slips,
         impulses=impulses,
         modes=(modes, new),
-        rest=jnp.pad(rest, (0, m)),
+        rest=jnp.pad(settled.rest, (0, m)),
         energy=energy,
-        solvable=solvable,
-        share=share,
+        solvable=settled.solvable,
+        share=settled.share,
     )
+
+
+class _When(NamedTuple):
+    """When the event is, see `_Event`, with the velocities `u` then, before it, the rates `at` of gaps and slips, and
+    which contacts are `touching`.
+    """
+
+    late: Float[Array, ""]
+    first: Any
+    hits: Any
+    before: Float[Array, "nu"]
+    u: Float[Array, "nu"]
+    at: Float[Array, "laws"]
+    touching: Bool[Array, "contacts"]
 
 
 class _Trial(NamedTuple):
@@ -660,7 +723,7 @@ class _Trial(NamedTuple):
 def _next_trial(trial: _Trial, gained, size, k) -> _Trial:
     """What is tried next, after the first rounds, in which the whole rebound was, and gained some energy."""
     first = k == _ROUNDS - 1
-    again = jnp.where(first, gained > _REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
+    again = jnp.where(first, gained > REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
     a, b, of_a, of_b, share = narrowed((trial.a, trial.b, trial.of_a, trial.of_b), trial.share, gained, k % 3 == 2)
     # Without a rebound energy is lost.
     share = jnp.where(again, jnp.where(first, 0.0, share), trial.share)
@@ -668,9 +731,14 @@ def _next_trial(trial: _Trial, gained, size, k) -> _Trial:
     return jax.tree.map(lambda old, new: jnp.where(k < _ROUNDS - 1, old, new), trial, new)
 
 
-class _Settled(NamedTuple):
-    """What happens in an event in one round of `_event`; see there."""
+class _Round(NamedTuple):
+    """What happens in an event in one round of impulses and forces of `_event`; see there.
 
+    **Fields:** the `problem` of the impulses or forces that are to be found next; `when` the event is.
+    """
+
+    problem: Problem
+    when: _When
     low: Bool[Array, "contacts"]
     rest: Float[Array, "contacts"]
     struck: Answers
@@ -678,7 +746,6 @@ class _Settled(NamedTuple):
     after: Float[Array, "nu"]
     rate: Float[Array, "laws"]
     udot: Float[Array, "nu"]
-    opening: Float[Array, "laws"]
     resting: Bool[Array, "contacts"]
     ended: Bool[Array, "frictions"]
     answers: Answers
@@ -686,128 +753,6 @@ class _Settled(NamedTuple):
     solvable: Bool[Array, ""]
     trial: _Trial
     share: Float[Array, ""]
-
-
-class _Laws(NamedTuple):
-    """The laws of `n` contacts and `m` dry `frictions` at a state, with the `influence` of their forces, and
-    `_coefficients`.
-    """
-
-    influence: Float[Array, "n_m n_m"]
-    frictions: Any
-    n: int
-    m: int
-    coefficient: Float[Array, "m"]
-    limit: Float[Array, "m"]
-
-    def of_modes(self, modes, rates) -> Answers:
-        """Which laws hold in some modes, and at some rates of gaps and slips."""
-        dry, slip = modes[self.n :], rates[self.n :]
-        slips = jnp.where(jnp.abs(dry) == FORWARD, dry, FREE)
-        if self.pairs:
-            own = of_pairs(self.pairs)
-            slips = slips.at[own].set(jax.vmap(slip_direction)(dry[own], slip[own]))
-        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True), dry == IMPLIED_STICK)
-
-    @property
-    def pairs(self) -> tuple[int, ...]:
-        """The numbers of the first directions of those friction that has two."""
-        return self.frictions.pairs if self.m else ()
-
-    def sizes(self, values):
-        """The sizes of what friction in one direction has, and of both where it has two."""
-        return _sizes(self.pairs, values)
-
-    @property
-    def are_pairs(self) -> np.ndarray:
-        """Which laws are of friction in two directions."""
-        return np.isin(np.arange(self.m), of_pairs(self.pairs))
-
-    def begun(self, ended):
-        """The length of the modes of slip, which begins where it had ended."""
-        return jnp.where(self.are_pairs & ended, BEGUN, 1.0)
-
-    @property
-    def of_joints(self) -> np.ndarray:
-        """Which friction is that of a joint, whose normal force is the size of its reaction."""
-        return np.array(self.frictions.contacts if self.m else (), int) < 0
-
-    def forces(self, opening, reactions, answers: Answers):
-        """The forces of laws that hold, from accelerations without them."""
-        if not self.m:
-            return solved_components(self.influence, opening, answers.closed)
-        none = jnp.zeros(self.m, opening.dtype)
-        matrix, right = laws_of(self.influence, opening, self._dry(self.coefficient, none, none), answers)
-        linear = jnp.linalg.solve(matrix, right)
-        if not self.of_joints.any():
-            return linear
-        factor = jnp.where(self.of_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
-
-        def correct(_, forces):
-            # Newton's method: the size of a reaction is not linear.
-            reaction = reactions[0] + jnp.tensordot(forces, reactions[1:], 1)
-            normal = norm(reaction)
-            along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
-            slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
-            own = matrix.at[self.n :].add(factor[:, None] * slope)
-            return jnp.linalg.solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
-
-        return lax.fori_loop(0, _CORRECTIONS, correct, linear)
-
-    def impulses(self, approach, touching):
-        """Which laws hold in an impact, the impulses, and whether there is a solution; `approach`: the rates before it,
-        with those of restitution.
-        """
-        none = jnp.zeros(self.m, approach.dtype)
-        if not self.m:
-            impulses, closed, solvable = _complementary(self.influence, approach, touching)
-            return Answers(closed, none > 0, none, solvable, none > 0), impulses, solvable
-        if not self.n:
-            answers = Answers(none[:0] > 0, none > 0, none, jnp.array(True), none > 0)
-            return answers, jnp.zeros_like(approach), jnp.array(True)
-        # Friction in joints has no impulse.
-        among = self._may(touching) & ~self.of_joints
-        dry = self._dry(self.coefficient, none, none)
-        answers = frictional(self.influence, approach, dry, jnp.concatenate([touching, among]))
-        impulses = jnp.linalg.solve(*laws_of(self.influence, approach, dry, answers))
-        # Others are zero to all digits.
-        act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
-        return answers, jnp.where(act, impulses, 0.0), answers.solvable
-
-    def decided(self, opening, reactions, staying, slips, modes, forces) -> Answers:
-        """Which laws hold after an event, of contacts that are `staying`, and of friction that `slips`, or may stick
-        where this is zero; `forces`: nearly those, on which the normal forces of joints depend.
-        """
-        none = jnp.zeros(self.m, opening.dtype)
-        if not self.m:
-            _, closed, solvable = _complementary(self.influence, opening, staying)
-            return Answers(closed, none > 0, none, solvable, none > 0)
-        # Friction that has just reached its limit is beyond it up to rounding errors.
-        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REST, 1.0)
-        coefficient, bounds = jnp.where(self.sizes(slips) == 0, limit, self.coefficient), none
-        if self.of_joints.any():
-            normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
-            bounds = jnp.where(self.of_joints, coefficient * normal, 0.0)
-        among = jnp.concatenate([staying, self._may(staying)])
-        return frictional(self.influence, opening, self._dry(coefficient, slips, bounds), among)
-
-    def _may(self, staying):
-        """Which friction may have a force."""
-        if not self.m:
-            return jnp.zeros(0, bool)
-        return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.frictions.contacts])
-
-    def _dry(self, coefficient, slips, bound) -> Dry:
-        return Dry(self.frictions.contacts, self.pairs, coefficient, slips, bound)
-
-
-def _is_implied(influence, closed):
-    """Which gaps cannot move where some contacts are closed, up to rounding errors."""
-    influence, closed = lax.stop_gradient((influence, closed))
-    columns = jnp.where(closed[:, None], influence, 0.0)
-    matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
-    left = influence - columns.T @ jnp.linalg.solve(matrix, columns)
-    return jnp.diag(left) <= _REST * jnp.diag(influence)
 
 
 def _free_acceleration(system, formulation, projector, t, q, u):
@@ -830,15 +775,3 @@ def _solved(system, formulation, t, q, u):
 def _by_projector(system, projector, t, q, u):
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     return projector.solve(system.force(t, q, u), gamma)
-
-
-def _complementary(influence, free, among):
-    """Impulses `≥ 0` of some contacts with `influence impulses + free ≥ 0`, of which contacts they are positive, and
-    whether there are any.
-    """
-    among = lax.stop_gradient(among)
-    both = among[:, None] & among[None, :]
-    influence = jnp.where(both, influence, jnp.eye(free.size, dtype=free.dtype))
-    free = jnp.where(among, free, 1.0)
-    positive, solvable = positive_components(influence, free)
-    return solved_components(influence, free, positive), positive, solvable

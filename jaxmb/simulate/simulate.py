@@ -250,7 +250,7 @@ def simulate(
         if inconsistent:
             consistent(system, times["t0"], state)
         if stuck:
-            result, coupling = made_precise(problem, trajectory.result, outcome, trajectory.found_events)
+            result, coupling = made_precise(problem, trajectory.result, outcome)
             trajectory = eqx.tree_at(lambda trajectory: trajectory.result, trajectory, result)
             outcome = outcome._replace(coupling=coupling)
         if system.acceleration_rows > 0 and not system.drift_free:

@@ -25,8 +25,8 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
-from ..manifold.impact import impact
 from ..solvers import (
+    NO_STATE,
     AbstractMultistep,
     MeshAdjoint,
     RunningScales,
@@ -196,12 +196,15 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
         result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
+    unknown = finite
     if found is not None:
+        no_state = result == RESULTS.promote(NO_STATE)
+        result, unknown = RESULTS.where(no_state, RESULTS.contacts_undetermined, result), unknown & ~no_state
         result = RESULTS.where(found.number > problem.max_events, RESULTS.too_many_events, result)
-    stuck, coupling = has_failed(result) & finite, None
+    stuck, coupling = has_failed(result) & unknown, None
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
-        result, coupling = diagnosed(problem, *end, found, evidence, result, stuck)
+        result, coupling = diagnosed(problem, *end, evidence, result, stuck)
     violated = policy.violated(system, *end)
     if violated is not False:
         result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
@@ -229,24 +232,18 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
 
 
 @eqx.filter_jit
-def made_precise(problem: Problem, result: Any, outcome: Outcome, found: FoundEvents | None) -> tuple[Any, Any]:
+def made_precise(problem: Problem, result: Any, outcome: Outcome) -> tuple[Any, Any]:
     """As `diagnosed`, of a run that got stuck: a program of its own, which only such runs need."""
     stuck = result != RESULTS.inconsistent_constraints
-    return diagnosed(problem, outcome.t, outcome.y, found, outcome.evidence, result, stuck)
+    return diagnosed(problem, outcome.t, outcome.y, outcome.evidence, result, stuck)
 
 
-def diagnosed(problem: Problem, t, y, found, evidence, result, stuck) -> tuple[Any, Any]:
+def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any]:
     """The result of a run that ended at a state, made precise where it got stuck, and the coupling of friction with its
     own reactions there, None without friction.
-
-    **Arguments:** `found`: the events until then, None of a system that has none.
     """
     system = problem.system
     result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
-    if found is not None:
-        event = lambda: impact(system.at(y), problem.method, found.touch, t, y)
-        solvable = lax.cond(stuck, lambda: event().solvable, lambda: jnp.array(True))
-        result, stuck = RESULTS.where(solvable, result, RESULTS.contacts_undetermined), stuck & solvable
     if not system.friction_parts:
         return result, None
     return diagnose_friction(system, problem.method, t, y, result, stuck)

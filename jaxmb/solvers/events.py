@@ -30,6 +30,8 @@ _FRACTION, _EVALUATIONS = 1e-13, 60
 _END = 1e-9
 # After an event that follows another one at once the next step is this fraction of the last one that was tried.
 _SHORTER = 1e-2
+# The result of a solve that ends since there is no state after an event.
+NO_STATE: Any = diffrax.RESULTS.internal_error
 # Where a guard is zero at the start of a step as well, its rise there is looked for down to this power of two.
 _HALVINGS = 30
 
@@ -45,7 +47,8 @@ class Crossing(AbstractErrorWithMore):
 
     **Fields:** the `error` for the controller inside; the `target`: the time of the first zero in the step; one where a
     guard is negative `within` the step, and otherwise zero, since diffrax expects no truth values in an error; the
-    `lowest` guard at its end; one where a guard is `falling` through zero there; `touch` and `near` of the guards.
+    `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
+    motion at the start of the step, since there was no state after an event; `touch` and `near` of the guards.
     """
 
     error: PyTree
@@ -53,6 +56,7 @@ class Crossing(AbstractErrorWithMore):
     within: Float[Array, ""]
     lowest: Float[Array, ""]
     falling: Float[Array, ""]
+    lost: Float[Array, ""]
     touch: Float[Array, ""]
     near: Float[Array, ""]
 
@@ -142,9 +146,10 @@ def crossing(
     )
     found = lax.while_loop(lambda search: search.phase != _DONE, advance, first)
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
-    within, falling = (x.astype(start.dtype) for x in (found.dips, falling))
+    lost = ~jnp.all(jnp.isfinite(ravel(y0)))
+    within, falling, lost = (x.astype(start.dtype) for x in (found.dips, falling, lost))
     touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
-    return Crossing(error, t0 + found.b * (t1 - t0), within, jnp.min(found.end), falling, touch, near)
+    return Crossing(error, t0 + found.b * (t1 - t0), within, jnp.min(found.end), falling, lost, touch, near)
 
 
 def _looked(search: _Search, values, rates, start, touch):
@@ -261,7 +266,8 @@ class EventState(AbstractControllerState):
 class EventController(diffrax.AbstractAdaptiveStepSizeController):
     """A controller around another one, whose steps end at events; at most `most` of them.
 
-    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`.
+    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`, and one after which there is no state with
+    `NO_STATE`.
     """
 
     controller: Any
@@ -328,7 +334,9 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         )
         full = ends & (before.count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
-        return keep & ~crossed, next_t0, next_t1, made_jump | ends, state, result
+        lost = found.lost > 0
+        result = diffrax.RESULTS.where(lost, NO_STATE, result)
+        return keep & ~crossed & ~lost, next_t0, next_t1, made_jump | ends, state, result
 
 
 def events_found(controller_state: Any) -> EventState | None:

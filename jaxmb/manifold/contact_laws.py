@@ -1,0 +1,174 @@
+"""The laws of contacts and dry friction at a state, for impulses and for forces."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ..linalg.complementarity import (
+    Answers,
+    Dry,
+    frictional,
+    laws_of,
+    of_pairs,
+    placed_pairs,
+    positive_components,
+    slip_direction,
+    solved_components,
+)
+from ..linalg.rotations import norm
+from ..system.gaps import BEGUN, CLOSED, FORWARD, FREE, IMPLIED_STICK, STICK
+
+# Rates below this fraction of what adds up in them, and squares of gradients, are zero.
+REST = 1e-9
+# The normal forces of joints, which depend on the friction in them, are found by this many corrections.
+_CORRECTIONS = 6
+
+
+class Problem(NamedTuple):
+    """Which impulses, or forces, are asked for.
+
+    **Fields:** `free`: the rates or accelerations along the directions of the laws without them; `among`: the laws that
+    may have any; of friction see `Dry`; `reactions` of the joints that have friction, without forces along these and by
+    a unit of each, None without such friction.
+    """
+
+    free: Float[Array, "laws"]
+    among: Bool[Array, "laws"]
+    coefficient: Float[Array, "m"]
+    slips: Float[Array, "m"]
+    bound: Float[Array, "m"]
+    reactions: Float[Array, "more_laws m d"] | None
+
+
+class Laws(NamedTuple):
+    """The laws of `n` contacts and `m` dry `frictions` at a state, with the `influence` of their forces, and
+    `_coefficients`.
+    """
+
+    influence: Float[Array, "n_m n_m"]
+    frictions: Any
+    n: int
+    m: int
+    coefficient: Float[Array, "m"]
+    limit: Float[Array, "m"]
+
+    def of_modes(self, modes, rates) -> Answers:
+        """Which laws hold in some modes, and at some rates of gaps and slips."""
+        dry, slip = modes[self.n :], rates[self.n :]
+        slips = jnp.where(jnp.abs(dry) == FORWARD, dry, FREE)
+        if self.pairs:
+            own = of_pairs(self.pairs)
+            slips = placed_pairs(self.pairs, jax.vmap(slip_direction)(dry[own], slip[own]), slips)
+        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True), dry == IMPLIED_STICK)
+
+    @property
+    def pairs(self) -> tuple[int, ...]:
+        """The numbers of the first directions of those friction that has two."""
+        return self.frictions.pairs if self.m else ()
+
+    def sizes(self, values):
+        """The sizes of what friction in one direction has, and of both where it has two."""
+        return sizes_of(self.pairs, values)
+
+    @property
+    def are_pairs(self) -> np.ndarray:
+        """Which laws are of friction in two directions."""
+        return np.isin(np.arange(self.m), of_pairs(self.pairs))
+
+    def begun(self, ended):
+        """The length of the modes of slip, which begins where it had ended."""
+        return jnp.where(self.are_pairs & ended, BEGUN, 1.0)
+
+    @property
+    def of_joints(self) -> np.ndarray:
+        """Which friction is that of a joint, whose normal force is the size of its reaction."""
+        return np.array(self.frictions.contacts if self.m else (), int) < 0
+
+    def of_impulses(self, approach, touching, reactions) -> Problem:
+        """The impulses of contacts that are `touching`; `approach`: the rates before it, with those of restitution.
+
+        Friction in joints has no impulse.
+        """
+        none, may = jnp.zeros(self.m, approach.dtype), self._may(touching) & ~self.of_joints
+        return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
+
+    def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
+        """The forces after an event, of contacts that are `staying`, and of friction that `slips`, or may stick where
+        this is zero; `opening`: the accelerations without them; `forces`: nearly those, on which the normal forces of
+        joints depend.
+        """
+        # Friction that has just reached its limit is beyond it up to rounding errors.
+        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - REST, 1.0)
+        coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
+        bounds = jnp.zeros(self.m, opening.dtype)
+        if reactions is not None:
+            normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
+            bounds = jnp.where(self.of_joints, coefficient * normal, 0.0)
+        among = jnp.concatenate([staying, self._may(staying)])
+        return Problem(opening, among, coefficient, slips, bounds, reactions)
+
+    def answers(self, problem: Problem) -> Answers:
+        """Which laws hold."""
+        free, among = problem.free, problem.among
+        if self.m:
+            dry = self._dry(problem.coefficient, problem.slips, problem.bound)
+            return frictional(self.influence, free, dry, among)
+        both, none = among[:, None] & among[None, :], free[:0]
+        influence = jnp.where(both, self.influence, jnp.eye(free.size, dtype=free.dtype))
+        closed, solvable = positive_components(influence, jnp.where(among, free, 1.0))
+        return Answers(closed, none > 0, none, solvable, none > 0)
+
+    def solved(self, problem: Problem, answers: Answers):
+        """The impulses or forces of laws that hold."""
+        free, reactions = problem.free, problem.reactions
+        if not self.m:
+            return solved_components(self.influence, free, answers.closed)
+        none = jnp.zeros(self.m, free.dtype)
+        matrix, right = laws_of(self.influence, free, self._dry(self.coefficient, none, none), answers)
+        # Others are zero to all digits.
+        act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
+        if reactions is None:
+            return jnp.where(act, jnp.linalg.solve(matrix, right), 0.0)
+        factor = jnp.where(self.of_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
+
+        def correct(_, forces):
+            # Newton's method: the size of a reaction is not linear.
+            reaction = reactions[0] + jnp.tensordot(forces, reactions[1:], 1)
+            normal = norm(reaction)
+            along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
+            slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
+            own = matrix.at[self.n :].add(factor[:, None] * slope)
+            return jnp.linalg.solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
+
+        linear = jnp.linalg.solve(matrix, right)
+        return jnp.where(act, lax.fori_loop(0, _CORRECTIONS, correct, linear), 0.0)
+
+    def _may(self, staying):
+        """Which friction may have a force."""
+        if not self.m:
+            return jnp.zeros(0, bool)
+        return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.frictions.contacts])
+
+    def _dry(self, coefficient, slips, bound) -> Dry:
+        return Dry(self.frictions.contacts, self.pairs, coefficient, slips, bound)
+
+
+def is_implied(influence, closed):
+    """Which gaps cannot move where some contacts are closed, up to rounding errors."""
+    influence, closed = lax.stop_gradient((influence, closed))
+    columns = jnp.where(closed[:, None], influence, 0.0)
+    matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
+    left = influence - columns.T @ jnp.linalg.solve(matrix, columns)
+    return jnp.diag(left) <= REST * jnp.diag(influence)
+
+
+def sizes_of(pairs: tuple[int, ...], values: Float[Array, "m"]) -> Float[Array, "m"]:
+    """The sizes of what friction in one direction has, and of both where it has two."""
+    if not pairs:
+        return jnp.abs(values)
+    size = norm(values[of_pairs(pairs)])
+    return placed_pairs(pairs, jnp.stack([size, size], axis=1), jnp.abs(values))
