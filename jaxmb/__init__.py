@@ -16,6 +16,7 @@ from ._types import State as State
 from ._version import __version__ as __version__
 from .bodies import RigidBodySystem as RigidBodySystem
 from .bodies.scene import Scene as Scene
+from .contact_events import ContactEvents as ContactEvents, Event as Event
 from .linalg import rotations as rotations
 from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.actuators import Actuator as Actuator, Motor as Motor

@@ -1,5 +1,6 @@
 """Checks of arguments that users pass, with messages that name the argument."""
 
+import importlib
 from typing import Any
 
 import jax
@@ -49,3 +50,11 @@ def real_shape(name: str, value: Any, expected: str = "a real number or an array
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name} must be {expected}, got {value!r}.")
     return array.shape
+
+
+def package_for_tables(name: str, install: str) -> Any:
+    """A package that makes tables, imported at its first use."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(f'This table needs {name}; install it with: pip install "{install}"') from None

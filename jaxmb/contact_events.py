@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from ._arguments import package_for_tables
 from ._types import State
 from .formulations import AbstractFormulation
 from .linalg.jitted import jitted
@@ -33,8 +34,8 @@ class Event(NamedTuple):
 
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
     `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; of friction `"stick"`, `"slip"`, or `"impact"`
-    for an impulse alone; the `impulse` [N s, N m s]; the kinetic energy [J] that was lost at this time, by all parts
-    together.
+    for an impulse alone; the `impulse` [N s, N m s]; `energy_lost` [J]: the kinetic energy that was lost at this time,
+    by all parts together, so that each of them has the same; `ContactEvents.energy_lost` has one for each time.
     """
 
     time: float
@@ -81,12 +82,25 @@ class ContactEvents(eqx.Module):
         return self._rows()[k]
 
     def __str__(self) -> str:
-        rows = [(f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}") for e in self._rows()]
-        table = [("time [s]", "part", "kind", "impulse", "energy lost [J]"), *rows]
+        events = self._rows()
+        # The energy that parts lose together stands at the first of them.
+        first = [k == 0 or event.time != events[k - 1].time for k, event in enumerate(events)]
+        rows = [
+            (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}" if shown else "")
+            for e, shown in zip(events, first, strict=True)
+        ]
+        table = [("time [s]", "part", "kind", "impulse [N s]", "energy lost [J]"), *rows]
         widths = [max(len(row[k]) for row in table) for k in range(5)]
         return "\n".join(
             "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in table
         )
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each `Event`.
+
+        **Raises:** `ImportError` without pandas; `ValueError` for a batch.
+        """
+        return package_for_tables("pandas", "pandas").DataFrame(self._rows(), columns=list(Event._fields))
 
     def _rows(self) -> list[Event]:
         if isinstance(self.times, Tracer) or self.times.ndim != 1:

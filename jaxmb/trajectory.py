@@ -1,7 +1,6 @@
 """A motion, with views by name."""
 
 import functools
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,11 +14,13 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from ._arguments import package_for_tables
 from ._compat import steps_of
 from ._results import RESULTS
 from ._types import State
 from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
+from .linalg.arrays import is_traced
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import unknown
 from .system import Reaction, Solved
@@ -34,6 +35,10 @@ class ConstraintViolation(NamedTuple):
 
     position: Float[Array, "times"]
     velocity: Float[Array, "times"]
+
+
+# The number of names that `print` of a motion shows.
+_SHOWN = 12
 
 
 class _ByName(Mapping[str, Any]):
@@ -52,6 +57,9 @@ class _ByName(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+    def __repr__(self) -> str:
+        return f"<of each {self._kind}: {', '.join(self._names)}>"
 
 
 def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
@@ -102,6 +110,23 @@ class Trajectory(eqx.Module):
     found_events: FoundEvents | None = None
     closer: "Trajectory | None" = None
 
+    def __repr__(self) -> str:
+        known = isinstance(self.ts, jax.Array | np.ndarray) and "num_steps" in self.stats
+        if not known or is_traced((self.ts, self.result, self.stats)):
+            return super().__repr__()
+        ts, steps, ended = (np.asarray(x) for x in (self.ts, self.stats["num_steps"], self.result._value))
+        finite, names = ts[np.isfinite(ts)], list(self)
+        span = f"t = {finite.min():.6g} to {finite.max():.6g}" if finite.size else "no time"
+        if ended.ndim:
+            good = np.sum(ended == RESULTS.successful._value)
+            text = f"Trajectories of {ended.size} runs of shape {ended.shape}, {good} successful: {span}"
+        else:
+            text = (
+                f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result] or 'successful'}"
+            )
+        more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
+        return f"{text}\nNames: {', '.join(names[:_SHOWN])}{more}"
+
     def __getitem__(self, name: str) -> Any:
         if name in self.system.motion_names():
             return self._motion(name)
@@ -135,8 +160,13 @@ class Trajectory(eqx.Module):
 
     @property
     def events(self) -> ContactEvents:
-        """Impacts, contacts that close and open, friction that sticks and slips: a table of times, parts, impulses and
-        energies lost.
+        """Impacts, contacts that close and open, friction that sticks and slips: `print` shows a table of times, parts,
+        kinds, impulses and energies lost.
+
+        ```python
+        for event in motion.events:
+            print(event.time, event.part, event.kind, event.impulse)
+        ```
         """
         if self.found_events is None:
             raise ValueError(
@@ -242,7 +272,9 @@ class Trajectory(eqx.Module):
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
-        """Forces of the joints of rigid bodies by name: `reactions["A"].force`."""
+        """What the joints of rigid bodies exert by name, each a `Reaction`: `reactions["A"].force` [N] in world axes,
+        shape (times, d), on the last of the joint's bodies that is not the ground, `.moment` [N m] and `.multipliers`.
+        """
         return _ByName("joint", self.system.joint_names(), self._reaction)
 
     @_of_each_member
@@ -325,7 +357,7 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without xarray, which `jaxmb[studies]` installs; `ValueError` for a batch.
         """
-        xarray, values = _package("xarray", "jaxmb[studies]"), self._table(names)
+        xarray, values = package_for_tables("xarray", "jaxmb[studies]"), self._table(names)
         components = _components(values)
         variables = {
             name: (("t",) if value.ndim == 1 else ("t", components[value.shape[1]][0]), value)
@@ -343,7 +375,7 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without pandas; `ValueError` for a batch.
         """
-        pandas, values = _package("pandas", "pandas"), self._table(names)
+        pandas, values = package_for_tables("pandas", "pandas"), self._table(names)
         components, columns = _components(values), {"t": np.asarray(self.ts)}
         for name, value in values.items():
             if value.ndim == 1:
@@ -430,13 +462,6 @@ def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[A
     names = {4: "euler_parameter", 3 if 3 in sizes else 2: "axis"}
     labels = lambda size: list("xyz"[:size]) if names.get(size) == "axis" else list(range(size))
     return {size: (names.get(size, f"component_of_{size}"), labels(size)) for size in sizes}
-
-
-def _package(name: str, install: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ImportError(f'This table needs {name}; install it with: pip install "{install}"') from None
 
 
 def _distance(a, b):

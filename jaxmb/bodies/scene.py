@@ -19,6 +19,7 @@ from ..parts.base import (
     AbstractForce,
     AbstractLink,
     AbstractNonIdeal,
+    AbstractPart,
     AbstractTendon,
     AbstractVelocityConstraint,
     KnownParts,
@@ -64,9 +65,9 @@ class Scene(eqx.Module):
     order; closed loops and redundant joints are the normal case.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
-    including drivers, rolling and `Servo`, tendons, and inertias of joints; `forces`: force elements, joint friction,
-    and at most one `Gravity`; `frames`: `planar.Frame` or `spatial.Frame`, which parts may name in place of bodies.
-    `"ground"` names the fixed world.
+    including drivers, rolling, `Stop`, rigid contacts and `Servo`, tendons, and inertias of joints; `forces`: force
+    elements, friction of joints and contacts, and at most one `Gravity`; `frames`: `planar.Frame` or `spatial.Frame`,
+    which parts may name in place of bodies. `"ground"` names the fixed world.
 
     **Raises:** `ValueError` for repeated or unknown names, parts of the other space, and bad numbers; the message
     names the part.
@@ -203,11 +204,13 @@ def _check_kinds(scene: Scene):
             )
     for part in scene.joints:
         if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractDryFriction):
-            raise ValueError(f"joints must hold constraints, got {part!r}.")
+            place = "" if not isinstance(part, AbstractLink | Gravity) else "; it belongs in forces="
+            raise ValueError(f"joints must hold constraints, got {_named(part)}{place}.")
     for part in scene.forces:
         # A concrete class: gravity is of no kind but its own, since it acts on every body.
         if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractDryFriction | Gravity):
-            raise ValueError(f"forces must hold force elements, joint friction, or Gravity, got {part!r}.")
+            place = "" if not isinstance(part, AbstractLink) else "; it belongs in joints="
+            raise ValueError(f"forces must hold force elements, friction, or Gravity, got {_named(part)}{place}.")
     if sum(not isinstance(part, AbstractActor) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     for frame in scene.frames:
@@ -218,6 +221,10 @@ def _check_kinds(scene: Scene):
         if dimension not in part.dimensions:
             here, there = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
             raise ValueError(f"{part.label} is {there}, but the scene is {here}; use the {here} part of that name.")
+
+
+def _named(part):
+    return part.label if isinstance(part, AbstractPart) else repr(part)
 
 
 def _check_names(scene: Scene):

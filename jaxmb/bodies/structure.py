@@ -59,8 +59,8 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
         raise ValueError(
-            f"The mechanism cannot be assembled from the given poses: residuals remain in {listed}. Check lengths, "
-            "points and axes for joints that contradict each other, or give better poses."
+            f"The mechanism cannot be assembled from the given poses: residuals [m, rad] remain in {listed}. Check "
+            "lengths, points and axes for joints that contradict each other, or give better poses."
         )
     joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, np.asarray(at.scale))
     check_gradients(system, np.asarray(at.row_norms))

@@ -114,7 +114,8 @@ class DryFriction(AbstractDryFriction):
     """Coulomb friction in a joint with one coordinate, or in a rigid contact, which sticks exactly.
 
     ```python
-    jaxmb.DryFriction("rub", "slide", coefficient=0.3, static_coefficient=0.4)
+    rub = jaxmb.DryFriction("rub", "slide", coefficient=0.3, static_coefficient=0.4)
+    scene = jaxmb.Scene([block], joints=[slide], forces=[rub])
     ```
 
     The slip of a joint is the rate of its displacement, or `radius` times that of its angle; the normal force is the

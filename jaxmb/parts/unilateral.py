@@ -178,7 +178,8 @@ class RigidContact(AbstractRigidContact):
     without a `DryFriction`.
 
     ```python
-    jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
+    floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
+    scene = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
     The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is a

@@ -69,7 +69,8 @@ def prescribe(
 
     **Returns:** the vector, and a static mask of the entries that were prescribed.
 
-    **Raises:** `ValueError` for unknown names, wrong shapes, and values that are no real numbers.
+    **Raises:** `ValueError` for unknown names, wrong shapes, values that are no real numbers, and entries that have two
+    values.
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"A {what} is prescribed by name, {{'crank.angle': 0.3}}; got {values!r}.")
@@ -81,6 +82,8 @@ def prescribe(
         shape = real_shape(f"{what.capitalize()} {name!r}", value)
         if shape not in ((), (len(index),)) or (shape == () and len(index) > 1):
             raise ValueError(f"{what.capitalize()} {name!r} has {len(index)} components, got shape {shape}.")
+        if fixed[index].any():
+            raise ValueError(f"{what.capitalize()} {name!r} is prescribed twice, by another name as well.")
         value = as_array(value, vector.dtype)
         vector = replaced(vector, np.array(index), value)
         fixed[index] = True

@@ -5,6 +5,7 @@ name, the second the velocities closest to the guess that satisfy `ψ(t, q, u) =
 `states/closest.py`.
 """
 
+import warnings
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -34,6 +35,8 @@ from .consistency import listed
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
+# Velocities that were given count as changed by more than this fraction; this many of them are named.
+_CHANGED, _NAMED = 0.01, 3
 # Singular values, of rows of unit length, that count as zero.
 _DEPENDENT = 1e-8
 
@@ -57,7 +60,9 @@ def assemble(
     **Arguments:**
 
     - `system`: a compiled scene, or another system.
-    - `guess`: where to start, default the poses and velocities given with the bodies.
+    - `guess`: where to start, default the poses and velocities given with the bodies; those that were not given are
+        zero there, so that a lone `angular_velocity` of a body that a joint holds is changed, with a warning:
+        prescribe it by `rates`.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
         of a joint's own; `{"floor.mode": 1}` closes a contact, 0 opens it; and values of internal states,
         `{"motor.torque": 2.0}`. Other internal states are those of the guess.
@@ -71,13 +76,16 @@ def assemble(
         `False` everywhere; `assembly_gap` says how far it is from closing. With `True` it is an error under `jit` as
         well, by a call of Python from the program, which JAX then does not keep on disk.
 
-    **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values.
+    **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values. It is
+    the closest one: the sum of the squares of all changes is the least, of positions and velocities in units of the
+    system's size, of angles in radians.
 
     **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
     coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the
     degrees of freedom. With `throw=True` under `jit`, a run-time error without the names.
     """
     check_system("assemble", system)
+    of_bodies = guess is None and rates is None
     guess = checked_guess("assemble", system, guess)
     t = checked_time("assemble", t, guess.q.dtype)
     z, fix = split_internal_states(system, guess.z, fix)
@@ -100,6 +108,8 @@ def assemble(
     if raises and not is_traced((ok, ok_rates)):
         if not ok_rates:
             raise ValueError(_cannot_move(system, t, q, u, fixed_rates))
+        if of_bodies and not is_traced((system, u)):
+            _warn_of_changed_velocities(system, guess.u, u)
         return State(q, u, z)
     ok = ok & ok_rates
     if throw:
@@ -108,6 +118,26 @@ def assemble(
         )
     state = State(q, u, z)
     return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
+
+
+def _warn_of_changed_velocities(system, given, found):
+    """Warn where velocities that were given with bodies contradict the constraints."""
+    given, found = np.asarray(given), np.asarray(found)
+    changed = []
+    for name, index in rates_of(system.rate_names()).items():
+        size = np.linalg.norm(given[index])
+        if name.endswith("velocity") and np.linalg.norm(found[index] - given[index]) > _CHANGED * size > 0:
+            before, after = (", ".join(f"{value:.4g}" for value in x[index]) for x in (given, found))
+            changed.append(f"{name} is {after} instead of {before}")
+    if changed:
+        more = f", and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+        first = changed[0].split(" is ")[0]
+        warnings.warn(
+            "The velocities given with the bodies, of which those left out are zero, contradict the constraints. Of "
+            f"the closest ones that do not, {'; '.join(changed[:_NAMED])}{more}. "
+            f"assemble(system, rates={{{first!r}: …}}) prescribes a rate, from which the others follow.",
+            stacklevel=4,
+        )
 
 
 def configuration(
@@ -164,7 +194,8 @@ def _cannot_assemble(system, t, q, fixed, names):
         text += f" with {', '.join(held)} fixed"
     dependent = _dependent(system, t, q, held, names)
     violated = violated_joints(system, t, q)
-    remain = f"residuals remain in {violated}"
+    units = " [m, rad]" if system.body_names else ""
+    remain = f"residuals{units} remain in {violated}"
     if dependent:
         return f"{text}: {dependent}{f'; {remain}' if violated else ''}. Fix fewer of them, or give values that agree."
     if violated:

@@ -70,8 +70,15 @@ class Reaction(NamedTuple):
 
 
 def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """The names that `rates=` takes, from those of a system's rates: theirs and those of coordinates."""
-    return {name.removesuffix("_rate"): index for name, index in names.items()} | dict(names)
+    """The names that `rates=` takes, from those of a system's rates: theirs, those of coordinates, and of planar bodies
+    the `angular_velocity`, as of bodies in space.
+    """
+    turns = {
+        f"{body}.angular_velocity": index
+        for body, end, index in ((*name.rpartition(".angle_rate")[:2], index) for name, index in names.items())
+        if end and f"{body}.velocity" in names
+    }
+    return turns | {name.removesuffix("_rate"): index for name, index in names.items()} | dict(names)
 
 
 def directions(names: Mapping[str, list[int]]) -> dict[int, str]:

@@ -42,13 +42,15 @@ def test_gap_and_its_derivatives(name):
 def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
     system = system_of(name)
     state = mb.assemble(system)
-    t, u = jnp.zeros(()), jnp.zeros_like(state.u)
+    # Balls that fall side by side would neither push nor pull.
+    t, u = jnp.zeros(()), jnp.linspace(0.5, -0.7, state.u.size)
     at = lambda mode: accelerations(system, Multipliers(), t, of.with_modes(system, state.q, mode), u)
     (free, none), (held, forces) = at(of.OPEN), at(of.CLOSED)
     (row,) = system.contacts.rows
     assert none[row] == 0
     left = of.direction_accelerations(system, t, state.q, u, held)
     np.testing.assert_allclose(left, 0.0, atol=1e-12)
+    assert abs(forces[row]) > 1e-3
     assert (forces[row] > 0) == (of.direction_accelerations(system, t, state.q, u, free)[0] < 0)
 
 

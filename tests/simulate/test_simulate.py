@@ -44,6 +44,9 @@ def test_steps_are_trimmed(dense):
     assert dense.ts.shape == (steps + 1,) and float(dense.ts[0]) == 0.0 and float(dense.ts[-1]) == 2.0
     assert np.all(np.diff(dense.ts) > 0)
     assert int(np.sum(dense.stats["orders"])) == steps
+    first, names = repr(dense).splitlines()
+    assert first == f"Trajectory: {steps + 1} saved from t = 0 to 2 in {dense.stats['num_steps']} steps; successful"
+    assert names == "Names: rod, pin" and repr(dense.reactions) == "<of each joint: pin>"
 
 
 def test_energy_momenta_and_save(dense, tmp_path):

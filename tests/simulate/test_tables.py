@@ -67,3 +67,31 @@ def test_what_is_no_table_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match='pip install "pandas"'):
         motion.to_pandas()
+
+
+def test_events_are_a_table_in_which_losses_of_energy_add_up():
+    """A ball with friction strikes a floor, and again: the parts lose the energy of an impact together."""
+    times, lost = np.array([0.5, 0.8]), np.array([2.0, 0.25])
+    events = mb.ContactEvents(
+        names=("floor", "rub"),
+        contacts=1,
+        times=times,
+        impulses=np.array([[3.0, -0.5], [1.0, -0.25]]),
+        energy_lost=lost,
+        before=np.array([[0.0, 0.0], [0.0, 0.0]]),
+        after=np.array([[0.0, 0.0], [0.0, 0.0]]),
+        rest=np.zeros((2, 2)),
+    )
+    head, *rows = str(events).splitlines()
+    assert head.split("  ")[0] == "time [s]" and "impulse [N s]" in head and head.endswith("energy lost [J]")
+    assert [row.split() for row in rows] == [
+        ["0.5", "floor", "impact", "3", "2"],
+        ["0.5", "rub", "impact", "-0.5"],
+        ["0.8", "floor", "impact", "1", "0.25"],
+        ["0.8", "rub", "impact", "-0.25"],
+    ]
+    frame = events.to_pandas()
+    assert list(frame.columns) == list(mb.Event._fields) and list(frame["part"]) == ["floor", "rub"] * 2
+    np.testing.assert_array_equal(frame.groupby("time")["energy_lost"].first(), lost)
+    first = events[0]
+    assert isinstance(first, mb.Event) and first.energy_lost == 2.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import spatial
+from jaxmb import planar, spatial
 from jaxmb.linalg.rotations import multiply, rotate
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -107,7 +107,7 @@ def test_axes_against_each_other_are_refused():
             mb.simulate(system, opposed, t1=0.1)
     # Where the attitude is held there is no other one.
     held = {f"body.e{k}": value for k, value in enumerate(p)}
-    with pytest.raises(ValueError, match=r"residuals remain in joint \("):
+    with pytest.raises(ValueError, match=r"residuals \[m, rad\] remain in joint \("):
         mb.assemble(system, opposed, fix=held)
 
 
@@ -127,3 +127,19 @@ def test_known_numbers_within_a_trace():
     expected = mb.assemble(system).q
     np.testing.assert_allclose(jax.jit(lambda x: x * mb.assemble(system).q)(1.0), expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(jax.jacfwd(lambda x: x * mb.assemble(system).q)(1.0), expected, rtol=0, atol=1e-12)
+
+
+def test_velocities_of_bodies_that_contradict_a_joint_are_told():
+    """A bar turns about a pin, and its centre, whose velocity was not given, does not."""
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0), angular_velocity=2.0)
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    system = mb.Scene([bar], joints=[pin]).compile()
+    told = r"bar\.angular_velocity is 1 instead of 2\. assemble\(system, rates=\{'bar\.angular_velocity': …\}\)"
+    with pytest.warns(UserWarning, match=told):
+        mb.assemble(system)
+    # It is prescribed by the name that it has in space as well, and that is no contradiction.
+    state = mb.assemble(system, rates={"bar.angular_velocity": 2.0})
+    np.testing.assert_allclose(state.u, [0.0, 1.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(mb.assemble(system, state).u, state.u)
+    with pytest.raises(ValueError, match=r"'bar\.angle' is prescribed twice"):
+        mb.assemble(system, rates={"bar.angular_velocity": 2.0, "bar.angle": 1.0})

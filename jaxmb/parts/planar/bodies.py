@@ -14,7 +14,8 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     """A planar rigid body with its initial guess; subclasses define mass and inertia.
 
     **Arguments:** `position` [m], shape (2,), of the origin of the body's frame, and `angle` [rad], a guess that
-    `assemble` improves; `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s] likewise.
+    `assemble` improves; `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s], a guess as well:
+    where joints contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
     """
 
     name: str = fields.name()
@@ -40,7 +41,8 @@ class Body(AbstractRigidBody):
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
     origin of the frame, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), of the
-    origin, and `angular_velocity` [rad/s] likewise; `centre` [m], shape (2,), the mass centre in the frame, default
+    origin, and `angular_velocity` [rad/s], a guess as well: where joints contradict them `assemble` changes both, and
+    `assemble(rates=)` prescribes one; `centre` [m], shape (2,), the mass centre in the frame, default
     its origin. Where a changed `"name.centre"` moves the mass centre, the guess of the frame stays.
     """
 

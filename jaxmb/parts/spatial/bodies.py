@@ -25,7 +25,8 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
 
     **Arguments:** `position` [m], shape (3,), of the origin of the body's frame, and `orientation`, shape (4,), unit
     Euler parameters (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,),
-    of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, likewise.
+    of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, a guess as well:
+    where joints contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
     """
 
     name: str = fields.name()
@@ -60,7 +61,8 @@ class Body(AbstractRigidBody):
     - `position` [m], shape (3,), of the origin of the frame, and `orientation`, shape (4,), unit Euler parameters
         (scalar first) from body to world: a guess that `assemble` improves.
     - `velocity` [m/s], shape (3,), of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the
-        body frame, likewise.
+        body frame, a guess as well: where joints contradict them `assemble` changes both, and `assemble(rates=)`
+        prescribes one.
     - `centre` [m], shape (3,), the mass centre in the frame, default its origin. Where a changed `"name.centre"` moves
         the mass centre, the guess of the frame stays.
     """

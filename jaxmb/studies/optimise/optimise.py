@@ -160,7 +160,7 @@ def optimise(
     ```python
     def drive(v):
         s = mb.with_parameters(vehicle, v)
-        motion = mb.simulate(s, start(s), t1=1.5, saveat=ts, throw=False)
+        motion = mb.simulate(s, start(s), t1=1.5, saveat=ts)
         return {"comfort": ride.vertical_rms(motion), "travel": jnp.abs(ride.arm_travel(motion)).max(axis=0)}
 
     limits = {"travel": (None, 0.3)}
@@ -170,8 +170,8 @@ def optimise(
     **Arguments:**
 
     - `function(values)`: outputs by name, numbers or arrays, from parameters by name; or a number, which is the
-        objective. It is made of JAX functions and compiled once. `simulate` and `assemble` need `throw=False`, so that
-        a trial that fails is NaN.
+        objective. It is made of JAX functions and compiled once. A trial whose `simulate` or `assemble` fails is NaN,
+        and steps are shorter.
     - `start`: starting values by name, or names alone of parameters of `system`.
     - `objective`: the output to make small, a number; may be left out if there is but one without a constraint.
     - `constraints`: outputs by name with their bounds `(low, high)`, either of them None, or with the number that they
@@ -338,8 +338,7 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
     what = f"At the start {named} not finite"
     cure = (
         "Start elsewhere, or return an output that tells how far the start is from a feasible one, such as "
-        "jaxmb.assembly_gap(...), with a constraint: constraints={'gap': (None, 0)}. Give assemble and simulate "
-        "throw=False."
+        "jaxmb.assembly_gap(...), with a constraint: constraints={'gap': (None, 0)}."
     )
     if not finite:
         raise ValueError(f"{what}. {cure}")
