@@ -123,6 +123,9 @@ def assemble(
 def _warn_of_changed_velocities(system, given, found):
     """Warn where velocities that were given with bodies contradict the constraints."""
     given, found = np.asarray(given), np.asarray(found)
+    least = np.min(np.abs(given[given != 0]), initial=np.inf)
+    if not np.any(given) or np.max(np.abs(found - given)) <= 0.5 * _CHANGED * least:
+        return
     changed = []
     for name, index in rates_of(system.rate_names()).items():
         size = np.linalg.norm(given[index])

@@ -52,17 +52,18 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
-    the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows.
+    the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows. The length
+    of a bar stands in the points of its joints and in its inertia: change all of them, or give it one name by
+    `design`.
 
     **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. For the
     weights of a module, a vector or a module that differs in nothing but its weights. Where design variables are among
     them, all parameters that follow from them are computed anew.
 
     **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, another module, numbers with
-    which the scene
-    would not compile, design variables out of bounds, and a parameter that follows from design variables. Under `jit`,
-    `vmap` or a derivative the numbers are not known yet; `simulate` then ends with `RESULTS.invalid_parameters`, before
-    the first step.
+    which the scene would not compile, design variables out of bounds, and a parameter that follows from design
+    variables. Under `jit`, `vmap` or a derivative the numbers are not known yet; `simulate` then ends with
+    `RESULTS.invalid_parameters`, before the first step.
     """
     paths = system.parameter_paths()
     variables = {name: own for own in system.design for name in own.values}

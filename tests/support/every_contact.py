@@ -32,13 +32,25 @@ class InsideBowl(AbstractGeometricContact):
 
 
 _GROUND = {"terrain": terrain.Bump(start=0.0, length=2.0, peak=0.2), "radius": 0.1}
+# Links that turn about their pins.
+_LINK_2D = planar.Body(
+    "link", mass=1.5, inertia=0.2, position=(0.4, 0.9), angle=0.2, velocity=(-0.24, 0.24), angular_velocity=0.6
+)
+_LINK_3D = spatial.Body(
+    "link",
+    mass=1.5,
+    inertia=(0.2, 0.25, 0.3),
+    position=(0.4, 0.1, 0.9),
+    velocity=(0.24, 0.0, -0.24),
+    angular_velocity=(0.0, 0.6, 0.0),
+)
 _PIN = planar.Revolute("pin", "ground", "link", point=(0.0, 0.5))
 _HINGE = spatial.Revolute("pin", "ground", "link", point=(0.0, 0.1, 0.5), axis=(0.0, 1.0, 0.0))
 # Parts with their bodies and with other joints.
 CONTACTS = {
-    "Stop in the plane": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.0), [_body_2d("link")], [_PIN]),
-    "Stop in space": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.5), [_body_3d("link")], [_HINGE]),
-    "Stop at one end": (mb.Stop("c", "pin.angle", upper=2.0), [_body_2d("link")], [_PIN]),
+    "Stop in the plane": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.0), [_LINK_2D], [_PIN]),
+    "Stop in space": (mb.Stop("c", "pin.angle", lower=-2.0, upper=2.5), [_LINK_3D], [_HINGE]),
+    "Stop at one end": (mb.Stop("c", "pin.angle", upper=2.0), [_LINK_2D], [_PIN]),
     "RigidContact in the plane": (mb.RigidContact("c", "a", centre=(0.1, 0.2), **_GROUND), [_body_2d("a")], []),
     "RigidContact in space": (mb.RigidContact("c", "a", centre=(0.1, 0.2, 0.0), **_GROUND), [_body_3d("a")], []),
     "RigidBallContact": (
