@@ -272,8 +272,10 @@ class Trajectory(eqx.Module):
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
-        """What the joints of rigid bodies exert by name, each a `Reaction`: `reactions["A"].force` [N] in world axes,
-        shape (times, d), on the last of the joint's bodies that is not the ground, `.moment` [N m] and `.multipliers`.
+        """Forces of the joints of rigid bodies by name, each a `Reaction`.
+
+        `reactions["A"].force` [N], shape (times, d), in world axes, acts on the last of the joint's bodies that is not
+        the ground; `.moment` [N m] about the joint's point; `.multipliers`.
         """
         return _ByName("joint", self.system.joint_names(), self._reaction)
 

@@ -199,23 +199,19 @@ def _check_kinds(scene: Scene):
         raise ValueError("A scene needs at least one body.")
     for body in scene.bodies:
         if not isinstance(body, AbstractBody):
-            raise ValueError(
-                f"bodies must hold Body or PointMass, got {body!r}; pass the others as joints= and forces=."
-            )
+            raise ValueError(f"bodies must hold Body or PointMass, got {_misplaced(body)}.")
     for part in scene.joints:
         if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractDryFriction):
-            place = "" if not isinstance(part, AbstractLink | Gravity) else "; it belongs in forces="
-            raise ValueError(f"joints must hold constraints, got {_named(part)}{place}.")
+            raise ValueError(f"joints must hold constraints, got {_misplaced(part)}.")
     for part in scene.forces:
         # A concrete class: gravity is of no kind but its own, since it acts on every body.
         if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractDryFriction | Gravity):
-            place = "" if not isinstance(part, AbstractLink) else "; it belongs in joints="
-            raise ValueError(f"forces must hold force elements, friction, or Gravity, got {_named(part)}{place}.")
+            raise ValueError(f"forces must hold force elements, friction, or Gravity, got {_misplaced(part)}.")
     if sum(not isinstance(part, AbstractActor) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
     for frame in scene.frames:
         if not isinstance(frame, AbstractFrame):
-            raise ValueError(f"frames must hold planar.Frame or spatial.Frame, got {frame!r}.")
+            raise ValueError(f"frames must hold planar.Frame or spatial.Frame, got {_misplaced(frame)}.")
     dimension = scene.bodies[0].dimension
     for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
         if dimension not in part.dimensions:
@@ -223,8 +219,19 @@ def _check_kinds(scene: Scene):
             raise ValueError(f"{part.label} is {there}, but the scene is {here}; use the {here} part of that name.")
 
 
-def _named(part):
-    return part.label if isinstance(part, AbstractPart) else repr(part)
+def _misplaced(part) -> str:
+    """What is in the wrong list of a scene, and in which one it belongs."""
+    if not isinstance(part, AbstractPart):
+        return repr(part)
+    if isinstance(part, AbstractBody):
+        place = "bodies"
+    elif isinstance(part, AbstractFrame):
+        place = "frames"
+    elif isinstance(part, AbstractLink) and not isinstance(part, AbstractForce | AbstractDryFriction):
+        place = "joints"
+    else:
+        place = "forces"
+    return f"{part.label}; it belongs in {place}="
 
 
 def _check_names(scene: Scene):
