@@ -18,12 +18,12 @@ def add_to(commands: Any) -> None:
     """Add the commands to a parser's commands."""
     command = commands.add_parser(
         "help",
-        help="print what a public name is, or list all of them",
-        description="Print the signature and the docstring of a public name, or list all names by subject.",
+        help="print what public names are, or list all of them",
+        description="Print the signatures and the docstrings of public names, or list all names by subject.",
     )
     command.add_argument(
-        "name",
-        nargs="?",
+        "names",
+        nargs="*",
         help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar, or a module: planar, solvers",
     )
     command.set_defaults(command=_help)
@@ -45,10 +45,10 @@ def add_to(commands: Any) -> None:
 def _help(arguments: argparse.Namespace) -> None:
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     styled = sys.stdout.isatty() and "NO_COLOR" not in os.environ
-    if arguments.name is None:
-        print(reference.listed(width, styled))
+    if arguments.names:
+        print("\n\n".join(reference.shown(reference.find(name), width, styled) for name in arguments.names))
     else:
-        print(reference.shown(reference.find(arguments.name), width, styled))
+        print(reference.listed(width, styled))
 
 
 def _reference(arguments: argparse.Namespace) -> None:

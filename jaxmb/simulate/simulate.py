@@ -85,6 +85,9 @@ def simulate(
     motion["bar"].angle, motion.energy, motion.reactions["pin"].force
     ```
 
+    The first call for a system compiles a program, which takes seconds; later ones with other numbers, times and
+    tolerances do not. `jax.jit` is not needed: it compiles the motion anew, as a part of its function.
+
     **Main arguments:**
 
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.

@@ -120,6 +120,9 @@ def test_help_on_a_name(capsys):
     assert main(["help", "Trajectory.reactions"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("jaxmb.Trajectory.reactions\n\nForces of the joints")
+    assert main(["help", "Trajectory.reactions", "Event"]) == 0
+    both = capsys.readouterr().out
+    assert both.startswith(out) and "jaxmb.Event(" in both
     assert main(["help"]) == 0
     out = capsys.readouterr().out
     assert "Scenes and their numbers" in out and "  mechanisms.four_bar  Crank, coupler and rocker" in out
