@@ -289,8 +289,9 @@ def _impact(system, t, y, formulation, touch, dated):
     z = y.z
     if z is not None:
         z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
-    # Without a solution the motion ends here.
-    u = jnp.where(event.solvable, event.u - event.late * event.after, jnp.nan)
+    # Without a solution the motion ends here, at infinite velocities; they are not a number where forces are none.
+    nowhere = jnp.where(jnp.all(jnp.isfinite(event.before)), jnp.inf, jnp.nan)
+    u = jnp.where(event.solvable, event.u - event.late * event.after, nowhere)
     return State(q + event.late * (before - after), u, z), event
 
 

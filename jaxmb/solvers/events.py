@@ -48,7 +48,8 @@ class Crossing(AbstractErrorWithMore):
     **Fields:** the `error` for the controller inside; the `target`: the time of the first zero in the step; one where a
     guard is negative `within` the step, and otherwise zero, since diffrax expects no truth values in an error; the
     `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
-    motion at the start of the step, since there was no state after an event; `touch` and `near` of the guards.
+    motion at the start of the step: there was no state after an event, and it gave an infinite one; `touch` and
+    `near` of the guards.
     """
 
     error: PyTree
@@ -146,7 +147,7 @@ def crossing(
     )
     found = lax.while_loop(lambda search: search.phase != _DONE, advance, first)
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
-    lost = ~jnp.all(jnp.isfinite(ravel(y0)))
+    lost = jnp.any(jnp.isinf(ravel(y0)))
     within, falling, lost = (x.astype(start.dtype) for x in (found.dips, falling, lost))
     touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
     return Crossing(error, t0 + found.b * (t1 - t0), within, jnp.min(found.end), falling, lost, touch, near)
