@@ -48,7 +48,7 @@ def find_multipliers(
         x, _ = carry
         force, push = jax.linearize(law, x)
         slope = influence @ jax.vmap(push, out_axes=1)(one)
-        step = _solve(one - slope, start + influence @ force - x)
+        step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
         size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
         return (x + step, slope), jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
@@ -67,12 +67,14 @@ def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
     """Whether the spectral radius of a matrix T ≥ 0 is below 1; its diagonal may be negative."""
     # Only then is I − T an M-matrix: some y > 0 has (I − T) y > 0.
     n = coupling.shape[0]
-    y = _solve(jnp.eye(n, dtype=coupling.dtype) - coupling, jnp.ones(n, coupling.dtype))
+    y = solve_coupled(jnp.eye(n, dtype=coupling.dtype) - coupling, jnp.ones(n, coupling.dtype))
     return jnp.all((y > 0) & jnp.isfinite(y))
 
 
-def _solve(matrix, b):
-    # Where the coupling contracts, the diagonal dominates in some units, and its pivots need no search.
+def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Array, "k"]:
+    """Solve with `1 − P ∂C/∂x`. Where the coupling contracts, the diagonal dominates in some units, and its pivots need
+    no search.
+    """
     return gauss_jordan(matrix, b.size) @ b
 
 

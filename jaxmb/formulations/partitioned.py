@@ -2,7 +2,9 @@
 
 from typing import ClassVar
 
-from ..linalg.elimination import solve_positive
+from jaxtyping import Array, Float
+
+from ..linalg.elimination import gauss_jordan, positive_solver
 from .formulation import AbstractFormulation
 
 
@@ -28,10 +30,30 @@ class Partitioned(AbstractFormulation):
     partitions: ClassVar[bool] = True
     inverts_mass: ClassVar[bool] = False
 
+    def prepared(self, inertia, jacobian):
+        null_space = jacobian.dense().pivoted.null_space
+        reduced = null_space.T @ inertia.product(null_space)
+        return ReducedPartitioned(gauss_jordan(reduced, reduced.shape[0]))
+
     def solve(self, inertia, force, jacobian, gamma):
         factor = jacobian.dense().pivoted
-        particular = factor.right_inverse @ gamma
-        reduced = factor.null_space.T @ inertia.product(factor.null_space)
-        independent = solve_positive(reduced, factor.null_space.T @ (force - inertia.product(particular)))
-        udot = particular + factor.null_space @ independent
-        return udot, factor.right_inverse.T @ (inertia.product(udot) - force)
+        reduced = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
+        return _solve(inertia, force, factor, gamma, reduced)
+
+
+class ReducedPartitioned(AbstractFormulation):
+    """The same with an `inverse` of `EᵀME` that is known already."""
+
+    inverse: Float[Array, "f f"]
+    partitions: ClassVar[bool] = True
+    inverts_mass: ClassVar[bool] = False
+
+    def solve(self, inertia, force, jacobian, gamma):
+        return _solve(inertia, force, jacobian.dense().pivoted, gamma, lambda load: self.inverse @ load)
+
+
+def _solve(inertia, force, factor, gamma, reduced):
+    particular = factor.right_inverse @ gamma
+    independent = reduced(factor.null_space.T @ (force - inertia.product(particular)))
+    udot = particular + factor.null_space @ independent
+    return udot, factor.right_inverse.T @ (inertia.product(udot) - force)

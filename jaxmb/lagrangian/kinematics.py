@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ else:
     from equinox import AbstractVar
 
 # Functions of the user take `t`, `q`, then velocities if they depend on them, and the parameters: a dictionary of
-# numbers by name.
-Parameters = dict[str, Array]
+# numbers, and of modules, by name.
+Parameters = dict[str, Any]
 
 
 class AbstractKinematics(eqx.Module):

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
+from ..parts.module_weights import ModuleWeights
 from ..parts.series import AbstractSignal
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
 from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
 from ..system.design_variables import DesignVariables, description_rows
 from .constraints import AbstractCoordinateConstraint
-from .kinematics import AbstractKinematics
+from .kinematics import AbstractKinematics, Parameters
 from .nonideal import AbstractNonIdealForce
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class AbstractLagrangian(AbstractSystem):
     nonideal: tuple[AbstractNonIdealForce, ...]
     kinematics: AbstractKinematics
     equations: AbstractEquations
-    parameters: dict[str, Array]
+    parameters: Parameters
     guess: State
     length: Float[Array, ""]
     coordinates: tuple[str, ...] = eqx.field(static=True)
@@ -121,9 +122,14 @@ class AbstractLagrangian(AbstractSystem):
         return {f"u{k}": [k] for k in range(self.nu)}
 
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
-        return {name: [(_parameter(name), None)] for name in self.parameters}
+        modules = self.module_structures()
+        return {name: [(_parameter(name, name in modules), None)] for name in self.parameters}
 
-    def parameters_at(self, t: Scalar) -> dict[str, Array]:
+    def module_structures(self):
+        # A concrete class: the other parameters are numbers.
+        return {name: own.like for name, own in self.parameters.items() if isinstance(own, ModuleWeights)}
+
+    def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""
         at = lambda name: jnp.asarray(self.inputs[name].signal(t), self.parameters[name].dtype)
         return self.parameters | {name: at(name) for name in self.inputs}
@@ -283,5 +289,5 @@ class Projected(AbstractEquations):
         return pull(total + system.applied_force(t, q, v))[0]
 
 
-def _parameter(name: str) -> Callable[[Any], Array]:
-    return lambda system: system.parameters[name]
+def _parameter(name: str, is_module: bool) -> Callable[[Any], Array]:
+    return lambda system: system.parameters[name].values if is_module else system.parameters[name]

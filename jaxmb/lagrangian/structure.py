@@ -18,7 +18,7 @@ from ..states.redundancy import check_gradients, check_implied_as_one
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
-from .kinematics import AbstractKinematics
+from .kinematics import AbstractKinematics, Parameters
 from .model import AbstractLagrangian
 
 # Number of sets of parameters at which the entries of the mass matrix are compared with zero.
@@ -41,7 +41,7 @@ def constraint_sizes(
     constraints: tuple[AbstractCoordinateConstraint, ...],
     kinematics: AbstractKinematics,
     guess: State,
-    parameters: dict[str, Array],
+    parameters: Parameters,
 ) -> tuple[int, ...]:
     """The number of rows of each constraint, from shapes alone.
 

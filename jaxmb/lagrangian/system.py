@@ -12,6 +12,7 @@ from jaxtyping import Array
 from .._compat import with_values
 from .._types import State, VectorLike
 from ..parts.fields import as_jax
+from ..parts.module_weights import ModuleWeights, as_weights
 from ..parts.series import AbstractSignal
 from ..system.equation import Ranks
 from .constraints import check_names
@@ -62,7 +63,8 @@ class LagrangianSystem(AbstractLagrangian):
     - `kinematics`: the meaning of u; default `Rates()`, u = q̇.
     - `equations`: how they are written; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
     - `q`, `u`: a state near the constraints, the guess for `assemble`; ranks are found there. Default u is zero.
-    - `parameters`: numbers by name.
+    - `parameters`: numbers by name. An equinox module, such as a network, is called in the functions,
+        `parameters["net"](v)`; its weights are one parameter, a vector, as in `Force`.
     - `coordinates`: names of the coordinates, which a saved motion keeps them under, so no `t`, `q`, `u`, `energy`,
         `file`, and no slashes; default `q0`, `q1`, ….
     - `length`: the size that residuals of positions are relative to.
@@ -92,7 +94,7 @@ class LagrangianSystem(AbstractLagrangian):
         equations: AbstractEquations | None = None,
         q: VectorLike,
         u: VectorLike | None = None,
-        parameters: Mapping[str, VectorLike] | None = None,
+        parameters: Mapping[str, VectorLike | eqx.Module] | None = None,
         coordinates: Sequence[str] | None = None,
         length: VectorLike = 1.0,
     ):
@@ -102,7 +104,7 @@ class LagrangianSystem(AbstractLagrangian):
         functions = _lagrangian(lagrangian, kinetic, potential), force
         # Φ, then the rest of ψ, then rows that bind accelerations only.
         constraints = tuple(sorted(constraints, key=lambda c: c.level))
-        numbers = {name: as_jax(value) for name, value in (parameters or {}).items()}
+        numbers = {name: _number(name, value) for name, value in (parameters or {}).items()}
         model = Unanalysed(
             lagrangian=functions[0],
             applied=force,
@@ -139,7 +141,10 @@ def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
     t = jnp.zeros((), q.dtype)
     with_number = lambda name, x: eqx.tree_at(lambda s: s.parameters[name], system, x)
     out = {}
+    modules = system.module_structures()
     for name, signal in signals.items():
+        if name in modules:
+            raise ValueError(f"{name!r} is a module, whose weights are not a function of time.")
         number = (system.parameters[name],)
         reaches = lambda kernel, name=name, number=number: depends(lambda x: kernel(with_number(name, x)), number, 0)
         of_rates = reaches(lambda s: s.rates(t, q, u))
@@ -150,6 +155,14 @@ def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
             )
         out[name] = DrivenParameter(signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u)))
     return out
+
+
+def _number(name: str, value: Any) -> Array | ModuleWeights:
+    try:
+        # A concrete class, since anything else is a number.
+        return as_weights(value) if isinstance(value, eqx.Module) else as_jax(value)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"Parameter {name!r}: {error}.") from None
 
 
 def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) -> State:

@@ -11,6 +11,8 @@ Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Di
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -246,10 +248,18 @@ def gauss_jordan(B: Float[Array, "r n"], r: int) -> Float[Array, "r n"]:
     return _sweep(B)
 
 
-def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """Solve with a symmetric positive definite matrix or a root of one: diagonal pivots need no search."""
+def positive_solver(M: Float[Array, "n n"]) -> Callable[[Float[Array, "n *k"]], Float[Array, "n *k"]]:
+    """`b -> M⁻¹ b` for a symmetric positive definite matrix or a root of one: diagonal pivots need no search."""
     n = M.shape[0]
-    return b / M[0, 0] if n == 1 else gauss_jordan(M, n) @ b
+    if n == 1:
+        return lambda b: b / M[0, 0]
+    inverse = gauss_jordan(M, n)
+    return lambda b: inverse @ b
+
+
+def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """The same for one b."""
+    return positive_solver(M)(b)
 
 
 @jax.custom_jvp

@@ -61,29 +61,45 @@ class AbstractConstraints(eqx.Module):
         and `A u̇ − γ` by `−rows`.
         """
 
+    def cancel_residuals(
+        self,
+        system: AbstractEquation,
+        at: tuple[Scalar, Coordinates, Velocities],
+        multipliers: Float[Array, "m"],
+        forces: Float[Array, "nu"],
+        rows: Float[Array, "m"],
+    ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
+        """The same for `M u̇ − F − Aᵀ λ − C(λ)`, at (t, q, u) and multipliers λ, with the change of those that C depends
+        on; None without any.
+        """
+        del multipliers
+        return self.cancel_accelerations(system.inertia(*at), forces, rows), None
+
 
 class SolvedState(eqx.Module):
     """A state whose equations of motion are solved; constants.
 
-    **Fields:** the `constraints` there; the accelerations `udot`; the `multipliers`, or None if they are not known.
+    **Fields:** the `constraints` there; the accelerations `udot`; the `multipliers`, or None if they are not known; in
+    a chart those that friction depends on.
     """
 
     constraints: AbstractConstraints
     udot: Float[Array, "nu"]
-    multipliers: Float[Array, "m"] | None
+    multipliers: Float[Array, "m"] | Float[Array, "k"] | None
 
 
 class RestoredState(eqx.Module):
     """A state on the constraints and its accelerations.
 
-    **Fields:** `q`, `u`, `udot`; `multipliers`, or None if they are not known; the number of `iterations` for positions
-    and whether any iteration `failed`; all but the first three are None in tangents.
+    **Fields:** `q`, `u`, `udot`; `multipliers`, or None if they are not known, in a chart those that friction depends
+    on; the number of `iterations` for positions and whether any iteration `failed`; all but the first three are None in
+    tangents.
     """
 
     q: Coordinates
     u: Velocities
     udot: Float[Array, "nu"]
-    multipliers: Float[Array, "m"] | None = None
+    multipliers: Float[Array, "m"] | Float[Array, "k"] | None = None
     iterations: Int[Array, ""] | None = None
     failed: Bool[Array, ""] | None = None
 
@@ -162,10 +178,12 @@ def push_accelerations(
 
     def equations(system, t, q, u):
         applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
+        if not system.ideal:
+            applied = applied + system.nonideal_force(t, q, u, multipliers)
         return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
 
     rows, forces = push(equations, at, along)
-    return here.cancel_accelerations(system.inertia(t, q, u), forces, rows)
+    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)[0]
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:

@@ -11,6 +11,7 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
 """
 
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -25,9 +26,10 @@ from .._results import RESULTS
 from .._types import Coordinates, Scalar, State, Velocities
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels, solve_constrained
-from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, solve_positive
+from ..formulations.friction import solve_coupled
+from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
-from ..linalg.newton import chord
+from ..linalg.newton import chord, root
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
 from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
@@ -79,13 +81,18 @@ class ChartIndices(eqx.Module):
 
 
 class ConstrainedAcceleration(eqx.Module):
-    """Velocities on the manifold of their coordinates, accelerations, the factor of the velocities' Jacobian, and
-    whether friction `failed` to determine the accelerations; None of a system without.
+    """Velocities on the manifold of their coordinates, and accelerations.
+
+    **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; that of `every` row of A, None where none binds
+    accelerations only; of a system with friction, the `multipliers` of the rows that it depends on, and whether it
+    `failed` to determine the accelerations; None of others.
     """
 
     u: Velocities
     udot: Float[Array, "nu"]
     factor: Factor
+    every: Factor | None = None
+    multipliers: Float[Array, "k"] | None = None
     failed: Bool[Array, ""] | None = None
 
 
@@ -138,33 +145,6 @@ def _ideal_acceleration(system, formulation, t, q, u, order):
     return ConstrainedAcceleration(u, udot, solved)
 
 
-@eqx.filter_jit
-def general_acceleration(
-    system: AbstractEquation,
-    formulation: AbstractFormulation,
-    t: Scalar,
-    q: Coordinates,
-    u: Velocities,
-    split: ChartIndices,
-) -> ConstrainedAcceleration:
-    """The same for any constraints, ideal or not, also those that bind accelerations only. The factors are those of
-    this state, and are differentiated with it.
-    """
-
-    def velocity_factor(u):
-        return eliminate(system.velocity_jacobian(t, q, u), split.velocity, system.velocity_rank)
-
-    solved = velocity_factor(u)
-    u = u - solved.right_inverse @ system.velocity_residual(t, q, u)
-    if not system.linear:
-        solved = velocity_factor(u)
-        u = u - solved.right_inverse @ system.velocity_residual(t, q, u)
-    jacobian = system.jacobian(t, q, u)
-    every = solved if split.acceleration is None else eliminate(jacobian, split.acceleration, system.acceleration_rank)
-    out = solve_constrained(system, formulation, t, q, u, DenseJacobian(jacobian, every, every.rows))
-    return ConstrainedAcceleration(u, out.udot, solved, out.failed)
-
-
 @_ideal_acceleration.def_jvp
 def _ideal_acceleration_jvp(primals, tangents):
     system, formulation, t, q, u, order = primals
@@ -177,6 +157,50 @@ def _ideal_acceleration_jvp(primals, tangents):
     dfactor = Factor(-(pushed @ solved.right_inverse), -(pushed @ solved.null_space), None)
     dudot = push_accelerations(here, at, along, RestoredState(q, out.u, out.udot))
     return out, ConstrainedAcceleration(along[3], dudot, dfactor)
+
+
+@eqx.filter_jit
+def general_acceleration(
+    system: AbstractEquation,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    q: Coordinates,
+    u: Velocities,
+    split: ChartIndices,
+) -> ConstrainedAcceleration:
+    """The same for any constraints, ideal or not, also those that bind accelerations only."""
+    return _general_acceleration(system, formulation, t, q, u, split)
+
+
+@eqx.filter_custom_jvp
+def _general_acceleration(system, formulation, t, q, u, split):
+    def velocity_factor(u):
+        return eliminate(system.velocity_jacobian(t, q, u), split.velocity, system.velocity_rank)
+
+    solved = velocity_factor(u)
+    u = u - solved.right_inverse @ system.velocity_residual(t, q, u)
+    if not system.linear:
+        solved = velocity_factor(u)
+        u = u - solved.right_inverse @ system.velocity_residual(t, q, u)
+    jacobian = system.jacobian(t, q, u)
+    every = None if split.acceleration is None else eliminate(jacobian, split.acceleration, system.acceleration_rank)
+    factor = solved if every is None else every
+    out = solve_constrained(system, formulation, t, q, u, DenseJacobian(jacobian, factor, factor.rows))
+    own = None if out.failed is None else out.multipliers[system.friction_rows]
+    return ConstrainedAcceleration(u, out.udot, solved, every, own, out.failed)
+
+
+@_general_acceleration.def_jvp
+def _general_acceleration_jvp(primals, tangents):
+    system, formulation, t, q, u, split = primals
+    dsystem, _, dt, dq, du, _ = tangents
+    out = general_acceleration(system, formulation, t, q, u, split)
+    here, at = _chart_constraints(split, system, t, q, out.u), (system, t, q, out.u)
+    along = push_velocities(here, at, (dsystem, dt, dense(dq, q), dense(du, u)))
+    dudot = push_accelerations(here, at, along, RestoredState(q, out.u, out.udot, out.multipliers))
+    # Nothing that is differentiated depends on the factors and the multipliers.
+    none = jax.tree.map(lambda _: None, out)
+    return out, eqx.tree_at(lambda out: (out.u, out.udot), none, (along[3], dudot), is_leaf=lambda x: x is None)
 
 
 @eqx.filter_custom_jvp
@@ -217,18 +241,22 @@ def _push_positions(own, at, along):
 
 def _chart_constraints(split, system, t, q, u):
     """The constraints in a chart at a state."""
-    factor = eliminate(system.jacobian(t, q, u), split.velocity, system.velocity_rank)
-    return ChartConstraints(factor, split)
+    jacobian = system.jacobian(t, q, u)
+    factor = eliminate(jacobian[: system.velocity_rows], split.velocity, system.velocity_rank)
+    every = None if split.acceleration is None else eliminate(jacobian, split.acceleration, system.acceleration_rank)
+    return ChartConstraints(factor, split, every)
 
 
 class ChartConstraints(AbstractConstraints):
     """The constraints in a chart: independent coordinates and velocities keep their values.
 
-    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`.
+    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`; the factor of `every` row of A, None
+    where none binds accelerations only.
     """
 
     factor: Factor
     split: ChartIndices
+    every: Factor | None = None
 
     def restore(self, system, t, y, near, tol):
         q, iterations, failed = restore_positions(system, t, y.q, self.split, tol)
@@ -240,20 +268,37 @@ class ChartConstraints(AbstractConstraints):
             step = right_inverse @ system.velocity_residual(t, q, u)
             u = u - step
             failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(u))))
-        # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ`. The accelerations are wrong by the
-        # square of the distance.
-        out = RestoredState(q, u, near.udot, None, iterations, failed)
-        rows = system.acceleration_residual(t, q, u, near.udot)
-        unbalanced = self._unbalanced(system, t, out)
-        forces = unbalanced - system.constraint_force(t, q, u, right_inverse.T @ unbalanced)
-        udot = near.udot + self.cancel_accelerations(system.inertia(t, q, u), forces, rows)
-        return RestoredState(q, u, udot, None, iterations, failed)
+        # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are wrong by
+        # the square of the distance.
+        at, own = (t, q, u), system.friction_rows
+        rows = system.acceleration_residual(*at, near.udot)
+        unbalanced = self._unbalanced(system, t, RestoredState(q, u, near.udot))
+        unbalanced = unbalanced - self._friction(system, at, near.multipliers)
+        multipliers = self._of_accelerations.right_inverse.T @ unbalanced
+        if near.multipliers is not None:
+            multipliers = multipliers.at[own].set(near.multipliers)
+        forces = unbalanced - system.constraint_force(*at, multipliers)
+        change, reactions = self.cancel_residuals(system, at, multipliers, forces, rows)
+        found = None if near.multipliers is None or reactions is None else near.multipliers + reactions
+        return RestoredState(q, u, near.udot + change, found, iterations, failed)
 
     def at(self, system, t, q, u):
         return _chart_constraints(self.split, system, t, q, u)
 
     def multipliers(self, system, t, restored):
-        return self.factor.right_inverse.T @ self._unbalanced(system, t, restored)
+        at, rows, balance = (t, restored.q, restored.u), system.friction_rows, self._of_accelerations.right_inverse.T
+        unbalanced = self._unbalanced(system, t, restored)
+        found = lambda own: balance @ (unbalanced - self._friction(system, at, own))
+        if restored.multipliers is None:
+            return found(None)
+        return found(root(lambda own: own - found(own)[rows], restored.multipliers, lambda _, own: own))
+
+    def _friction(self, system, at, own):
+        """`C` at (t, q, u), from the multipliers that it depends on."""
+        if system.ideal:
+            return jnp.zeros(system.nu, at[2].dtype)
+        none = jnp.zeros(system.acceleration_rows, at[2].dtype)
+        return system.nonideal_force(*at, none if own is None else none.at[system.friction_rows].set(own))
 
     def _unbalanced(self, system, t, at):
         """`M u̇ − F`, what the constraints have to balance."""
@@ -269,11 +314,40 @@ class ChartConstraints(AbstractConstraints):
     def cancel_velocities(self, residual):
         return -(self.factor.right_inverse @ residual)
 
+    @property
+    def _of_accelerations(self) -> Factor:
+        return self.factor if self.every is None else self.every
+
     def cancel_accelerations(self, inertia, forces, rows):
-        factor, particular = self.factor, self.cancel_velocities(rows)
-        reduced = factor.null_space.T @ inertia.product(factor.null_space)
-        load = factor.null_space.T @ (forces + inertia.product(particular))
-        return particular - factor.null_space @ solve_positive(reduced, load)
+        return self._cancelling(inertia)(forces, rows)
+
+    def _cancelling(self, inertia):
+        """`cancel_accelerations` for several forces and rows."""
+        factor = self._of_accelerations
+        solve = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
+
+        def cancel(forces, rows):
+            particular = -(factor.right_inverse @ rows)
+            load = factor.null_space.T @ (forces + inertia.product(particular))
+            return particular - factor.null_space @ solve(load)
+
+        return cancel
+
+    def cancel_residuals(self, system, at, multipliers, forces, rows):
+        inertia, own = system.inertia(*at), system.friction_rows
+        cancel = self._cancelling(inertia)
+        change = cancel(forces, rows)
+        if own.size == 0:
+            return change, None
+        # Friction answers a change of the multipliers that it depends on, and so changes them again.
+        law = lambda x: system.nonideal_force(*at, multipliers.at[own].set(x))
+        frictions = jax.jacfwd(law)(multipliers[own]).T
+        responses = jax.vmap(lambda force: cancel(-force, jnp.zeros_like(rows)))(frictions)
+        balance = self._of_accelerations.right_inverse[:, own].T
+        reaction = lambda change, forces: balance @ (inertia.product(change) + forces)
+        coupling = jax.vmap(reaction, out_axes=1)(responses, -frictions)
+        own_change = solve_coupled(jnp.eye(own.size, dtype=rows.dtype) - coupling, reaction(change, forces))
+        return change + own_change @ responses, own_change
 
 
 # The default, made once.
@@ -352,7 +426,7 @@ class Chart(eqx.Module):
 
     **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H| and, with
     redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties; `redundant`: None
-    where all rows are independent.
+    where all rows are independent; `multipliers` of the rows that friction depends on, None without any.
     """
 
     split: ChartIndices
@@ -360,6 +434,7 @@ class Chart(eqx.Module):
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
     redundant: RedundantRows | None = None
+    multipliers: Float[Array, "k"] | None = None
 
     @property
     def age(self) -> Int[Array, ""]:
@@ -404,7 +479,9 @@ class PartitionTerm(AbstractManifoldTerm):
         choose = lambda system: _choose(system, t, y, _of_coordinates(system, t, y))
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, system))
         redundant = RedundantRows(row_sizes(system, t, y), jnp.zeros((), y.q.dtype)) if drops_rows(system) else None
-        return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant)
+        frictions = system.friction_rows.size
+        multipliers = jnp.zeros(frictions, y.q.dtype) if frictions else None
+        return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant, multipliers)
 
     def evaluate(self, t, y, chart, args):
         q = correct_positions(self.system, t, y.q, lax.stop_gradient(chart.split))
@@ -412,6 +489,7 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def _evaluate(self, t, q, u, chart):
         system, split, quality, failed = self.system, chart.split, chart.quality, None
+        multipliers = chart.multipliers
         if system.acceleration_rows == 0:
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
         else:
@@ -419,25 +497,26 @@ class PartitionTerm(AbstractManifoldTerm):
                 out = ideal_acceleration(system, self.formulation, t, q, u, split.velocity)
             else:
                 out = general_acceleration(system, self.formulation, t, q, u, split)
-                failed = out.failed
-            u, udot, factors = out.u, out.udot, out.factor
-            quality = _velocity_quality(system, factors, split.velocity)
+                failed, multipliers = out.failed, out.multipliers
+            u, udot, factors = out.u, out.udot, (out.factor, out.every)
+            quality = _velocity_quality(system, out.factor, split.velocity)
             if split.coordinate is None:
-                split = ChartIndices(split.velocity, split.acceleration, None, factors.right_inverse)
-        chart = Chart(split, quality, chart.fresh, chart.counters, chart.redundant)
+                split = ChartIndices(split.velocity, split.acceleration, None, out.factor.right_inverse)
+        chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=multipliers)
         f = State(system.rates(t, q, u), udot)
         failed = chart.singular if failed is None else chart.singular | failed
         return ManifoldEvaluation(State(q, u), f, chart, failed, factors)
 
     def project_near(self, t, y, linearized_at, args):
         system, chart = self.system, linearized_at.chart
-        if system.acceleration_rows == 0 or not system.ideal_on_velocities:
+        if system.acceleration_rows == 0:
             return self._project(t, y, chart, chart.split)
-        constraints = ChartConstraints(linearized_at.factors, chart.split)
-        near = SolvedState(constraints, lax.stop_gradient(linearized_at.f.u), None)
+        constraints = ChartConstraints(linearized_at.factors[0], chart.split, linearized_at.factors[1])
+        near = SolvedState(constraints, *lax.stop_gradient((linearized_at.f.u, chart.multipliers)))
         out: Any = restore(system, t, y, near, self.newton_tol)
         f = State(system.rates(t, out.q, out.u), out.udot)
-        chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
+        failed = out.failed | chart.singular
+        chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=out.multipliers)
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
 
     def project_cold(self, t, y, chart, args):
@@ -457,17 +536,17 @@ class PartitionTerm(AbstractManifoldTerm):
         return out._replace(failed=failed | out.failed)
 
     def kept(self, chart):
-        return eqx.tree_at(lambda split: split.right_inverse, chart.split, None)
+        return eqx.tree_at(lambda split: split.right_inverse, chart.split, None), chart.multipliers
 
     def at_solution(self, t, y, f, kept, args):
-        system = self.system
-        if system.acceleration_rows > 0 and system.ideal_on_velocities:
-            out = solved(eqx.Partial(_chart_constraints, kept), system, t, RestoredState(y.q, y.u, f.u))
+        system, (split, multipliers) = self.system, kept
+        if system.acceleration_rows > 0:
+            solution = RestoredState(y.q, y.u, f.u, multipliers)
+            out = solved(eqx.Partial(_chart_constraints, split), system, t, solution)
             return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
-        split = kept
         if system.coordinate_rank:
-            own = coordinate_factor(*lax.stop_gradient((system, t, y.q)), kept)
-            split = ChartIndices(kept.velocity, kept.acceleration, kept.coordinate, own.right_inverse)
+            own = coordinate_factor(*lax.stop_gradient((system, t, y.q)), split)
+            split = ChartIndices(split.velocity, split.acceleration, split.coordinate, own.right_inverse)
         none = jnp.zeros(1 + drops_rows(system), y.q.dtype)
         out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
         return out.y, out.f
@@ -517,7 +596,7 @@ def _counted(chart, iterations):
     """The chart after a Newton iteration for positions."""
     age, _, newton, charts, singular = chart.counters
     counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
-    return Chart(chart.split, chart.quality, chart.fresh, counters, chart.redundant)
+    return dataclasses.replace(chart, counters=counters)
 
 
 @eqx.filter_jit
@@ -531,7 +610,7 @@ def _updated(system, t, y, chart, max_influence):
         def renew(chart):
             split, fresh, singular = _choose(system, t, y, jacobian)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
-            return Chart(split, fresh, fresh, counters, chart.redundant)
+            return dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
 
         return cond_of_lanes(worse(chart), renew, lambda chart: chart, chart)
 
@@ -544,11 +623,12 @@ def _updated(system, t, y, chart, max_influence):
         split, own = _refreshed(system, jacobian, chart.split)
         quality = jnp.maximum(chart.quality, own)
         # Only a chart that has been refreshed can be worse.
-        refreshed = Chart(split, quality, chart.fresh, chart.counters.at[0].set(0), chart.redundant)
+        counters = chart.counters.at[0].set(0)
+        refreshed = dataclasses.replace(chart, split=split, quality=quality, counters=counters)
         return renewed(refreshed, jacobian)
 
     def keep(chart):
-        return Chart(chart.split, chart.quality, chart.fresh, chart.counters.at[0].add(1), chart.redundant)
+        return dataclasses.replace(chart, counters=chart.counters.at[0].add(1))
 
     return cond_of_lanes(stale, refresh, keep, chart)
 

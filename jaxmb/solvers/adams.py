@@ -70,6 +70,10 @@ class AdamsState(AbstractMultistepState):
     def memory(self) -> Float[Array, "length n"]:
         return self.history.differences
 
+    @property
+    def chosen(self) -> Int[Array, ""]:
+        return self.order
+
 
 class _Step(AbstractAttempt):
     """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas (of a

@@ -121,6 +121,12 @@ class AdamsSteps(AbstractSteps):
         kept = kept_of_chart(terms, new.chart)
         return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
 
+    def alone(self, solver_state):
+        return solver_state.alone()
+
+    def chosen(self, solver_state):
+        return solver_state.chosen
+
     def memory(self, solver_state):
         return solver_state.memory
 

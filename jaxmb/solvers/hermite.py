@@ -69,6 +69,10 @@ class HermiteState(AbstractMultistepState):
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
         return self.history.differences, self.slope
 
+    @property
+    def chosen(self) -> Int[Array, ""]:
+        return self.order_index
+
 
 class _Step(AbstractAttempt):
     """The numbers of a step: the state `after` it, the history there and its `slope`; the `ends` of the step by every

@@ -22,6 +22,8 @@ from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
 from .linear_map import filled, linear_map
+from .packing import Layout
+from .segments import Row, Segments, choice_of, row_of, start_of
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
@@ -29,20 +31,6 @@ _TOO_LONG = (
     "Second derivatives need the rows of all steps, of which {} are kept; this run has more: simulate(..., "
     "adjoint=jaxmb.solvers.MeshAdjoint(most)) keeps others."
 )
-
-
-class Row(NamedTuple):
-    """What is stored of a step.
-
-    **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
-    before the first; the `end` of this one; whether it ended at an event (`AbstractGuards`), None in a run that looks
-    for none; what its linearisation needs, its `own`.
-    """
-
-    since: Any
-    end: Any
-    at_event: Any
-    own: Any
 
 
 class Saved(eqx.Module):
@@ -60,7 +48,7 @@ class Saved(eqx.Module):
     length: int = eqx.field(static=True)
     passed: Any
 
-    def takes(self, k: Any, row: "Row") -> Any:
+    def takes(self, k: Any, row: Row) -> Any:
         """Whether the state at the end of the step k is saved; False of a series without such states."""
         if self.events:
             return row.at_event
@@ -95,14 +83,14 @@ class Mesh(eqx.Module):
     still: PyTree
     steps: AbstractSteps
     rows: list[Array]
-    layout: "Layout" = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
     count: Any
     saved: tuple[Saved, ...]
     like: PyTree
     memory: PyTree
     dense: int = eqx.field(static=True)
     event: bool = eqx.field(static=True)
-    segments: "Segments | None"
+    segments: Segments | None
 
     @property
     def size(self) -> int:
@@ -168,8 +156,8 @@ class Mesh(eqx.Module):
     def _rows_again(self, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
         """The rows of a segment of the run, found again in these buffers where they are `lost`."""
         segments: Any = self.segments
-        terms, args, _ = freeze(eqx.combine(self.moved.terms, self.still))
-        return segments.rows(terms, args, segment, rows, lost)
+        equations = freeze(eqx.combine(self.moved.terms, self.still))
+        return segments.rows(self.steps, equations, segment, self.count, rows, lost)
 
     def _first(self, w, memory, out: Tangents):
         """The carry of the loop over steps at its start, with tables for its results."""
@@ -314,44 +302,6 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     return lw, ldense, place
 
 
-class Layout:
-    """Rows as vectors, one for each type of numbers."""
-
-    def __init__(self, example: PyTree):
-        arrays, self.static = eqx.partition(example, lambda x: isinstance(x, jax.ShapeDtypeStruct | jax.Array))
-        leaves, self.structure = jax.tree.flatten(arrays)
-        self.leaves = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        self.types = sorted({x.dtype for x in self.leaves}, key=str)
-
-    def blank(self, length: int) -> list[Array]:
-        """Buffers of this many rows of zeros."""
-        size = lambda dtype: sum(x.size for x in self.leaves if x.dtype == dtype)
-        return [jnp.zeros((length, size(dtype)), dtype) for dtype in self.types]
-
-    def packed(self, row: PyTree[Array]) -> list[Array]:
-        """A row as vectors."""
-        leaves = jax.tree.leaves(eqx.filter(row, eqx.is_array))
-        return [self._joined(leaves, dtype) for dtype in self.types]
-
-    def packed_tangent(self, row: PyTree[Array], tangent: PyTree[Array]) -> list[Array]:
-        """The tangent of a row, or parts of it, as those of its vectors that are floating-point numbers."""
-        arrays = eqx.filter(row, eqx.is_array)
-        leaves = jax.tree.leaves(filled(arrays, tangent))
-        return [self._joined(leaves, dtype) for dtype in self.types if jnp.issubdtype(dtype, jnp.floating)]
-
-    def _joined(self, leaves, dtype):
-        return jnp.concatenate([jnp.ravel(x) for x, of in zip(leaves, self.leaves, strict=True) if of.dtype == dtype])
-
-    def unpacked(self, vectors: list[Array]) -> PyTree[Array]:
-        """The inverse of `packed`."""
-        given, starts, leaves = dict(zip(self.types, vectors, strict=True)), dict.fromkeys(self.types, 0), []
-        for of in self.leaves:
-            start = starts[of.dtype]
-            leaves.append(given[of.dtype][start : start + of.size].reshape(of.shape))
-            starts[of.dtype] = start + of.size
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
-
-
 class MeshAdjoint(diffrax.AbstractAdjoint):
     """Derivatives of a solve on its mesh, in every mode.
 
@@ -409,8 +359,8 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
 
 @eqx.filter_custom_jvp
 def _recorded(equations, jumps, init_state, fixed, max_steps, most):
-    """The last state of diffrax's loop, the packed rows of the last segment of its steps, and the packed starts of all
-    segments, of `most` steps each; None where there is one segment only.
+    """The last state of diffrax's loop, the packed rows of the last segment of its steps, of `most` steps each, and the
+    packed starts of all segments and choices of all steps; None where there is one segment only.
 
     **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
     step size controller knows as well, and the solver stand here for their tangents.
@@ -425,116 +375,49 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
         del max_steps
         since = jnp.asarray(-jnp.inf, init.tprev.dtype)
-        layout = Layout(eqx.filter_eval_shape(lambda init: _row(steps, terms, since, init, body_fun(init)), init))
-        of_starts = Layout(eqx.filter_eval_shape(lambda init: _start_of(since, body_fun(init), steps.jumps), init))
-        step = _step_with_row(body_fun, steps, terms, layout)
+        layout = Layout(eqx.filter_eval_shape(lambda init: row_of(steps, terms, since, init, body_fun(init)), init))
+        of_starts, of_choices = _layouts_again(steps, init, eqx.filter_eval_shape(body_fun, init))
 
         def body(carry):
-            old, since, rows, starts = carry
+            old, since, rows, starts, choices = carry
+            new = body_fun(old)
+            k, kept = old.num_accepted_steps, new.num_accepted_steps > old.num_accepted_steps
             if starts is not None:
                 # In the middle of a segment what is written comes to lie behind the last start.
-                k = old.num_accepted_steps
                 place = jnp.where(k % size == 0, k // size, segments)
-                start = of_starts.packed(_start_of(since, old, steps.jumps))
-                starts = [buffer_set(buffer, place, x) for buffer, x in zip(starts, start, strict=True)]
-            return *step(old, since, rows), starts
+                starts = _written(starts, place, of_starts.packed(start_of(steps, old)), True)
+                choices = _written(choices, k, of_choices.packed(choice_of(steps, old, new)), kept)
+            rows = _written(rows, k % size, layout.packed(row_of(steps, terms, since, old, new)), kept)
+            return new, jnp.where(kept, old.tnext, since), rows, starts, choices
 
-        starts = None if segments == 1 else of_starts.blank(segments + 1)
-        last, _, rows, starts = while_loop(
+        several = segments > 1
+        starts = of_starts.blank(segments + 1) if several else None
+        choices = of_choices.blank(segments * size) if several else None
+        last, _, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, layout.blank(size), starts),
+            (init, since, layout.blank(size), starts, choices),
             max_steps=None,
-            buffers=lambda carry: (buffers(carry[0]), carry[2], carry[3]),
+            buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
         )
-        found.append((last, rows, starts))
+        found.append((last, rows, None if starts is None else (starts, choices)))
         return last
 
     _run(outer, terms, args, init_state, fixed, max_steps)
     return found[0]
 
 
-def _row(steps, terms, since, old, new) -> Row:
-    """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
-    before, after = events_found(old.controller_state), events_found(new.controller_state)
-    at_event = None if before is None or after is None else after.count > before.count
-    return Row(since, old.tnext, at_event, steps.row(terms, old, new))
+def _written(tables, index, row, kept):
+    return [buffer_set(table, index, x, kept) for table, x in zip(tables, row, strict=True)]
 
 
-def _step_with_row(body_fun, steps, terms, layout):
-    """A step of diffrax's loop that writes its row, if it is accepted."""
-
-    def step(old, since, rows):
-        new = body_fun(old)
-        kept = new.num_accepted_steps > old.num_accepted_steps
-        packed = layout.packed(_row(steps, terms, since, old, new))
-        index = old.num_accepted_steps % rows[0].shape[0]
-        rows = [buffer_set(buffer, index, x, kept) for buffer, x in zip(rows, packed, strict=True)]
-        return new, jnp.where(kept, old.tnext, since), rows
-
-    return step
-
-
-def _start_of(since, state, jumps):
-    """What a state of diffrax's loop is made of where a segment of a run starts: without what is saved."""
-    parts = (
-        state.tprev,
-        state.tnext,
-        state.y,
-        state.made_jump if jumps else None,
-        state.solver_state,
-        state.controller_state,
-        state.num_accepted_steps,
+def _layouts_again(steps, old, new):
+    """The layouts of the starts of segments and of choices, from two states of diffrax's loop."""
+    return (
+        Layout(eqx.filter_eval_shape(lambda new: start_of(steps, new), new)),
+        Layout(eqx.filter_eval_shape(lambda old, new: choice_of(steps, old, new), old, new)),
     )
-    # Flags of diffrax are no arrays before the loop begins.
-    return since, jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, bool) else x, parts)
-
-
-class Segments(eqx.Module):
-    """The segments of a run that has more steps than rows are kept of, whose rows are found again from their starts.
-
-    **Fields:** the packed `starts`; the layouts `of_starts` and `of_rows`; `first`: the state of diffrax's loop at the
-    start of the run; what is `fixed` in it.
-    """
-
-    starts: list[Array]
-    of_starts: "Layout" = eqx.field(static=True)
-    of_rows: "Layout" = eqx.field(static=True)
-    first: Any
-    fixed: Any
-    max_steps: int = eqx.field(static=True)
-
-    def rows(self, terms: PyTree, args: PyTree, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
-        """The rows of a segment, in these buffers; where they are not `lost`, the same."""
-        solver, saveat, options, steps, limit = self.fixed
-        saveat = eqx.tree_at(lambda saveat: (saveat.subs, saveat.dense), saveat, (None, False), is_leaf=_is_none)
-        options = options | {"event": None, "progress_meter": diffrax.NoProgressMeter()}
-        start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])
-        since, (*given, made_jump, solver_state, controller_state, count) = start
-        places = lambda s: (
-            *(s.tprev, s.tnext, s.y, s.made_jump, s.solver_state, s.controller_state, s.num_accepted_steps),
-            *(s.save_state, s.dense_ts, s.dense_infos, s.dense_save_index, s.progress_meter_state),
-            *(s.event_tprev, s.event_tnext, s.event_dense_info, s.event_values, s.event_mask),
-        )
-        made_jump = False if made_jump is None else made_jump
-        new = (*given, made_jump, solver_state, controller_state, count, *[None] * 10)
-        init_state = eqx.tree_at(places, self.first, new, is_leaf=_is_none)
-        last, found = jnp.where(lost, (segment + 1) * rows[0].shape[0], 0), []
-
-        def outer(cond_fun, body_fun, init, *, max_steps, buffers):
-            del max_steps
-            step = _step_with_row(body_fun, steps, terms, self.of_rows)
-            proceed = lambda carry: cond_fun(carry[0]) & (carry[0].num_accepted_steps < last)
-            own = lambda carry: (buffers(carry[0]), carry[2])
-            carry = while_loop(
-                proceed, lambda carry: step(*carry), (init, since, rows), max_steps=None, buffers=own, kind="lax"
-            )
-            found.append(carry[2])
-            return carry[0]
-
-        _run(outer, terms, args, init_state, (solver, saveat, options, steps, limit), self.max_steps)
-        return found[0]
 
 
 @_recorded.def_jvp
@@ -542,7 +425,7 @@ def _recorded_jvp(primals, tangents):
     equations, jumps, init_state, fixed, max_steps, _ = primals
     dequations, djumps, dinit, *_ = tangents
     out = _recorded(*primals)
-    final, rows, starts = out
+    final, rows, again = out
     _, saveat, options, steps, _ = fixed
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
@@ -558,7 +441,7 @@ def _recorded_jvp(primals, tangents):
     events = events_found(final.controller_state)
     if events is not None:
         saved += (Saved(False, None, 0, True, len(events.states), jnp.stack([events.count, jnp.array(0)])),)
-    row = lambda a, b: _row(steps, equations[0], b.tprev, a, b)
+    row = lambda a, b: row_of(steps, equations[0], b.tprev, a, b)
     layout = Layout(eqx.filter_eval_shape(row, init_state, final))
     mesh = Mesh(
         moved=Moving(moved, None if djumps is None else jumps),
@@ -572,20 +455,19 @@ def _recorded_jvp(primals, tangents):
         memory=memory,
         dense=max_steps if saveat.dense else 0,
         event=options["event"] is not None,
-        segments=_segments(starts, layout, final, init_state, fixed, max_steps),
+        segments=_segments(again, layout, steps, init_state, final),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
-    again = lambda mesh, *x: mesh.of_one_segment().push(*x), lambda mesh, x: mesh.of_one_segment().pull(x)
-    along = linear_map(Mesh.push, Mesh.pull, again, mesh, x, like)
-    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, starts))
+    of_one = lambda mesh, *x: mesh.of_one_segment().push(*x), lambda mesh, x: mesh.of_one_segment().pull(x)
+    along = linear_map(Mesh.push, Mesh.pull, of_one, mesh, x, like)
+    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, again))
 
 
-def _segments(starts, of_rows, final, init_state, fixed, max_steps):
-    if starts is None:
+def _segments(again, layout, steps, old, new):
+    if again is None:
         return None
-    of_starts = Layout(eqx.filter_eval_shape(lambda state: _start_of(state.tprev, state, fixed[3].jumps), final))
-    first, fixed = freeze((init_state, fixed))
-    return Segments(starts, of_starts, of_rows, first, fixed, max_steps)
+    (starts, choices), (of_starts, of_choices) = again, _layouts_again(steps, old, new)
+    return Segments(starts, choices, of_starts, of_choices, layout)
 
 
 def _of_loop(final, along: Tangents, like):

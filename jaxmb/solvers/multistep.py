@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import diffrax
 import equinox as eqx
@@ -59,6 +59,17 @@ class AbstractMultistepState(eqx.Module):
     @abc.abstractmethod
     def memory(self) -> PyTree[Array]:
         """The numbers of the past that a step depends on smoothly: fields, or parts of them."""
+
+    @property
+    @abc.abstractmethod
+    def chosen(self) -> PyTree[Array]:
+        """What the error estimate of the last step chose for the next one, such as its order: fields, or parts of them;
+        None without any.
+        """
+
+    def alone(self) -> Self:
+        """The same without tangents."""
+        return eqx.tree_at(lambda state: state.tangents, self, None, is_leaf=lambda x: x is None)
 
 
 class AbstractAttempt(eqx.Module):

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import equinox as eqx
 from jaxtyping import Array, PyTree
@@ -45,6 +45,20 @@ class AbstractSteps(eqx.Module):
     @abc.abstractmethod
     def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
         """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
+
+    @abc.abstractmethod
+    def alone(self, solver_state: Any) -> Any:
+        """The state of the solver itself, without the tangents that it carries along."""
+
+    @abc.abstractmethod
+    def chosen(self, solver_state: Any) -> PyTree[Array]:
+        """The parts of the state of the solver itself that the error estimate of a step chose for the next one; None
+        without any.
+        """
+
+    def of_solver_alone(self) -> Self:
+        """The same for runs of the solver itself."""
+        return self
 
     @abc.abstractmethod
     def memory(self, solver_state: Any) -> PyTree[Array]:

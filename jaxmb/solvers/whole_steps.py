@@ -1,5 +1,6 @@
 """The steps of any solver, differentiated as they are."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -30,16 +31,21 @@ class WholeSteps(AbstractSteps):
     def row(self, terms, before, after):
         del terms, after
         jump = jnp.asarray(before.made_jump) if self.jumps else None
-        return before.tprev, before.tnext, before.y, self._own(before.solver_state), jump
+        return before.tprev, before.tnext, before.y, self.alone(before.solver_state), jump
+
+    def alone(self, solver_state):
+        if self.multistep:
+            return solver_state.alone()
+        return solver_state[0] if self.watched else solver_state
+
+    def chosen(self, solver_state):
+        return solver_state.chosen if self.multistep else None
+
+    def of_solver_alone(self):
+        return dataclasses.replace(self, watched=False)
 
     def memory(self, solver_state):
-        return self._smooth(self._own(solver_state))
-
-    def _own(self, solver_state):
-        """A solver state without tangents."""
-        if self.multistep:
-            return eqx.tree_at(lambda state: state.tangents, solver_state, None, is_leaf=_is_none)
-        return solver_state[0] if self.watched else solver_state
+        return self._smooth(self.alone(solver_state))
 
     def _smooth(self, state):
         """The numbers that a step depends on smoothly, with None for all others."""

@@ -208,3 +208,30 @@ def test_projection_keeps_wheels_from_slipping():
     assert np.max(projected.constraint_violation.velocity) <= 1e-12
     for name, own in held.system.quantities().items():
         assert eqx.filter_eval_shape(mb.Trajectory.quantity, projected, name).shape == (1, *own.shape)
+
+
+def test_a_network_is_a_parameter():
+    """It is called in the user's functions, and its weights have derivatives."""
+    network = eqx.nn.MLP(1, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
+    system = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * p["m"] * v @ v,
+        force=lambda t, q, v, p: p["net"](v) - q,
+        q=[1.0],
+        parameters={"m": 1.0, "net": network},
+    )
+    start, weights = mb.assemble(system), mb.parameters(system)["net"]
+    assert weights.shape == (13,) and eqx.tree_equal(mb.modules(system)["net"], network, rtol=0.0, atol=0.0)
+
+    def end(weights):
+        return mb.simulate(mb.with_parameters(system, {"net": weights}), start, t1=1.0, rtol=1e-10)["q0"][-1]
+
+    forward, reverse = jax.jit(jax.jacfwd(end))(weights), jax.jit(jax.grad(end))(weights)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    value, along = jax.jit(end), np.sin(np.arange(13.0))
+    central = (value(weights + 1e-4 * along) - value(weights - 1e-4 * along)) / 2e-4
+    np.testing.assert_allclose(reverse @ along, central, rtol=1e-6)
+    np.testing.assert_allclose(end(network), end(weights), rtol=1e-14)
+    with pytest.raises(ValueError, match="'net' is a module, whose weights are not a function of time"):
+        mb.simulate(system, start, t1=1.0, inputs={"net": lambda t: weights})
+    with pytest.raises(ValueError, match="Parameter 'm': expected a real number or an array"):
+        LagrangianSystem(kinetic=kinetic, q=[1.0], parameters={"m": "one"})

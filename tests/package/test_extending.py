@@ -96,6 +96,10 @@ class TwoStepState(solvers.AbstractMultistepState):
     def memory(self):
         return self.rates
 
+    @property
+    def chosen(self):
+        return None
+
 
 class TwoStepAttempt(solvers.AbstractAttempt):
     predicted: jax.Array

@@ -11,6 +11,9 @@ from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
 from jaxmb.system import gaps as of
 
+# The velocities of the bodies are any: those in the closest state are used.
+pytestmark = pytest.mark.filterwarnings("ignore:The velocities given with the bodies")
+
 
 def state_of(system):
     """A state with velocities, in which contacts are closed."""

@@ -122,6 +122,18 @@ def test_runs_longer_than_the_rows_that_are_kept():
     np.testing.assert_allclose(batch[0], whole[1], rtol=1e-8, atol=1e-8 * np.max(np.abs(whole[1])))
 
 
+LONGER = ["backward", "jumps", "steps", "event", "projection", "hermite", "explicit", "implicit"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", LONGER)
+def test_steps_of_segments_are_taken_again(name):
+    """Also those of other solvers and manifolds, after jumps, and up to an event."""
+    of = lambda most: jax.jit(jax.jacrev(lambda p: FORMS[name](p, adjoint=MeshAdjoint(most))))(POINT)
+    whole, cut = of(2048), of(16)
+    np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-9 * np.max(np.abs(whole)))
+
+
 def test_second_derivatives_of_a_run_that_is_too_long():
     second = jax.hessian(lambda p: jnp.sum(states(run(p, adjoint=MeshAdjoint(16)))))
     with pytest.raises(RuntimeError, match="Second derivatives need the rows of all steps, of which 16 are kept"):

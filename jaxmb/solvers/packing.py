@@ -1,0 +1,46 @@
+"""Pytrees of arrays as rows of tables."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .linear_map import filled
+
+
+class Layout:
+    """Rows as vectors, one for each type of numbers."""
+
+    def __init__(self, example: PyTree):
+        arrays, self.static = eqx.partition(example, lambda x: isinstance(x, jax.ShapeDtypeStruct | jax.Array))
+        leaves, self.structure = jax.tree.flatten(arrays)
+        self.leaves = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+        self.types = sorted({x.dtype for x in self.leaves}, key=str)
+
+    def blank(self, length: int) -> list[Array]:
+        """Buffers of this many rows of zeros."""
+        size = lambda dtype: sum(x.size for x in self.leaves if x.dtype == dtype)
+        return [jnp.zeros((length, size(dtype)), dtype) for dtype in self.types]
+
+    def packed(self, row: PyTree[Array]) -> list[Array]:
+        """A row as vectors."""
+        leaves = jax.tree.leaves(eqx.filter(row, eqx.is_array))
+        return [self._joined(leaves, dtype) for dtype in self.types]
+
+    def packed_tangent(self, row: PyTree[Array], tangent: PyTree[Array]) -> list[Array]:
+        """The tangent of a row, or parts of it, as those of its vectors that are floating-point numbers."""
+        arrays = eqx.filter(row, eqx.is_array)
+        leaves = jax.tree.leaves(filled(arrays, tangent))
+        return [self._joined(leaves, dtype) for dtype in self.types if jnp.issubdtype(dtype, jnp.floating)]
+
+    def _joined(self, leaves, dtype):
+        return jnp.concatenate([jnp.ravel(x) for x, of in zip(leaves, self.leaves, strict=True) if of.dtype == dtype])
+
+    def unpacked(self, vectors: list[Array]) -> PyTree[Array]:
+        """The inverse of `packed`."""
+        given, starts, leaves = dict(zip(self.types, vectors, strict=True)), dict.fromkeys(self.types, 0), []
+        for of in self.leaves:
+            start = starts[of.dtype]
+            leaves.append(given[of.dtype][start : start + of.size].reshape(of.shape))
+            starts[of.dtype] = start + of.size
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)

@@ -1,0 +1,128 @@
+"""Runs of more steps than rows are kept of, whose steps are taken again.
+
+Of every step is kept what the step size controller and the error estimates chose, a few numbers, and at the start of
+every segment of a run the whole state. The steps of a segment follow from these, without error estimates and without
+the tangents whose errors were controlled.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._compat import buffer_set, while_loop
+from .events import events_found
+from .packing import Layout
+from .steps import AbstractSteps
+
+
+class Row(NamedTuple):
+    """What is stored of a step.
+
+    **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
+    before the first; the `end` of this one; whether it ended at an event (`AbstractGuards`), None in a run that looks
+    for none; what its linearisation needs, its `own`.
+    """
+
+    since: Any
+    end: Any
+    at_event: Any
+    own: Any
+
+
+class Choice(NamedTuple):
+    """What was chosen for a step.
+
+    **Fields:** its times, and whether it `made_jump`, as in the states of diffrax's loop, None where steps have no
+    jumps; `at_event` of its row; what its error estimate has `chosen` for the next step.
+    """
+
+    tprev: Any
+    tnext: Any
+    made_jump: Any
+    at_event: Any
+    chosen: PyTree[Array]
+
+
+class Between(NamedTuple):
+    """The parts of a state of diffrax's loop that steps are made of."""
+
+    tprev: Any
+    tnext: Any
+    y: PyTree[Array]
+    made_jump: Any
+    solver_state: PyTree[Array]
+
+
+def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) -> Row:
+    """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
+    return Row(since, old.tnext, _ends_at_event(old, new), steps.row(terms, old, new))
+
+
+def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
+    """What was chosen for the same step."""
+    made_jump = jnp.asarray(old.made_jump) if steps.jumps else None
+    chosen = steps.chosen(steps.alone(new.solver_state))
+    return Choice(old.tprev, old.tnext, made_jump, _ends_at_event(old, new), chosen)
+
+
+def start_of(steps: AbstractSteps, state: Any) -> tuple[PyTree[Array], PyTree[Array]]:
+    """What a segment starts with: the state, and that of the solver itself."""
+    return state.y, steps.alone(state.solver_state)
+
+
+def _ends_at_event(old, new):
+    before, after = events_found(old.controller_state), events_found(new.controller_state)
+    return None if before is None or after is None else after.count > before.count
+
+
+class Segments(eqx.Module):
+    """The segments of a run.
+
+    **Fields:** packed `starts` of segments and `choices` of steps, with their layouts; the `layout` of rows.
+    """
+
+    starts: list[Array]
+    choices: list[Array]
+    of_starts: Layout = eqx.field(static=True)
+    of_choices: Layout = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
+
+    def rows(
+        self, steps: AbstractSteps, equations: PyTree, segment: Any, count: Any, rows: list[Array], lost: Any
+    ) -> list[Array]:
+        """The rows of a segment of a run of `count` steps, in these buffers; where they are not `lost`, the same.
+
+        **Arguments:** `equations`: the terms, their arguments and the solver without tangents.
+        """
+        terms, args, solver = equations
+        steps, size = steps.of_solver_alone(), rows[0].shape[0]
+        first = segment * size
+        last = jnp.where(lost, jnp.minimum(first + size, count), first)
+        read = lambda k: self.of_choices.unpacked([buffer[k] for buffer in self.choices])
+
+        def body(carry):
+            k, y, solver_state, rows = carry
+            choice, earlier = read(k), read(jnp.maximum(k - 1, 0))
+            since = jnp.where(k == 0, -jnp.inf, earlier.tnext).astype(choice.tnext.dtype)
+            made_jump = False if choice.made_jump is None else choice.made_jump
+            old = Between(choice.tprev, choice.tnext, y, made_jump, solver_state)
+            y, _, _, after, _ = solver.step(terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
+            if choice.chosen is not None:
+                after = eqx.tree_at(steps.chosen, after, choice.chosen)
+            own = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))
+            packed = self.layout.packed(Row(since, old.tnext, choice.at_event, own))
+            rows = [buffer_set(buffer, k % size, x) for buffer, x in zip(rows, packed, strict=True)]
+            return k + 1, y, after, rows
+
+        start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])
+        carry = while_loop(
+            lambda carry: carry[0] < last,
+            body,
+            (first, *start, rows),
+            max_steps=None,
+            buffers=lambda carry: carry[3],
+            kind="lax",
+        )
+        return carry[3]
