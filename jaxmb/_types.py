@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 Scalar: TypeAlias = ArrayLike
@@ -11,6 +13,9 @@ VectorLike: TypeAlias = ArrayLike | Sequence[Any]
 # The coordinates q and the velocities u of a system, with one axis.
 Coordinates: TypeAlias = Float[Array, "nq"]
 Velocities: TypeAlias = Float[Array, "nu"]
+
+# States of at most this many numbers are printed with them.
+_FEW = 60
 
 
 class State(eqx.Module):
@@ -27,3 +32,15 @@ class State(eqx.Module):
     q: Float[Array, "... nq"]
     u: Float[Array, "... nu"]
     z: Float[Array, "... nz"] | None = None
+
+    def __repr__(self) -> str:
+        parts = {"q": self.q, "u": self.u} | ({} if self.z is None else {"z": self.z})
+        return f"State({', '.join(f'{name}={_shown(x)}' for name, x in parts.items())})"
+
+
+def _shown(x: Any) -> str:
+    """The numbers of an array where they are known and few, else its shape and type."""
+    known = isinstance(x, Array | np.ndarray) and not isinstance(x, Tracer)
+    return (
+        np.array2string(np.asarray(x), precision=6, separator=", ") if known and x.size <= _FEW else eqx.tree_pformat(x)
+    )

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..parts.module_weights import ModuleWeights
 from ..parts.series import AbstractSignal
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
@@ -126,8 +125,8 @@ class AbstractLagrangian(AbstractSystem):
         return {name: [(_parameter(name, name in modules), None)] for name in self.parameters}
 
     def module_structures(self):
-        # A concrete class: the other parameters are numbers.
-        return {name: own.like for name, own in self.parameters.items() if isinstance(own, ModuleWeights)}
+        is_module = lambda own: isinstance(own, eqx.Module)
+        return {name: own.like for name, own in self.parameters.items() if is_module(own)}
 
     def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""

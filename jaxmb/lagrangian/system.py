@@ -159,7 +159,6 @@ def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
 
 def _number(name: str, value: Any) -> Array | ModuleWeights:
     try:
-        # A concrete class, since anything else is a number.
         return as_weights(value) if isinstance(value, eqx.Module) else as_jax(value)
     except (ValueError, TypeError) as error:
         raise ValueError(f"Parameter {name!r}: {error}.") from None

@@ -83,6 +83,9 @@ class StatefulTerm(AbstractManifoldTerm):
     def kept(self, chart):
         return self.term.kept(chart)
 
+    def kept_at_start(self, chart):
+        return self.term.kept_at_start(chart)
+
     def at_solution(self, t, y, f, kept, args):
         term = _at(self.term, y)
         own, rates = term.at_solution(t, _mechanical(y), _mechanical(f), kept, args)

@@ -426,7 +426,8 @@ class Chart(eqx.Module):
 
     **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H| and, with
     redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties; `redundant`: None
-    where all rows are independent; `multipliers` of the rows that friction depends on, None without any.
+    where all rows are independent; `multipliers` of the rows that friction depends on, at the prediction of the last
+    step and at its end, None without any.
     """
 
     split: ChartIndices
@@ -434,7 +435,7 @@ class Chart(eqx.Module):
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
     redundant: RedundantRows | None = None
-    multipliers: Float[Array, "k"] | None = None
+    multipliers: Float[Array, "2 k"] | None = None
 
     @property
     def age(self) -> Int[Array, ""]:
@@ -480,7 +481,7 @@ class PartitionTerm(AbstractManifoldTerm):
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, system))
         redundant = RedundantRows(row_sizes(system, t, y), jnp.zeros((), y.q.dtype)) if drops_rows(system) else None
         frictions = system.friction_rows.size
-        multipliers = jnp.zeros(frictions, y.q.dtype) if frictions else None
+        multipliers = jnp.zeros((2, frictions), y.q.dtype) if frictions else None
         return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant, multipliers)
 
     def evaluate(self, t, y, chart, args):
@@ -497,7 +498,9 @@ class PartitionTerm(AbstractManifoldTerm):
                 out = ideal_acceleration(system, self.formulation, t, q, u, split.velocity)
             else:
                 out = general_acceleration(system, self.formulation, t, q, u, split)
-                failed, multipliers = out.failed, out.multipliers
+                failed = out.failed
+                if out.multipliers is not None:
+                    multipliers = jnp.stack([out.multipliers] * 2)
             u, udot, factors = out.u, out.udot, (out.factor, out.every)
             quality = _velocity_quality(system, out.factor, split.velocity)
             if split.coordinate is None:
@@ -512,11 +515,13 @@ class PartitionTerm(AbstractManifoldTerm):
         if system.acceleration_rows == 0:
             return self._project(t, y, chart, chart.split)
         constraints = ChartConstraints(linearized_at.factors[0], chart.split, linearized_at.factors[1])
-        near = SolvedState(constraints, *lax.stop_gradient((linearized_at.f.u, chart.multipliers)))
+        multipliers = None if chart.multipliers is None else chart.multipliers[0]
+        near = SolvedState(constraints, *lax.stop_gradient((linearized_at.f.u, multipliers)))
         out: Any = restore(system, t, y, near, self.newton_tol)
         f = State(system.rates(t, out.q, out.u), out.udot)
-        failed = out.failed | chart.singular
-        chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=out.multipliers)
+        chart, failed = _counted(chart, out.iterations), out.failed | chart.singular
+        if multipliers is not None:
+            chart = dataclasses.replace(chart, multipliers=jnp.stack([multipliers, out.multipliers]))
         return ManifoldEvaluation(State(out.q, out.u), f, chart, failed, None)
 
     def project_cold(self, t, y, chart, args):
@@ -536,7 +541,14 @@ class PartitionTerm(AbstractManifoldTerm):
         return out._replace(failed=failed | out.failed)
 
     def kept(self, chart):
-        return eqx.tree_at(lambda split: split.right_inverse, chart.split, None), chart.multipliers
+        return self._kept(chart, 1)
+
+    def kept_at_start(self, chart):
+        return self._kept(chart, 0)
+
+    def _kept(self, chart, k):
+        split = eqx.tree_at(lambda split: split.right_inverse, chart.split, None)
+        return split, None if chart.multipliers is None else chart.multipliers[k]
 
     def at_solution(self, t, y, f, kept, args):
         system, (split, multipliers) = self.system, kept

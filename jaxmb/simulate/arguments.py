@@ -142,7 +142,10 @@ def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
 def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
     ts = real_array("saveat", times, jnp.result_type(float), None)
     if ts.ndim != 1 or ts.shape[0] == 0:
-        raise ValueError(f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}.")
+        raise ValueError(
+            f"saveat must be a vector of times or a diffrax.SaveAt, got shape {ts.shape}; for 11 equally spaced states "
+            "saveat=numpy.linspace(t0, t1, 11)."
+        )
     if is_traced((ts, start, end)):
         return ts
     if not (min(start, end) <= ts.min() and ts.max() <= max(start, end)):

@@ -6,7 +6,7 @@ known: nothing is solved, and little of a step is stored. This is the same metho
 the mesh of the motion; it differs from the derivative of the step by less than the local error of the tangent.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,6 @@ from .evaluation import (
     after_jump,
     at_solution,
     chart_after_jump,
-    evaluate,
     field_of,
     kept_of_chart,
     next_chart,
@@ -87,6 +86,14 @@ class Jump(eqx.Module):
     chart: Any
 
 
+class StartRow(NamedTuple):
+    """What is stored of the start of a run: whether a step was `made`; the field there; what is `kept` of its chart."""
+
+    made: Any
+    f: Float[Array, " n"]
+    kept: Any
+
+
 class AdamsRow(eqx.Module):
     """What is stored of a step.
 
@@ -130,16 +137,24 @@ class AdamsSteps(AbstractSteps):
     def memory(self, solver_state):
         return solver_state.memory
 
-    def memory_at_start(self, equations, start, along):
-        state, like, (dequations, w, given) = start.solver_state, start.y, along
-        chart = next_chart(equations[0], start.tprev, like, state.chart, equations[1])
+    def start(self, terms, before, after):
+        differences = after.solver_state.history.differences
+        # After one step from a start these are the derivative at its end, and how far it is from that at the start.
+        f = differences[0] - differences[1]
+        return StartRow(jnp.array(True), f, kept_of_chart(terms, after.solver_state.chart, at_start=True))
+
+    def memory_at_start(self, equations, first, row, along):
+        like, given = first.y, along[2]
 
         def field(equations, flat):
             terms, args, _ = equations
-            return evaluate(terms, start.tprev, flat, like, chart, args).f
+            return at_solution(terms, first.tprev, flat, row.f, like, row.kept, args)[1]
 
-        _, f = eqx.filter_jvp(field, (equations, ravel(like)), (dequations, w))
-        return jnp.where(state.history.known == 0, given.at[0].set(f), given)
+        # In a run without steps the row is none: of zeros nothing that is not finite comes, in either mode.
+        asked = row.made & (first.solver_state.history.known == 0)
+        along = jax.tree.map(lambda x: jnp.where(asked, x, jnp.zeros((), x.dtype)), along[:2])
+        _, f = eqx.filter_jvp(field, (equations, ravel(like)), along)
+        return jnp.where(asked, given.at[0].set(f), given)
 
     def linearised(self, of, moved, like, row):
         def at(of_terms, flat):

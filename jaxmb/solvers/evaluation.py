@@ -159,10 +159,12 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
     return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)
 
 
-def kept_of_chart(term: Any, chart: Chart | None) -> PyTree[Array]:
-    """What `at_solution` needs of a chart."""
+def kept_of_chart(term: Any, chart: Chart | None, at_start: bool = False) -> PyTree[Array]:
+    """What `at_solution` needs of the chart at the end of a step; `at_start`: of a first step, for its start."""
     manifold = _manifold(term)
-    return None if manifold is None else manifold.kept(chart)
+    if manifold is None:
+        return None
+    return manifold.kept_at_start(chart) if at_start else manifold.kept(chart)
 
 
 def at_solution(

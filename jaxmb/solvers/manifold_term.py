@@ -143,8 +143,12 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return out._replace(failed=out.failed | linearized_at.failed)
 
     def kept(self, chart: Chart) -> PyTree[Array]:
-        """What `at_solution` needs of a chart, stored for each step; by default all of it."""
+        """What `at_solution` needs of the chart at the end of a step, stored for each step; by default all of it."""
         return chart
+
+    def kept_at_start(self, chart: Chart) -> PyTree[Array]:
+        """The same for the start of a first step, whose prediction that is."""
+        return self.kept(chart)
 
     def at_solution(self, t: Any, y: Y, f: Y, kept: PyTree[Array], args: Args) -> tuple[Y, Y]:
         """A state on the manifold and the vector field there, both known, with the derivatives that the equations give

@@ -359,8 +359,9 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
 
 @eqx.filter_custom_jvp
 def _recorded(equations, jumps, init_state, fixed, max_steps, most):
-    """The last state of diffrax's loop, the packed rows of the last segment of its steps, of `most` steps each, and the
-    packed starts of all segments and choices of all steps; None where there is one segment only.
+    """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
+    each has `most`; the starts of all segments and the choices of all steps, None where there is one segment only. All
+    but the first are packed.
 
     **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
     step size controller knows as well, and the solver stand here for their tangents.
@@ -376,32 +377,34 @@ def _recorded(equations, jumps, init_state, fixed, max_steps, most):
         del max_steps
         since = jnp.asarray(-jnp.inf, init.tprev.dtype)
         layout = Layout(eqx.filter_eval_shape(lambda init: row_of(steps, terms, since, init, body_fun(init)), init))
+        of_first = _layout_of_first(steps, terms, init)
         of_starts, of_choices = _layouts_again(steps, init, eqx.filter_eval_shape(body_fun, init))
 
         def body(carry):
-            old, since, rows, starts, choices = carry
+            old, since, first, rows, starts, choices = carry
             new = body_fun(old)
             k, kept = old.num_accepted_steps, new.num_accepted_steps > old.num_accepted_steps
+            first = _written(first, 0, of_first.packed(steps.start(terms, old, new)), kept & (k == 0))
             if starts is not None:
                 # In the middle of a segment what is written comes to lie behind the last start.
                 place = jnp.where(k % size == 0, k // size, segments)
-                starts = _written(starts, place, of_starts.packed(start_of(steps, old)), True)
+                starts = _written(starts, place, of_starts.packed(start_of(steps, since, old)), True)
                 choices = _written(choices, k, of_choices.packed(choice_of(steps, old, new)), kept)
             rows = _written(rows, k % size, layout.packed(row_of(steps, terms, since, old, new)), kept)
-            return new, jnp.where(kept, old.tnext, since), rows, starts, choices
+            return new, jnp.where(kept, old.tnext, since), first, rows, starts, choices
 
         several = segments > 1
         starts = of_starts.blank(segments + 1) if several else None
         choices = of_choices.blank(segments * size) if several else None
-        last, _, rows, starts, choices = while_loop(
+        last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, layout.blank(size), starts, choices),
+            (init, since, of_first.blank(1), layout.blank(size), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
         )
-        found.append((last, rows, None if starts is None else (starts, choices)))
+        found.append((last, first, rows, None if starts is None else (starts, choices)))
         return last
 
     _run(outer, terms, args, init_state, fixed, max_steps)
@@ -412,10 +415,15 @@ def _written(tables, index, row, kept):
     return [buffer_set(table, index, x, kept) for table, x in zip(tables, row, strict=True)]
 
 
+def _layout_of_first(steps, terms, state):
+    """The layout of what is stored of the start of a run."""
+    return Layout(eqx.filter_eval_shape(lambda state: steps.start(terms, state, state), state))
+
+
 def _layouts_again(steps, old, new):
     """The layouts of the starts of segments and of choices, from two states of diffrax's loop."""
     return (
-        Layout(eqx.filter_eval_shape(lambda new: start_of(steps, new), new)),
+        Layout(eqx.filter_eval_shape(lambda new: start_of(steps, new.tprev, new), new)),
         Layout(eqx.filter_eval_shape(lambda old, new: choice_of(steps, old, new), old, new)),
     )
 
@@ -425,12 +433,14 @@ def _recorded_jvp(primals, tangents):
     equations, jumps, init_state, fixed, max_steps, _ = primals
     dequations, djumps, dinit, *_ = tangents
     out = _recorded(*primals)
-    final, rows, again = out
+    final, first, rows, again = out
     _, saveat, options, steps, _ = fixed
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
     w, given = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
-    x = Moving(dequations, djumps), (w, steps.memory_at_start(equations, init_state, (dequations, w, given)))
+    at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
+    given = steps.memory_at_start(equations, init_state, at_start, (dequations, w, given))
+    x = Moving(dequations, djumps), (w, given)
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
@@ -460,7 +470,8 @@ def _recorded_jvp(primals, tangents):
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
     of_one = lambda mesh, *x: mesh.of_one_segment().push(*x), lambda mesh, x: mesh.of_one_segment().pull(x)
     along = linear_map(Mesh.push, Mesh.pull, of_one, mesh, x, like)
-    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, again))
+    none = jax.tree.map(lambda _: None, (first, again))
+    return out, (_of_loop(final, along, y0), none[0], _of_rows(rows, along.rows), none[1])
 
 
 def _segments(again, layout, steps, old, new):

@@ -34,12 +34,13 @@ class Row(NamedTuple):
 class Choice(NamedTuple):
     """What was chosen for a step.
 
-    **Fields:** its times, and whether it `made_jump`, as in the states of diffrax's loop, None where steps have no
-    jumps; `at_event` of its row; what its error estimate has `chosen` for the next step.
+    **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop;
+    where steps have no jumps, the last two are None, since it starts where the last one ended; `at_event` of its row;
+    what its error estimate has `chosen` for the next step.
     """
 
-    tprev: Any
     tnext: Any
+    tprev: Any
     made_jump: Any
     at_event: Any
     chosen: PyTree[Array]
@@ -62,14 +63,14 @@ def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
     """What was chosen for the same step."""
-    made_jump = jnp.asarray(old.made_jump) if steps.jumps else None
+    jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
     chosen = steps.chosen(steps.alone(new.solver_state))
-    return Choice(old.tprev, old.tnext, made_jump, _ends_at_event(old, new), chosen)
+    return Choice(old.tnext, *jump, _ends_at_event(old, new), chosen)
 
 
-def start_of(steps: AbstractSteps, state: Any) -> tuple[PyTree[Array], PyTree[Array]]:
-    """What a segment starts with: the state, and that of the solver itself."""
-    return state.y, steps.alone(state.solver_state)
+def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, PyTree[Array], PyTree[Array]]:
+    """What a segment starts with: `since` of its first row, its time, the state, and that of the solver itself."""
+    return since, state.tprev, state.y, steps.alone(state.solver_state)
 
 
 def _ends_at_event(old, new):
@@ -100,21 +101,20 @@ class Segments(eqx.Module):
         steps, size = steps.of_solver_alone(), rows[0].shape[0]
         first = segment * size
         last = jnp.where(lost, jnp.minimum(first + size, count), first)
-        read = lambda k: self.of_choices.unpacked([buffer[k] for buffer in self.choices])
 
         def body(carry):
-            k, y, solver_state, rows = carry
-            choice, earlier = read(k), read(jnp.maximum(k - 1, 0))
-            since = jnp.where(k == 0, -jnp.inf, earlier.tnext).astype(choice.tnext.dtype)
+            k, since, t, y, solver_state, rows = carry
+            choice = self.of_choices.unpacked([buffer[k] for buffer in self.choices])
+            tprev = t if choice.tprev is None else choice.tprev
             made_jump = False if choice.made_jump is None else choice.made_jump
-            old = Between(choice.tprev, choice.tnext, y, made_jump, solver_state)
+            old = Between(tprev, choice.tnext, y, made_jump, solver_state)
             y, _, _, after, _ = solver.step(terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
             if choice.chosen is not None:
                 after = eqx.tree_at(steps.chosen, after, choice.chosen)
             own = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))
             packed = self.layout.packed(Row(since, old.tnext, choice.at_event, own))
             rows = [buffer_set(buffer, k % size, x) for buffer, x in zip(rows, packed, strict=True)]
-            return k + 1, y, after, rows
+            return k + 1, old.tnext, old.tnext, y, after, rows
 
         start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])
         carry = while_loop(
@@ -122,7 +122,7 @@ class Segments(eqx.Module):
             body,
             (first, *start, rows),
             max_steps=None,
-            buffers=lambda carry: carry[3],
+            buffers=lambda carry: carry[-1],
             kind="lax",
         )
-        return carry[3]
+        return carry[-1]

@@ -64,13 +64,23 @@ class AbstractSteps(eqx.Module):
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
-    def memory_at_start(self, equations: PyTree, start: Any, along: tuple[PyTree, Array, PyTree]) -> PyTree[Array]:
+    def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
+        """What is stored of the start of a run, from the states of diffrax's loop before and after its first accepted
+        step; by default nothing.
+        """
+        del terms, before, after
+        return None
+
+    def memory_at_start(
+        self, equations: PyTree, first: Any, row: PyTree[Array], along: tuple[PyTree, Array, PyTree]
+    ) -> PyTree[Array]:
         """The tangent of the memory that the first step of a run begins with; by default the one that it is given.
 
-        **Arguments:** `equations`: the terms, their arguments and the solver; `start`: the first state of diffrax's
-        loop; `along`: the tangents of the equations, of the raveled state and of the memory in `start`.
+        **Arguments:** `equations`: the terms, their arguments and the solver; `first`: the first state of diffrax's
+        loop; `row`: what is stored of the start, zeros in a run without steps; `along`: the tangents of the
+        equations, of the raveled state and of the memory in `first`.
         """
-        del equations, start
+        del equations, first, row
         return along[2]
 
     @abc.abstractmethod

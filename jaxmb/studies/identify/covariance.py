@@ -8,6 +8,9 @@ from jaxtyping import Float
 # Directions of unknowns to which the residuals are less sensitive than this, relative to the strongest direction, are
 # not determined.
 _UNDETERMINED = 1e-6
+# Nor are those to which the data are less sensitive than so many relative tolerances of the motions: derivatives are
+# not more exact.
+_TOLERANCES = 100.0
 # Components with at least this share in such a direction are named.
 _SHARE = 0.1
 
@@ -34,26 +37,28 @@ def covariance(
     squares: float | None,
     count: int,
     slope: float = 1.0,
+    rtol: float = 0.0,
 ) -> Covariance:
     """The covariance of a fit.
 
     **Arguments:** `jacobian` of the residuals along n directions, first of the `count` of data; `changes` of the
     components along them; `squares`: sum of the squared residuals of data, which estimates the noise if it is not
     known. For a robust loss these are the squares of `ψ = r ρ'(r²)`, and `slope` is the mean of `ψ'`: the covariance is
-    that of Huber's M-estimate, as from samples with noise of the variance `mean ψ² / (mean ψ')²`.
+    that of Huber's M-estimate, as from samples with noise of the variance `mean ψ² / (mean ψ')²`. `rtol`: the
+    relative tolerance of the motions.
     """
     noise = 1.0
     if squares is not None:
         # The rank of what is determined does not depend on how the rows are weighted.
         plain = np.linalg.svd(jacobian, compute_uv=False)
-        surplus = count - int(np.sum(plain > _UNDETERMINED * plain[0]))
+        surplus = count - int(np.sum(plain > _smallest(jacobian, plain, count, rtol)))
         noise = np.sqrt(squares / surplus) / slope if surplus > 0 and slope > 0 else np.nan
         if np.isfinite(noise):
             # What is known beside the data has the size that it is known with.
             jacobian = np.vstack([jacobian[:count], noise * jacobian[count:]])
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
     sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
-    weak = sizes <= _UNDETERMINED * sizes[0]
+    weak = sizes <= _smallest(jacobian, sizes, count, rtol)
     root = changes @ (directions[~weak] / sizes[~weak][:, None]).T
     lost = changes @ directions[weak].T
     root = root * noise
@@ -62,6 +67,11 @@ def covariance(
     matrix[undetermined, :] = matrix[:, undetermined] = 0.0
     matrix[undetermined, undetermined] = np.inf
     return Covariance(matrix, root, lost, undetermined, float(noise))
+
+
+def _smallest(jacobian, sizes, count, rtol):
+    """The sensitivity down to which a direction is determined, of a Jacobian with these singular values."""
+    return max(_UNDETERMINED * sizes[0], _TOLERANCES * rtol * np.linalg.norm(jacobian[:count], 2))
 
 
 def combinations(components: tuple[str, ...], values: np.ndarray, found: Covariance) -> tuple[dict[str, float], ...]:

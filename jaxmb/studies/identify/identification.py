@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..._types import State
+from ...simulate.arguments import DEFAULT_RTOL
 from ...system import AbstractSystem
 from ...system.quantities import component_names
 from . import verdict
@@ -214,7 +215,7 @@ def identification(
     if problem.loss.robust:
         pull, slopes = problem.loss.influence(data)
         squares, slope = float(np.sum(pull**2)), float(np.mean(slopes))
-    found = covariance(jacobian, by_directions, squares, data.size, slope)
+    found = covariance(jacobian, by_directions, squares, data.size, slope, problem.rtol)
     dispersion = found.noise**2 * slope if problem.loss.robust else 1.0
     own = series(problem, values, readings, known_noise)
     far = outliers(own)
@@ -285,6 +286,7 @@ def _judged(problem, z, components, ends, segments, found, own, far, known_noise
         warnings.append(
             f"the data do not determine {', '.join(undetermined)} separately (`combinations` says which changes leave "
             "the residuals as they are): free fewer of them, or measure more"
+            + (f", or simulate with a smaller rtol than {problem.rtol:g}" if problem.rtol > DEFAULT_RTOL else "")
         )
         reasons |= dict.fromkeys(undetermined, _UNDETERMINED)
     at_end = problem.free.at_end(z, deviations)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..._results import RESULTS
 from ..._types import State
+from ...simulate.arguments import DEFAULT_RTOL
 from ...system import AbstractSystem
 from ..batch import batch
 from ..minimise import Linearised
@@ -41,6 +42,11 @@ class Problem(eqx.Module):
     def loss(self) -> Loss:
         """The loss, which all experiments have in common."""
         return self.trials[0].loss
+
+    @property
+    def rtol(self) -> float:
+        """The relative tolerance of the motions."""
+        return float(np.max(np.asarray(self.options.get("rtol", DEFAULT_RTOL))))
 
     def own(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """The unknowns of one experiment, by their names in it."""

@@ -488,6 +488,15 @@ def test_combinations_that_make_no_difference():
     np.testing.assert_allclose(found.matrix[2, 2], 2 / 3)
 
 
+def test_what_the_tolerance_hides_is_not_determined():
+    """Derivatives of motions are as exact as these, so a sensitivity of 1e-5 is none at rtol 1e-6; a prior's is."""
+    jacobian = np.diag([1.0, 1e-5])
+    assert not covariance(jacobian, np.eye(2), None, 2, rtol=1e-8).undetermined.any()
+    assert covariance(jacobian, np.eye(2), None, 2, rtol=1e-6).undetermined.tolist() == [False, True]
+    known = np.array([[1.0, 0.0], [1e3, 0.0], [0.0, 0.5]])
+    assert not covariance(known, np.eye(2), None, 1, rtol=1e-4).undetermined.any()
+
+
 def test_iterations_together_are_those_alone():
     residuals = lambda z: np.array([10 * (z[1] - z[0] ** 2), 1 - z[0]])
     jacobian = lambda z: np.array([[-20 * z[0], 10.0], [-1.0, 0.0]])
