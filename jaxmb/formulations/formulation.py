@@ -148,7 +148,8 @@ def solve_constrained(
         return Solution(udot, multipliers, None)
     failed, rows = None, system.friction_rows
     if rows.size:
-        found, _, failed = _friction(*lax.stop_gradient((system, t, q, u, inertia, jacobian, multipliers)), formulation)
+        known = lax.stop_gradient((system, t, q, u, inertia, jacobian, multipliers, formulation))
+        found, _, failed = _friction(*known)
 
         def residual(own):
             law = system.nonideal_force(t, q, u, multipliers.at[rows].set(own))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.elimination import PivotOrder, eliminate, full_pivot
-from .kinematics import QuasiVelocityFrame
+from .kinematics import Parameters, QuasiVelocityFrame
 from .model import AbstractEquations
 from .transposition import Transposition, check_shape, share_of_suslov
 
@@ -92,7 +92,7 @@ class Hamel(AbstractEquations):
 
 
 @eqx.filter_jit
-def _frame_at(frame: QuasiVelocityFrame, q: Float[Array, "n"], parameters: dict[str, Array]) -> Float[Array, "n n"]:
+def _frame_at(frame: QuasiVelocityFrame, q: Float[Array, "n"], parameters: Parameters) -> Float[Array, "n n"]:
     return complete(frame.columns_of(jnp.zeros((), q.dtype), q, parameters))
 
 
@@ -123,7 +123,7 @@ def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) ->
 
 
 def structure_functions(
-    frame: QuasiVelocityFrame, t: Scalar, q: Float[Array, "n"], parameters: dict[str, Array]
+    frame: QuasiVelocityFrame, t: Scalar, q: Float[Array, "n"], parameters: Parameters
 ) -> Float[Array, "n k k"]:
     """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c."""
     columns = lambda q: frame.columns_of(t, q, parameters)

@@ -19,11 +19,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .kinematics import Parameters
+
 # A name; a number between Hölder's choice, zero, and Suslov's, one; or `W(t, q, v, dq, parameters)`, shape (nq,).
 Transposition = str | float | Callable[..., Array]
 
 
-def check_shape(transposition: Callable[..., Array], q: Array, parameters: dict[str, Array]) -> None:
+def check_shape(transposition: Callable[..., Array], q: Array, parameters: Parameters) -> None:
     """Raise a `ValueError` unless a function returns a variation of all rates."""
     shape = jax.eval_shape(lambda: jnp.asarray(transposition(jnp.zeros((), q.dtype), q, q, q, parameters))).shape
     if shape != q.shape:

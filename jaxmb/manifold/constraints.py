@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..linalg.inertia import AbstractInertia
 from ..system import AbstractEquation
 
 
@@ -54,13 +53,6 @@ class AbstractConstraints(eqx.Module):
         """The change of velocities that changes the rows of ψ by `−residual`, to all digits."""
 
     @abc.abstractmethod
-    def cancel_accelerations(
-        self, inertia: AbstractInertia, forces: Float[Array, "nu"], rows: Float[Array, "m"]
-    ) -> Float[Array, "nu"]:
-        """The change of accelerations, together with one of the multipliers, that changes `M u̇ − F − Aᵀ λ` by `−forces`
-        and `A u̇ − γ` by `−rows`.
-        """
-
     def cancel_residuals(
         self,
         system: AbstractEquation,
@@ -69,11 +61,10 @@ class AbstractConstraints(eqx.Module):
         forces: Float[Array, "nu"],
         rows: Float[Array, "m"],
     ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
-        """The same for `M u̇ − F − Aᵀ λ − C(λ)`, at (t, q, u) and multipliers λ, with the change of those that C depends
-        on; None without any.
+        """The change of accelerations, together with one of the multipliers λ, that changes `M u̇ − F − Aᵀ λ − C(λ)` by
+        `−forces` and `A u̇ − γ` by `−rows`, at (t, q, u); and the change of the multipliers that C depends on, None
+        without any.
         """
-        del multipliers
-        return self.cancel_accelerations(system.inertia(*at), forces, rows), None
 
 
 class SolvedState(eqx.Module):
@@ -92,8 +83,8 @@ class RestoredState(eqx.Module):
     """A state on the constraints and its accelerations.
 
     **Fields:** `q`, `u`, `udot`; `multipliers`, or None if they are not known, in a chart those that friction depends
-    on; the number of `iterations` for positions and whether any iteration `failed`; all but the first three are None in
-    tangents.
+    on; the number of `iterations` for positions and whether any iteration `failed`, None in tangents, as are
+    multipliers that friction does not depend on.
     """
 
     q: Coordinates
@@ -107,7 +98,7 @@ class RestoredState(eqx.Module):
 # Wrapped in a compiled function, so that it is traced once for all its places.
 @eqx.filter_jit
 def restore(system: AbstractEquation, t: Scalar, y: State, near: SolvedState, tol: Scalar) -> RestoredState:
-    """Restore a state to ideal constraints and find the accelerations there.
+    """Restore a state to the constraints and find the accelerations there.
 
     Derivatives are exact in a chart; those of a projector for a state on the constraints, and off them wrong by the
     size of the displacement.
@@ -139,7 +130,8 @@ def _push_solution(here, system, t, out, along):
     dsystem, dt, dq, du = along
     dq = here.push_positions((system, t, out.q), (dsystem, dt, dq))
     along = push_velocities(here, (system, t, out.q, out.u), (dsystem, dt, dq, du))
-    return RestoredState(dq, along[3], push_accelerations(here, (system, t, out.q, out.u), along, out))
+    dudot, dmultipliers = push_accelerations(here, (system, t, out.q, out.u), along, out)
+    return RestoredState(dq, along[3], dudot, dmultipliers)
 
 
 @eqx.filter_custom_jvp
@@ -171,8 +163,8 @@ def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple
 
 def push_accelerations(
     here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...], out: RestoredState
-) -> Float[Array, "nu"]:
-    """The tangent of the accelerations at (system, t, q, u)."""
+) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
+    """The tangents of the accelerations at (system, t, q, u), and of the multipliers that friction depends on."""
     system, t, q, u = at
     udot, multipliers = out.udot, here.multipliers(system, t, out)
 
@@ -183,7 +175,7 @@ def push_accelerations(
         return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
 
     rows, forces = push(equations, at, along)
-    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)[0]
+    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:

@@ -119,8 +119,8 @@ class ProjectorConstraints(AbstractConstraints):
     def cancel_velocities(self, residual):
         return self.projector.displacement(-residual)
 
-    def cancel_accelerations(self, inertia, forces, rows):
-        return self.projector.solve(-forces, -rows)[0]
+    def cancel_residuals(self, system, at, multipliers, forces, rows):
+        return self.projector.solve(-forces, -rows)[0], None
 
 
 def _largest(values, scale):

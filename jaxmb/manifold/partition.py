@@ -4,8 +4,10 @@ A step evaluates twice. `ideal_acceleration` takes predicted coordinates close t
 there: the one elimination of the step. `ChartConstraints` take the corrected state, keep its independent coordinates
 and velocities, solve `Φ = 0` and `ψ = 0` for the dependent ones, and find the accelerations there by one Newton
 correction of those of the prediction: it needs no Jacobian and no elimination, and costs a fifth. Where no state nearby
-has been evaluated, `restore_positions` is followed by `ideal_acceleration`. The factors' own derivatives are part of
-the rule, so higher derivatives are right as well.
+has been evaluated, `restore_positions` is followed by `ideal_acceleration`. Where constraints are not ideal, or bind
+accelerations only, `general_acceleration` stands for that. Its derivatives are those of the equations at their
+solution, those of `ideal_acceleration` as well; the factors that these need are differentiated with them or made anew,
+so higher derivatives are right.
 
 Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikravesh and I. S. Chung, J. Mech. Design
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
@@ -29,7 +31,7 @@ from ..formulations.formulation import check_mass, row_levels, solve_constrained
 from ..formulations.friction import solve_coupled
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
-from ..linalg.newton import chord, root
+from ..linalg.newton import chord
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
 from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
@@ -155,7 +157,7 @@ def _ideal_acceleration_jvp(primals, tangents):
     along = push_velocities(here, at, (dsystem, dt, dense(dq, q), dense(du, u)))
     pushed = solved.right_inverse @ push(lambda s, t, q, u: s.jacobian(t, q, u), at, along)
     dfactor = Factor(-(pushed @ solved.right_inverse), -(pushed @ solved.null_space), None)
-    dudot = push_accelerations(here, at, along, RestoredState(q, out.u, out.udot))
+    dudot, _ = push_accelerations(here, at, along, RestoredState(q, out.u, out.udot))
     return out, ConstrainedAcceleration(along[3], dudot, dfactor)
 
 
@@ -197,10 +199,11 @@ def _general_acceleration_jvp(primals, tangents):
     out = general_acceleration(system, formulation, t, q, u, split)
     here, at = _chart_constraints(split, system, t, q, out.u), (system, t, q, out.u)
     along = push_velocities(here, at, (dsystem, dt, dense(dq, q), dense(du, u)))
-    dudot = push_accelerations(here, at, along, RestoredState(q, out.u, out.udot, out.multipliers))
-    # Nothing that is differentiated depends on the factors and the multipliers.
-    none = jax.tree.map(lambda _: None, out)
-    return out, eqx.tree_at(lambda out: (out.u, out.udot), none, (along[3], dudot), is_leaf=lambda x: x is None)
+    solution = RestoredState(q, out.u, out.udot, out.multipliers)
+    found = along[3], *push_accelerations(here, at, along, solution)
+    # Nothing that is differentiated depends on the factors.
+    none, parts = jax.tree.map(lambda _: None, out), lambda out: (out.u, out.udot, out.multipliers)
+    return out, eqx.tree_at(parts, none, found, is_leaf=lambda x: x is None)
 
 
 @eqx.filter_custom_jvp
@@ -269,7 +272,7 @@ class ChartConstraints(AbstractConstraints):
             u = u - step
             failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(u))))
         # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are wrong by
-        # the square of the distance.
+        # the square of the distance; by the distance only where a multiplier that friction depends on changes its sign.
         at, own = (t, q, u), system.friction_rows
         rows = system.acceleration_residual(*at, near.udot)
         unbalanced = self._unbalanced(system, t, RestoredState(q, u, near.udot))
@@ -286,12 +289,8 @@ class ChartConstraints(AbstractConstraints):
         return _chart_constraints(self.split, system, t, q, u)
 
     def multipliers(self, system, t, restored):
-        at, rows, balance = (t, restored.q, restored.u), system.friction_rows, self._of_accelerations.right_inverse.T
-        unbalanced = self._unbalanced(system, t, restored)
-        found = lambda own: balance @ (unbalanced - self._friction(system, at, own))
-        if restored.multipliers is None:
-            return found(None)
-        return found(root(lambda own: own - found(own)[rows], restored.multipliers, lambda _, own: own))
+        friction = self._friction(system, (t, restored.q, restored.u), restored.multipliers)
+        return self._of_accelerations.right_inverse.T @ (self._unbalanced(system, t, restored) - friction)
 
     def _friction(self, system, at, own):
         """`C` at (t, q, u), from the multipliers that it depends on."""
@@ -318,11 +317,8 @@ class ChartConstraints(AbstractConstraints):
     def _of_accelerations(self) -> Factor:
         return self.factor if self.every is None else self.every
 
-    def cancel_accelerations(self, inertia, forces, rows):
-        return self._cancelling(inertia)(forces, rows)
-
     def _cancelling(self, inertia):
-        """`cancel_accelerations` for several forces and rows."""
+        """`(forces, rows) -> change`, what `cancel_residuals` does without C."""
         factor = self._of_accelerations
         solve = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
 

@@ -147,7 +147,10 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return chart
 
     def kept_at_start(self, chart: Chart) -> PyTree[Array]:
-        """The same for the start of a first step, whose prediction that is."""
+        """The same for the start of a run, from the chart at the end of its first step, whose prediction is the start.
+
+        The index sets are those that `update_chart` chose at the start.
+        """
         return self.kept(chart)
 
     def at_solution(self, t: Any, y: Y, f: Y, kept: PyTree[Array], args: Args) -> tuple[Y, Y]:

@@ -10,9 +10,11 @@ import pytest
 from rough_machines import GRAVITY, SCENES, manipulator, pendulum, sledge
 
 import jaxmb as mb
-from jaxmb import formulations, planar
+from jaxmb import formulations, planar, solvers
 from jaxmb.formulations.formulation import accelerations
 from jaxmb.linalg.rotations import rotate, rotate_2d
+from jaxmb.manifold import Partition
+from jaxmb.manifold.partition import general_acceleration
 
 
 def random_state(system, seed):
@@ -276,3 +278,28 @@ def test_bad_input():
     with pytest.raises(ValueError, match=r"accelerations prescribed by.*turn.*contradict"):
         both = [angle("turn", motion=lambda t, p: t**2), angle("other", motion=lambda t, p: 2 * t**2)]
         scene(joints=[mb.Servo(both[0]), mb.Servo(both[1])])
+
+
+def test_second_derivatives_of_accelerations():
+    """With friction and a program: those of the rule at the solution and those of the method that finds it."""
+    system = manipulator()
+    q, u = random_state(system, 0)
+    names = ["rub.coefficient", "lower.mass"]
+    start = jnp.array([float(mb.parameters(system)[name]) for name in names])
+    term, _ = Partition().prepare(system, formulations.Partitioned(), solvers.Adams(), 1e-8)
+    chart = term.update_chart(0.0, mb.State(q, u), term.init_chart(0.0, mb.State(q, u), None), None)
+    weights = np.cos(np.arange(float(system.nu)))
+
+    def by_rule(x):
+        own = mb.with_parameters(system, dict(zip(names, x, strict=True)))
+        found = general_acceleration(own, formulations.Partitioned(), jnp.zeros(()), q, u, chart.split)
+        return weights @ found.udot
+
+    def by_method(x):
+        own = mb.with_parameters(system, dict(zip(names, x, strict=True)))
+        return weights @ accelerations(own, formulations.Multipliers(), 0.0, q, u)[0]
+
+    for derivative in (lambda f: f, jax.grad, jax.hessian):
+        expected = jax.jit(derivative(by_method))(start)
+        found = jax.jit(derivative(by_rule))(start)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(expected)))

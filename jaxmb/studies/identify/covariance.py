@@ -50,15 +50,12 @@ def covariance(
     noise = 1.0
     if squares is not None:
         # The rank of what is determined does not depend on how the rows are weighted.
-        plain = np.linalg.svd(jacobian, compute_uv=False)
-        surplus = count - int(np.sum(plain > _smallest(jacobian, plain, count, rtol)))
+        surplus = count - int(np.sum(~_directions(jacobian, count, rtol)[2]))
         noise = np.sqrt(squares / surplus) / slope if surplus > 0 and slope > 0 else np.nan
         if np.isfinite(noise):
             # What is known beside the data has the size that it is known with.
             jacobian = np.vstack([jacobian[:count], noise * jacobian[count:]])
-    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
-    sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
-    weak = sizes <= _smallest(jacobian, sizes, count, rtol)
+    sizes, directions, weak = _directions(jacobian, count, rtol)
     root = changes @ (directions[~weak] / sizes[~weak][:, None]).T
     lost = changes @ directions[weak].T
     root = root * noise
@@ -69,9 +66,15 @@ def covariance(
     return Covariance(matrix, root, lost, undetermined, float(noise))
 
 
-def _smallest(jacobian, sizes, count, rtol):
-    """The sensitivity down to which a direction is determined, of a Jacobian with these singular values."""
-    return max(_UNDETERMINED * sizes[0], _TOLERANCES * rtol * np.linalg.norm(jacobian[:count], 2))
+def _directions(jacobian, count, rtol):
+    """Singular values of a Jacobian, their directions, and which of them are not determined."""
+    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
+    sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
+    of_data, of_others = (np.linalg.norm(rows @ directions.T, axis=0) for rows in np.split(jacobian, [count]))
+    smallest = _UNDETERMINED * sizes[0]
+    # What is known beside the data is exact.
+    hidden = (of_data <= _TOLERANCES * rtol * np.linalg.norm(jacobian[:count], 2)) & (of_others <= smallest)
+    return sizes, directions, (sizes <= smallest) | hidden
 
 
 def combinations(components: tuple[str, ...], values: np.ndarray, found: Covariance) -> tuple[dict[str, float], ...]:

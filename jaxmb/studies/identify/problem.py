@@ -45,8 +45,9 @@ class Problem(eqx.Module):
 
     @property
     def rtol(self) -> float:
-        """The relative tolerance of the motions."""
-        return float(np.max(np.asarray(self.options.get("rtol", DEFAULT_RTOL))))
+        """The relative tolerance of the motions, without a step size controller of one's own."""
+        finest = 10 * float(jnp.finfo(jnp.result_type(float)).eps)
+        return max(float(np.max(np.asarray(self.options.get("rtol", DEFAULT_RTOL)))), finest)
 
     def own(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """The unknowns of one experiment, by their names in it."""

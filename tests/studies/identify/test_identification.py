@@ -493,7 +493,7 @@ def test_what_the_tolerance_hides_is_not_determined():
     jacobian = np.diag([1.0, 1e-5])
     assert not covariance(jacobian, np.eye(2), None, 2, rtol=1e-8).undetermined.any()
     assert covariance(jacobian, np.eye(2), None, 2, rtol=1e-6).undetermined.tolist() == [False, True]
-    known = np.array([[1.0, 0.0], [1e3, 0.0], [0.0, 0.5]])
+    known = np.array([[1e3, 0.0], [0.0, 0.5]])
     assert not covariance(known, np.eye(2), None, 1, rtol=1e-4).undetermined.any()
 
 
