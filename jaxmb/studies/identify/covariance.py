@@ -68,8 +68,9 @@ def covariance(
 
 def _directions(jacobian, count, rtol):
     """Singular values of a Jacobian, their directions, and which of them are not determined."""
-    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=True)
-    sizes = np.pad(sizes, (0, directions.shape[0] - sizes.size))
+    rows, n = jacobian.shape
+    # Rows of zeros complete the directions, without a square matrix of as many rows as there are data.
+    _, sizes, directions = np.linalg.svd(np.pad(jacobian, ((0, max(n - rows, 0)), (0, 0))), full_matrices=False)
     of_data, of_others = (np.linalg.norm(rows @ directions.T, axis=0) for rows in np.split(jacobian, [count]))
     smallest = _UNDETERMINED * sizes[0]
     # What is known beside the data is exact.
