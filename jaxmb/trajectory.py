@@ -150,8 +150,9 @@ class Trajectory(eqx.Module):
         return self.system.motion(name, self.ys)
 
     def quantity(self, name: str) -> Array:
-        """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` of a body, `"A.force"` of a
-        joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a constraint.
+        """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` or `"rod.acceleration"` of a
+        body, `"A.force"` of a joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a
+        constraint.
         """
         known = self.system.quantities()
         if name not in known:

@@ -71,15 +71,29 @@ def _cut(i: int, j: int, d: int, rotates: bool, q: Array, u: Array) -> BodyMotio
 
 
 def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]:
-    """The fields of `BodyMotion` of every body, `"crank.angle"`."""
+    """The fields of `BodyMotion` of every body, `"crank.angle"`, and the accelerations of its velocities,
+    `"crank.acceleration"`.
+    """
     d = layout.space.dimension
+    turning = () if d == 2 else (3,)
     translation = {"position": (d,), "velocity": (d,)}
-    rotation = {"angle": (), "angular_velocity": ()} if d == 2 else {"orientation": (4,), "angular_velocity": (3,)}
+    rotation = {"angle": (), "angular_velocity": ()} if d == 2 else {"orientation": (4,), "angular_velocity": turning}
+    rates = {"acceleration": ("velocity", (d,)), "angular_acceleration": ("angular_velocity", turning)}
+
+    def changing(body, field, ys, solved):
+        # Velocities of a body are its own entries of u.
+        return getattr(body_motion(layout, body, State(ys.q, solved.accelerations)), field)
+
     out = {}
     for body, name in enumerate(names):
-        for field, shape in (translation | rotation if layout.rotates[body] else translation).items():
+        own = translation | rotation if layout.rotates[body] else translation
+        for field, shape in own.items():
             value = lambda ts, ys, _, body=body, field=field: getattr(body_motion(layout, body, ys), field)
             out[f"{name}.{field}"] = Quantity(shape, value)
+        for rate, (field, shape) in rates.items():
+            if field in own:
+                value = lambda ts, ys, solved, body=body, field=field: changing(body, field, ys, solved)
+                out[f"{name}.{rate}"] = Quantity(shape, value, of_forces=True)
     return out
 
 

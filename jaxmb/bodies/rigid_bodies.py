@@ -291,20 +291,21 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def contacts(self):
-        rows, names, modes, restitution, first = [], [], [], [], 0
+        rows, names, modes, by_poisson, restitution, first = [], [], [], [], [], 0
         for g in self.constraints:
             count = len(g.group.names) * g.rows
             if isinstance(g.group.part, AbstractUnilateralConstraint):
                 names += g.group.names
                 rows += range(first, first + count)
                 modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
+                by_poisson += [g.group.part.impact_law == "poisson"] * len(g.group.names)
                 restitution.append(g.group.part.restitution)
             first += count
         frictions = self._dry_frictions(names)
         if not names and frictions is None:
             return None
         coefficients = jnp.concatenate([*restitution, jnp.zeros(0, self.length.dtype)])
-        return Contacts(tuple(names), tuple(rows), tuple(modes), coefficients, frictions)
+        return Contacts(tuple(names), tuple(rows), tuple(modes), tuple(by_poisson), coefficients, frictions)
 
     def _dry_frictions(self, contacts):
         names, rows, modes, of_contacts, releases, pairs, first = [], [], [], [], [], [], self.position_rows

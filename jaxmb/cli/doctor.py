@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 
 from .. import mechanisms
+from .._machine import cores
 from .._programs import VARIABLE, kept_in
 from .._results import RESULTS
 from .._version import __version__
@@ -132,7 +133,7 @@ def _processor() -> str:
 
 def _cores() -> str:
     """Those that this process may use."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores()
     limit = os.environ.get("NPROC")
     return f"{count} core{'s' * (count > 1)}" + (f", NPROC={limit}" if limit else "")
 

@@ -30,7 +30,7 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("--out", type=Path, required=True, help="folder of the store, such as runs.zarr")
     command.add_argument("--processes", type=int, default=1, help="processes on this machine (default %(default)d)")
-    command.add_argument("--chunk", type=int, help="members computed together (default 512 or fewer)")
+    command.add_argument("--chunk", type=int, help="members computed together (default 512, or 128 for each core)")
     command.add_argument("--overwrite", action="store_true", help="replace a store that holds another sweep")
     command.set_defaults(command=_sweep)
 

@@ -1,10 +1,12 @@
 """Elimination of the dependent accelerations: the reduced equations of coordinate partitioning."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ..linalg.elimination import gauss_jordan, positive_solver
+from ..linalg.elimination import Factor, gauss_jordan, positive_solver
+from ..linalg.inertia import AbstractInertia
 from .formulation import AbstractFormulation
 
 
@@ -52,8 +54,18 @@ class ReducedPartitioned(AbstractFormulation):
         return _solve(inertia, force, jacobian.dense().pivoted, gamma, lambda load: self.inverse @ load)
 
 
-def _solve(inertia, force, factor, gamma, reduced):
+def reduced_accelerations(
+    inertia: AbstractInertia,
+    force: Float[Array, "nu"],
+    factor: Factor,
+    gamma: Float[Array, "m"],
+    solve: Callable[[Float[Array, "f"]], Float[Array, "f"]],
+) -> Float[Array, "nu"]:
+    """The accelerations by the `factor` of A, with the solution of the reduced equations, `(EᵀME)⁻¹`."""
     particular = factor.right_inverse @ gamma
-    independent = reduced(factor.null_space.T @ (force - inertia.product(particular)))
-    udot = particular + factor.null_space @ independent
+    return particular + factor.null_space @ solve(factor.null_space.T @ (force - inertia.product(particular)))
+
+
+def _solve(inertia, force, factor, gamma, solve):
+    udot = reduced_accelerations(inertia, force, factor, gamma, solve)
     return udot, factor.right_inverse.T @ (inertia.product(udot) - force)

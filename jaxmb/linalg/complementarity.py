@@ -89,8 +89,8 @@ class Dry(NamedTuple):
 
     **Fields:** the number of the contact of each in `contacts`, -1 for one with a normal force of its own; `pairs`: the
     numbers of the first laws of those friction that has two, one after the other; the `coefficient`; where it `slips`,
-    1 or -1, of pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force of those
-    without a contact.
+    1 or -1, of pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force, which that of
+    the contact adds to.
     """
 
     contacts: tuple[int, ...]
@@ -188,8 +188,9 @@ def _in_directions(W, b, dry, among):
         """The answers where pairs act along directions and across them, and the equations for the forces."""
         turn = others + jnp.tensordot(e, turns, 2)
         matrix, right = turn @ W @ turn.T, turn @ b
-        coefficient = dry.coefficient * jnp.where(np.isin(np.arange(m), pairs[:, 1]), across, 1.0)
-        laws = dry._replace(slips=turn[n:, n:] @ dry.slips, coefficient=coefficient)
+        share = jnp.where(np.isin(np.arange(m), pairs[:, 1]), across, 1.0)
+        slips = turn[n:, n:] @ dry.slips
+        laws = dry._replace(slips=slips, coefficient=dry.coefficient * share, bound=dry.bound * share)
         answers = _in_lines(matrix, right, laws, among)
         matrix, right = laws_of(matrix, right, laws, answers)
         return answers, matrix @ turn, right
@@ -202,7 +203,7 @@ def _in_directions(W, b, dry, among):
 
     def with_slips(answers, e):
         """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
-        pressed, sticks = answers.closed[contact], answers.sticks[pairs].all(1)
+        pressed, sticks = answers.closed[contact] | (dry.bound[pairs[:, 0]] > 0), answers.sticks[pairs].all(1)
         slips = jnp.where((touches & pressed & ~sticks)[:, None], jnp.where(may[:, None], e, known), 0.0)
         slips = placed_pairs(dry.pairs, slips, answers.slips)
         sticks_both = placed_pairs(dry.pairs, jnp.stack([sticks, sticks], axis=1), answers.sticks)
@@ -212,7 +213,8 @@ def _in_directions(W, b, dry, among):
         """The equations of a step of Newton's method for the directions of slip and the forces."""
         laws, slides = with_slips(answers, e)
         matrix, right = laws_of(W, b, dry, laws)
-        rates, load = (W @ x + b)[both], dry.coefficient[pairs[:, 0]] * jnp.maximum(x[contact], 0.0)
+        load = dry.bound[pairs[:, 0]] + dry.coefficient[pairs[:, 0]] * jnp.maximum(x[contact], 0.0)
+        rates = (W @ x + b)[both]
         # Along the direction the force is that of slip. Across, force and slip are zero together.
         across = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
         speed = jnp.abs(jnp.sum(e * rates, axis=1))
@@ -336,7 +338,7 @@ def _in_lines(W, b, dry, among):
     )
     found, solvable = _lemke(jnp.concatenate([rows_n, rows_r, rows_l]), right)
     closed, inside, backward = found[:n], found[n : n + m], found[n + m :]
-    pressed = jnp.any(closed[None, :] & (normal > 0), axis=1) | (np.array(dry.contacts) < 0)
+    pressed = jnp.any(closed[None, :] & (normal > 0), axis=1) | (np.array(dry.contacts) < 0) | (bound > 0)
     force = among[n:] & pressed
     sticks = force & may & inside & ~backward
     direction = jnp.where(may, jnp.where(backward, -1.0, 1.0), dry.slips)

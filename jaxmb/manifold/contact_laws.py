@@ -96,6 +96,17 @@ class Laws(NamedTuple):
         none, may = jnp.zeros(self.m, approach.dtype), self._may(touching) & ~self.of_joints
         return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
 
+    def of_expansion(self, free, again, touching, reactions) -> Problem:
+        """The impulses in an expansion, those of contacts besides what they push `again` at least; `free`: the rates at
+        the end of compression.
+        """
+        bound = jnp.zeros(self.m, free.dtype)
+        if self.m:
+            pushes = jnp.where(self.of_joints, 0.0, again[np.array(self.frictions.contacts)])
+            bound = self.coefficient * pushes
+        problem = self.of_impulses(free + self.influence[:, : self.n] @ again, touching, reactions)
+        return problem._replace(bound=bound)
+
     def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
         """The forces after an event, of contacts that are `staying`, and of friction that `slips`, or may stick where
         this is zero; `opening`: the accelerations without them; `forces`: nearly those, on which the normal forces of
@@ -128,7 +139,9 @@ class Laws(NamedTuple):
         if not self.m:
             return solved_components(self.influence, free, answers.closed)
         none = jnp.zeros(self.m, free.dtype)
-        matrix, right = laws_of(self.influence, free, self._dry(self.coefficient, none, none), answers)
+        # The normal forces of joints are found below.
+        bound = jnp.where(self.of_joints, 0.0, problem.bound)
+        matrix, right = laws_of(self.influence, free, self._dry(self.coefficient, none, bound), answers)
         # Others are zero to all digits.
         act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
         if reactions is None:

@@ -29,6 +29,7 @@ from .._types import Coordinates, Scalar, State, Velocities
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels, solve_constrained
 from ..formulations.friction import solve_coupled
+from ..formulations.partitioned import reduced_accelerations
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.newton import chord
@@ -46,8 +47,8 @@ from .constraints import (
     restore,
     solved,
 )
+from .contact_guards import after_jump, contact_guards
 from .diagnosis import diagnose
-from .impact import after_jump, contact_guards
 from .manifold import AbstractManifold, VectorField, newton_tolerance
 from .orthogonal_projection import project_normalized
 
@@ -323,9 +324,7 @@ class ChartConstraints(AbstractConstraints):
         solve = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
 
         def cancel(forces, rows):
-            particular = -(factor.right_inverse @ rows)
-            load = factor.null_space.T @ (forces + inertia.product(particular))
-            return particular - factor.null_space @ solve(load)
+            return reduced_accelerations(inertia, -forces, factor, -rows, solve)
 
         return cancel
 

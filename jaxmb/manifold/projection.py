@@ -20,8 +20,8 @@ from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluatio
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import RestoredState, SolvedState, restore, solved
+from .contact_guards import ContactGuards, after_jump, contact_guards
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .impact import ContactGuards, after_jump, contact_guards
 from .impulse import after_impulse
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (

@@ -6,7 +6,7 @@ of impacts and of loss of contact within its steps. Every pair that may touch is
 """
 
 import abc
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -33,15 +33,18 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     each: its mode, which is 0 where it is open, 1 where it is closed, and 2 where it is closed but other contacts imply
     it. By name the mode is `"stop.mode"`: `assemble(system, fix={"stop.mode": 1})` closes the gap.
 
-    An impact is Newton's: the gap opens at `restitution` times the rate at which it closed. Contacts that are closed
+    By Newton's law of impact the gap opens at `restitution` times the rate at which it closed. By Poisson's law the
+    impulse of the contact while the bodies part is `restitution` times that until they no longer approach, or more
+    where the gap would close. The two differ where friction acts, or several contacts at once. Contacts that are closed
     at the same time share the impulse. With friction, or with several coefficients at once, Newton's law may give
     energy back (T. R. Kane and D. A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): the rebounds of such an impact are
     all less, by the share at which no energy is gained.
 
-    **Fields:** `restitution` from 0 to 1, default 0.
+    **Fields:** `restitution` from 0 to 1, default 0; `impact_law`: `"newton"`, the default, or `"poisson"`.
     """
 
     restitution: fields.Number = fields.parameter(sign="non-negative", default=0.0, constant=True)
+    impact_law: Literal["newton", "poisson"] = fields.choice("newton", "poisson", default="newton")
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -77,8 +80,9 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     ```
 
     **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
-    which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before. The
-    range of an angle must be less than a full turn. `JointStop` is a compliant one.
+    which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before;
+    `impact_law`, `"newton"` (default) or `"poisson"`. The range of an angle must be less than a full turn. `JointStop`
+    is a compliant one.
     """
 
     lower: fields.Number = fields.parameter(unit="rad or m", optional=True)
@@ -186,7 +190,8 @@ class RigidContact(AbstractRigidContact):
     compliant one.
 
     **Arguments:** `body`; `terrain`, from `jaxmb.terrain`, fixed in the world; `radius` [m] ≥ 0, 0 for a point;
-    `centre` [m], body-fixed, default the origin of the frame; `restitution` from 0 to 1, default 0.
+    `centre` [m], body-fixed, default the origin of the frame; `restitution` from 0 to 1, default 0; `impact_law`,
+    `"newton"` (default) or `"poisson"`.
     """
 
     name: str = fields.name()
@@ -214,8 +219,8 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
     `DryFriction`.
 
     **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
-    centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0. The centres must not
-    coincide.
+    centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0; `impact_law`,
+    `"newton"` (default) or `"poisson"`. The centres must not coincide.
     """
 
     radius_a: fields.Number = fields.length(sign="non-negative")
@@ -243,7 +248,7 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPair):
 
     **Arguments:** `point_a` [m] of the plane and `point_b` [m], the centre, body-fixed, default the origins of the
     frames; `normal_a`, the plane's normal, fixed in `body_a`, or `normal` in the world at the given poses; `radius` [m]
-    ≥ 0, default 0; `restitution` from 0 to 1, default 0.
+    ≥ 0, default 0; `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
     """
 
     point_a: fields.Number = fields.point(body=0, default="origin")
@@ -272,7 +277,8 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
 
     **Arguments:** `size` [m], the lengths of the box along the axes of the frame of `body_a`; `radius` [m] > 0;
     `point_a` and `point_b` [m], the centres of the box and of the ball, body-fixed, default the origins of the frames;
-    `restitution` from 0 to 1, default 0. The ball's centre stays outside of the box.
+    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`. The ball's centre stays
+    outside of the box.
     """
 
     size: fields.Number = fields.parameter(shape=("d",), unit="m", sign="positive")
@@ -304,7 +310,7 @@ class Slack(AbstractGeometricContact, AbstractPair):
     """A rope between two points, or a coupling with slack: the points are at most `length` apart.
 
     **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0;
-    `restitution` from 0 to 1, default 0.
+    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
     """
 
     point_a: fields.Number = fields.point(body=0, default="origin")

@@ -41,6 +41,9 @@ class BodyMotion(NamedTuple):
     **Fields:** `position` [m] of the mass centre and `velocity` [m/s], world axes, shape (times, 2) or (times, 3); in
     the plane `angle` [rad] and `angular_velocity` [rad/s], shape (times,); in space `orientation` (Euler parameters,
     (times, 4)) and `angular_velocity` [rad/s] in the body frame, (times, 3). A point mass has no attitude: None.
+
+    The derivatives of both velocities are quantities: `trajectory.quantity("crank.acceleration")` [m/s²] and
+    `"crank.angular_acceleration"` [rad/s²].
     """
 
     position: Array
@@ -53,7 +56,8 @@ class BodyMotion(NamedTuple):
         return list(self._fields)
 
     def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"The motion of a body has {', '.join(self._fields)}; got {name!r}.")
+        of_forces = '; for accelerations: trajectory.quantity("NAME.acceleration")' if "accel" in name else ""
+        raise AttributeError(f"The motion of a body has {', '.join(self._fields)}; got {name!r}{of_forces}.")
 
 
 class Reaction(NamedTuple):

@@ -114,7 +114,10 @@ def main():
         steps = str(int(case.at("motion", RTOL)[1]))
         costs.append((name, steps, f"{1e3 * times['motion']:.2f}", *ratios, spent, kernels))
         errors.append((name, *case.errors()))
-        print(f"{name} done", file=sys.stderr, flush=True)
+        print("  ".join((*costs[-1], *errors[-1][1:])), file=sys.stderr, flush=True)
+        # All programs together have more pieces of code than a process may map.
+        del case
+        jax.clear_caches()
     print("\n".join([*aligned(costs), "", *aligned(errors)]))
 
 

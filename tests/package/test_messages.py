@@ -32,9 +32,17 @@ def test_an_unknown_coordinate_lists_those_of_the_body(pendulum):
         mb.assemble(pendulum, fix={"rod.angel": 0.3})
 
 
+def test_an_angle_in_degrees_is_warned_of():
+    scene = mb.Scene([mb.planar.Body("rod", mass=1.0, inertia=0.1, angle=90.0)])
+    with pytest.warns(UserWarning, match=r"'rod': the angle 90 rad is more than .*; .*np.deg2rad\(90\) is 1.571"):
+        scene.compile()
+
+
 def test_views_list_what_they_have(motion):
     with pytest.raises(AttributeError, match="angular_velocity; got 'omega'"):
         getattr(motion["rod"], "omega")  # noqa: B009
+    with pytest.raises(AttributeError, match=r"trajectory.quantity\("):
+        getattr(motion["rod"], "acceleration")  # noqa: B009
     assert dir(motion["rod"]) == sorted(["position", "velocity", "angle", "orientation", "angular_velocity"])
 
 

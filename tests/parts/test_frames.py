@@ -136,6 +136,9 @@ def test_what_an_accelerometer_and_a_gyroscope_measure():
     np.testing.assert_allclose(central(imu.position), imu.velocity[1:-1], rtol=0, atol=1e-4)
     np.testing.assert_allclose(central(imu.velocity), imu.acceleration[1:-1], rtol=0, atol=1e-3)
     np.testing.assert_allclose(central(imu.angular_velocity), imu.angular_acceleration[1:-1], rtol=0, atol=1e-3)
+    arm = lambda field: motion.quantity(f"arm.{field}")
+    np.testing.assert_allclose(central(arm("velocity")), arm("acceleration")[1:-1], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(central(arm("angular_velocity")), arm("angular_acceleration")[1:-1], rtol=0, atol=1e-3)
     felt = jax.vmap(rotations.unrotate)(imu.orientation, imu.acceleration - jnp.array([[0.0, 0.0, -9.81]]))
     np.testing.assert_allclose(imu.specific_force, felt, rtol=0, atol=1e-12)
     # The origin of the frame: 0.2 and 0.1 from the hinge in the link's frame, whatever the mass centre.

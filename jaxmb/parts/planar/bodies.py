@@ -1,5 +1,6 @@
 """Planar bodies, and moments of inertia of common shapes."""
 
+import warnings
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -24,6 +25,15 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     velocity: fields.Number = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
     angular_velocity: fields.Number = fields.guess(unit="rad/s", default=0.0)
     rotates: ClassVar[bool] = True
+
+    def validate(self):
+        # A system's bodies of one kind share their numbers, and have no guess.
+        if self.angle is not None and abs(self.angle) > 2 * np.pi:
+            warnings.warn(
+                f"{self.label}: the angle {self.angle:g} rad is more than a full turn; angles are in radians, "
+                f"np.deg2rad({self.angle:g}) is {np.deg2rad(self.angle):.4g}.",
+                stacklevel=2,
+            )
 
     def pose(self):
         return np.append(self.position, self.angle)

@@ -3,12 +3,14 @@
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from concurrent import futures
 from typing import Any, Literal
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from ..._machine import threads
 from ..batch import Member, batch
 from .outputs import Outputs, Returned, check_same, outputs_of, returned, statuses
 
@@ -140,13 +142,25 @@ class _Program:
     def __call__(
         self, columns: Mapping[str, np.ndarray], tell: Callable[[int], object] = lambda members: None
     ) -> Returned:
-        """The outputs of some members, in blocks."""
+        """The outputs of some members, in blocks, as many at a time as there are threads; XLA computes one in one."""
         count = next(iter(columns.values())).shape[0]
-        blocks = []
-        for start in range(0, count, self.size):
-            blocks.append(jax.tree.map(np.asarray, self._run(self._block(columns, start))))
-            tell(min(self.size, count - start))
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
+        # Made in this thread, where a user may have changed how arrays are made.
+        blocks = [self._block(columns, start) for start in range(0, count, self.size)]
+        found: list[Any] = [None] * len(blocks)
+        with futures.ThreadPoolExecutor(min(threads(), len(blocks))) as pool:
+            places = {pool.submit(self._computed, block): k for k, block in enumerate(blocks)}
+            try:
+                for done in futures.as_completed(places):
+                    k = places[done]
+                    found[k] = done.result()
+                    tell(min(self.size, count - k * self.size))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *found)
+
+    def _computed(self, block: dict[str, Any]) -> Returned:
+        return jax.tree.map(np.asarray, self._run(block))
 
     def _block(self, columns: Mapping[str, np.ndarray], start: int) -> dict[str, Any]:
         """The parameters of a block, filled up to its size with the last member."""

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from ..._compat import processes_of
+from ..._machine import cores
 from ..._programs import SETTINGS
 from .batch import Batch
 from .dataset import packages
@@ -110,7 +111,7 @@ def on_processes(
             min(processes, len(left)),
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_start_worker,
-            initargs=(max((os.cpu_count() or 1) // processes, 1),),
+            initargs=(max(cores() // processes, 1),),
         )
         try:
             for index, values in on_executor(batch, store, list(left.values()), pool, _PER_WORKER * processes):

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._machine import threads
 from ..._version import __version__
 from ...parts.names import names_arguments
 from . import dataset, store as stores
@@ -24,8 +24,9 @@ from .labels import described
 from .load import load_sweep
 from .outputs import OK, RESERVED, check_parameters, declared, step_limit
 
-# Large enough that what a chunk costs besides its members, 5 ms, does not count, small enough that little is lost.
-_CHUNK = 512
+# Large enough that what a chunk costs besides its members, 5 ms, does not count, and that each core has at least two of
+# its blocks, small enough that little is lost.
+_CHUNK, _OF_THREAD = 512, 128
 # What a sweep is known by, where the name of the attribute does not say it.
 _WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
 
@@ -79,14 +80,17 @@ def sweep(
 
     **Other arguments:**
 
-    - `chunk`: members that are written together, default 512 or fewer; what is lost when a process is killed, and what
-        takes memory. The store keeps it. They are computed in blocks as by `jaxmb.batch`.
+    - `chunk`: members that are written together, default 512, or 128 for each core where that is more, or fewer where
+        there are not as many; what is lost when a process is killed, and what takes memory. The store keeps it. They
+        are computed in blocks as by `jaxmb.batch`.
     - `budget`: most steps of a member at first. Members of a block run together and take as long as the slowest of
         them. So if the function has an argument `max_steps`, which it hands to `simulate`, and returns its `result`,
         members that use up the budget are computed anew with the default of `max_steps`, in blocks of their own, by a
         second program. Default `"auto"`: none, until the chunks so far show by their steps that the rest of the sweep
         will save twice the time in which that program is compiled. None: no budget.
-    - `processes`: on this machine, each with its share of the cores. A process that dies is replaced.
+    - `processes`: on this machine, each with its share of the cores, default one. A process computes as many blocks of
+        a chunk at a time as it has cores, or as the environment variable `NPROC` allows; the bits are the same. Several
+        of them, each of which compiles for itself, survive a crash: a process that dies is replaced.
     - `executor`: any `concurrent.futures.Executor` instead: Dask's `client.get_executor()`,
         `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves.
     - `devices`: a number of `jax.local_devices()`, or a list of them, among which the members of a chunk are divided,
@@ -268,17 +272,18 @@ def _check_threads(devices: Sequence[Any]) -> None:
 
     Each holds a thread of XLA while its program runs, and waits for others, for ever if there are none.
     """
-    threads, parts = int(os.environ.get("NPROC") or os.cpu_count() or 1), len(devices)
-    if parts > 1 and devices[0].platform == "cpu" and threads < 2 * parts:
+    available, parts = threads(), len(devices)
+    if parts > 1 and devices[0].platform == "cpu" and available < 2 * parts:
         raise ValueError(
-            f"{parts} devices of a CPU need {2 * parts} threads, and JAX has {threads}: set NPROC={2 * parts} in the "
+            f"{parts} devices of a CPU need {2 * parts} threads, and JAX has {available}: set NPROC={2 * parts} in the "
             "environment before JAX starts, or use processes=."
         )
 
 
 def _chunk(given: Any, members: int, processes: int) -> int:
     if given is None:
-        return min(_CHUNK, -(-members // processes))
+        most = _CHUNK if processes > 1 else max(_CHUNK, _OF_THREAD * threads())
+        return min(most, -(-members // processes))
     if not isinstance(given, int | np.integer) or isinstance(given, bool) or given < 1:
         raise ValueError(f"chunk must be an integer of at least 1, got {given!r}.")
     return min(int(given), members)

@@ -22,6 +22,7 @@ from sweeping import CASES, CHUNKS, files, forked, marks, run, spring, wait_for
 
 import jaxmb as mb
 from jaxmb.cli import main
+from jaxmb.studies.sweep import batch as sweep_batch
 
 
 @pytest.fixture(scope="module")
@@ -371,6 +372,50 @@ def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
     assert marks(store) == 5
     run(store)
     assert files(store) == files(undisturbed[0])
+
+
+def halved(a, b):
+    """A loop of several steps, so that members are computed in blocks."""
+    x = jax.lax.while_loop(lambda x: x > 1.0, lambda x: 0.5 * x, a)
+    return {"x": jnp.where(a > 6.0, jnp.nan, x * b)}
+
+
+def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
+    """Two blocks are computed at a time, with the same bits as one after the other."""
+    cases = mb.cases.grid(a=np.linspace(1.5, 7.0, 12), b=[1.0, 3.0])
+    own = sweep_batch._Program._computed
+    monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
+    together = threading.Barrier(2)
+
+    def both(program, block):
+        together.wait(timeout=60)
+        return own(program, block)
+
+    with monkeypatch.context() as patch:
+        patch.setenv("NPROC", "2")
+        patch.setattr(sweep_batch._Program, "_computed", both)
+        found = mb.sweep(halved, cases)
+    shown = capsys.readouterr().err.strip().split("\r")[-1]
+    assert "24/24" in shown and f"{int(np.sum(found.status != 1))} failed" in shown
+    xr.testing.assert_identical(found, mb.sweep(halved, cases, progress=False))
+
+
+def test_a_sweep_is_interrupted_between_blocks(monkeypatch):
+    """Blocks that have not begun are not computed then."""
+    computed, own = [], sweep_batch._Program._computed
+    monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
+
+    def interrupted(program, block):
+        computed.append(block)
+        if len(computed) == 2:
+            raise KeyboardInterrupt
+        return own(program, block)
+
+    monkeypatch.setenv("NPROC", "1")
+    monkeypatch.setattr(sweep_batch._Program, "_computed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        mb.sweep(halved, mb.cases.grid(a=np.linspace(1.5, 7.0, 40), b=[1.0, 3.0]), progress=False)
+    assert len(computed) < 5
 
 
 def test_progress_tells_the_time_left_and_failures(capsys):

@@ -1,0 +1,127 @@
+"""When events of contacts and dry friction are: gaps, forces and slips that become zero along a motion."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .._types import Scalar, State
+from ..formulations import AbstractFormulation
+from ..linalg.complementarity import (
+    placed_pairs,
+)
+from ..linalg.rotations import norm
+from ..solvers import AbstractGuards
+from ..system import AbstractEquation
+from ..system.gaps import (
+    BEGUN,
+    CLOSED,
+    FORWARD,
+    OPEN,
+    STICK,
+    contacts_of,
+    counts,
+    direction_rates,
+    direction_rows,
+    frictions_of,
+    gaps,
+    modes_of,
+    pairs_of,
+)
+from .contact_forces import contact_forces, largest_force, slow_slip, stick_reserve
+from .impact import Impact, impact
+from .impact_event import NEAR
+from .impulse import after_impulse
+
+# Slip in two directions that begins has the direction of its modes up to this multiple of what is slow.
+_SEEN = 4
+# Modes of slip are longer than this, and those of slip that has begun shorter.
+_HALFWAY = 0.75
+
+
+class ContactGuards(AbstractGuards):
+    """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
+    forces; slips in units of the size per second, and what the forces of stick are below their limits.
+    """
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    touch: Float[Array, ""]
+
+    @property
+    def near(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return NEAR * self.touch
+
+    def values(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        q = system.normalize(y.q)
+        t, (n, _) = jnp.asarray(t, q.dtype), counts(system)
+        modes = modes_of(system, q)
+        free = jnp.where(modes[:n] == OPEN, gaps(system, t, q), system.length)
+        frictions = contacts_of(system).frictions
+        if frictions is None:
+            acts = modes == CLOSED
+        else:
+            acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] >= STICK])
+            rates = direction_rates(system, t, q, y.u)
+            slips, slip = jnp.abs(modes[n:]) == FORWARD, modes[n:] * rates[n:]
+            free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
+            free = self._of_pairs(free, modes, rates, y.u)
+
+        def forces():
+            own = system.at(y)
+            _, multipliers = contact_forces(own, self.formulation, t, q, y.u)
+            largest = largest_force(own, t, dataclasses.replace(y, q=q), multipliers)
+            taken = multipliers[np.array(direction_rows(system))]
+            if frictions is not None:
+                taken = jnp.concatenate([taken[:n], stick_reserve(own, t, q, y.u, multipliers)])
+            return taken / largest
+
+        held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
+        return jnp.where(acts, held, free / system.length)
+
+    def _of_pairs(self, free, modes, rates, u):
+        """With the guards of slip in two directions: that it has not turned by more than 60 degrees from its modes, nor
+        is slow; where it has begun, that it is neither back at rest nor faster.
+        """
+        own = pairs_of(self.system)
+        if not own.size:
+            return free
+        length = self.system.length
+        slow, size, speed = slow_slip(self.system, self.touch * length, u), norm(modes[own]), norm(rates[own])
+        along = jnp.sum(modes[own] * rates[own], axis=1)
+        has_begun, slides = (size > 0) & (size < _HALFWAY), (size > _HALFWAY) & (size < STICK)
+        turned = jnp.where(has_begun, along / BEGUN, jnp.where(slides, along - 0.5 * speed, length))
+        fast = jnp.where(has_begun, _SEEN * slow - speed, jnp.where(slides, speed - slow, length))
+        n, pairs = counts(self.system)[0], frictions_of(self.system).pairs
+        return jnp.concatenate([free[:n], placed_pairs(pairs, jnp.stack([turned, fast], axis=1), free[n:])])
+
+    def impact(self, t: Scalar, y: State, dated: bool = False) -> Impact:
+        """The event at a state; see `impact`."""
+        return impact(self.system.at(y), self.formulation, self.touch, t, y, dated)
+
+    def rates(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        q, (n, _) = system.normalize(y.q), counts(system)
+        rates = direction_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
+        watched = (modes_of(system, q) == OPEN) & (np.arange(rates.size) < n)
+        return jnp.where(watched, rates, jnp.inf)
+
+
+def contact_guards(
+    system: AbstractEquation, formulation: AbstractFormulation, touch: Float[Array, ""]
+) -> ContactGuards | None:
+    """The guards of a system's contacts; None without any."""
+    return None if system.contacts is None else ContactGuards(system, formulation, touch)
+
+
+def after_jump(term: Any, t: Scalar, y: State) -> State:
+    """The state after prescribed rates have jumped, or contacts closed or opened, of a term with `system`,
+    `formulation` and `guards`.
+    """
+    if term.guards is None:
+        return after_impulse(term.system, t, y)
+    return term.guards.impact(t, y).after
