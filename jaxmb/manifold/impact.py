@@ -172,7 +172,7 @@ def _struck(event, at, along):
     projector = jacobian.projector(system.inertia(t, free, event.u))
     numbers = np.array(direction_rows(system))
     moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
-    rebounds = ~event.low & ~np.array(contacts.by_poisson)
+    rebounds = ~event.low & ~np.array(contacts.by_poisson, bool)
     of_contact, known = np.zeros(0, bool), jnp.zeros(0, q.dtype)
     coefficient = known
     if m:
@@ -238,7 +238,7 @@ def _struck(event, at, along):
         plain, matrix, right = of_phase(event.at, du, compression, none)
         first, between = solved(plain, matrix, right)
         first_by_share = jnp.linalg.solve(matrix, jnp.where(compression.held, bounce, 0.0))
-        pushes = ~event.low & np.array(contacts.by_poisson)
+        pushes = ~event.low & np.array(contacts.by_poisson, bool)
         again = lambda system, impulses: jnp.where(
             pushes, event.share * contacts_of(system).restitution * impulses[:n], 0.0
         )
