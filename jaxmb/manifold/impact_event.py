@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg.complementarity import (
     Answers,
@@ -16,7 +16,7 @@ from ..linalg.complementarity import (
     solved_components,
 )
 from ..linalg.rotations import norm
-from ..solvers.events import narrowed
+from ..solvers.events import Bracket, narrowed
 from ..system.gaps import (
     CLOSED,
     FORWARD,
@@ -43,8 +43,8 @@ NEAR = 1e2
 _FAR = 1e6
 # A contact closes where it would bounce no higher than this multiple of it.
 _BOUNCE = 1e3
-# Low bounces, and the normal forces of joints, which depend on the friction in them, decide on what stays closed and
-# sticks in this many rounds.
+# The normal forces of joints, which depend on the friction in them, decide on what stays closed and sticks in this many
+# rounds of impulses and forces; without such friction low bounces do in a second one.
 _ROUNDS = 4
 # Rebounds at which no energy is gained are found in this many trials, to this fraction of what adds up in it.
 _TRIALS, _GAIN = 40, 1e-12
@@ -153,10 +153,8 @@ def find_event(system, formulation, touch, t, y) -> Event:
             impulses, solvable = before.pushed + impulses, solvable & before.solvable
         after = before.when.u + jnp.where(k < turns, 0.0, jump) + impulses @ moves
         rate = rates_at(after)
-        both = before.when.at + rate
-        gained = jnp.dot(impulses, both)
+        gained = jnp.dot(impulses, before.when.at + rate)
         size = jnp.dot(jnp.abs(impulses), jnp.abs(before.when.at) + jnp.abs(rate))
-        trial = _next_trial(before.trial, gained, size, k // turns - 1)
         udot, opening, reactions = accelerated(after)
         sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(before.when.u))
         resting = before.when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
@@ -174,7 +172,7 @@ def find_event(system, formulation, touch, t, y) -> Event:
             resting=resting,
             ended=ended,
             solvable=solvable,
-            trial=trial,
+            gained=(gained, size),
             share=before.trial.share,
         )
 
@@ -200,8 +198,13 @@ def find_event(system, formulation, touch, t, y) -> Event:
         # Each bounce takes `restitution` times the time of the one before.
         ratio = jnp.where(low & (bounce > 0), contacts.restitution, 0.0)
         rest = jnp.where(low & (bounce > 0), 2 * before.rate[:n] / (falls * (1 - ratio)), 0.0)
+        # Where nothing bounces low, and no force depends on others, a second round would find the same.
+        rounds = before.rounds if laws.of_joints.any() else jnp.where(jnp.any(low), 2, 1)
+        trial = _next_trial(before.trial, *before.gained, k // turns - rounds)
         return before._replace(
-            problem=impulse_of(when, low, before.trial.share),
+            problem=impulse_of(when, low, trial.share),
+            rounds=rounds,
+            trial=trial,
             low=low,
             rest=jnp.where(is_first, rest, before.rest),
             answers=answers,
@@ -271,7 +274,9 @@ def find_event(system, formulation, touch, t, y) -> Event:
         answers=no,
         forces=none,
         solvable=yes,
-        trial=_Trial(one, 0 * one, one, 0 * one, one, ~yes),
+        rounds=jnp.array(_ROUNDS if laws.of_joints.any() else 1),
+        gained=(one, one),
+        trial=_Trial(one, Bracket(0 * one, one, 0 * one, one, jnp.array(0)), ~yes),
         share=one,
         compression=Phase(u, none > 0, none[n:], none) if turns == 3 else None,
         pushed=none if turns == 3 else None,
@@ -280,8 +285,8 @@ def find_event(system, formulation, touch, t, y) -> Event:
 
     def going(carry):
         k, last = carry
-        rounds = k // turns - 1
-        return (k % turns != 0) | (rounds < _ROUNDS) | (last.trial.again & (rounds < _ROUNDS + _TRIALS))
+        more = k // turns - 1 - last.rounds
+        return (k % turns != 0) | (more < 0) | (last.trial.again & (more < _TRIALS))
 
     def advance(carry):
         k, last = carry
@@ -373,34 +378,33 @@ class _When(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """The search for the largest `share` of the rebounds at which an impact gives no energy back: it is between `a`, at
-    which some is lost, and `b`, with what is gained at both; whether it goes on `again`.
+    """The search for the largest `share` of the rebounds at which an impact gives no energy back: it is in the
+    `bracket`, of what is gained; whether it goes on `again`.
     """
 
     share: Float[Array, ""]
-    a: Float[Array, ""]
-    b: Float[Array, ""]
-    of_a: Float[Array, ""]
-    of_b: Float[Array, ""]
+    bracket: Bracket
     again: Bool[Array, ""]
 
 
 def _next_trial(trial: _Trial, gained, size, k) -> _Trial:
-    """What is tried next, after the first rounds, in which the whole rebound was, and gained some energy."""
-    first = k == _ROUNDS - 1
+    """What is tried next, after `k` trials; before the first one the whole rebound was, and gained some energy."""
+    first = k == 0
     again = jnp.where(first, gained > REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
-    a, b, of_a, of_b, share = narrowed((trial.a, trial.b, trial.of_a, trial.of_b), trial.share, gained, k % 3 == 2)
+    bracket, share = narrowed(trial.bracket, trial.share, gained, k % 3 == 2)
     # Without a rebound energy is lost.
     share = jnp.where(again, jnp.where(first, 0.0, share), trial.share)
-    new = _Trial(share, a, b, of_a, of_b, again)
-    return jax.tree.map(lambda old, new: jnp.where(k < _ROUNDS - 1, old, new), trial, new)
+    new = _Trial(share, bracket, again)
+    return jax.tree.map(lambda old, new: jnp.where(k < 0, old, new), trial, new)
 
 
 class _Round(NamedTuple):
     """What happens in an event in one round of impulses and forces of `find_event`; see there.
 
-    **Fields:** the `problem` of the impulses or forces that are to be found next; `when` the event is; by Poisson's law
-    the `compression`, and the impulses with which contacts have `pushed` then and push again at least.
+    **Fields:** the `problem` of the impulses or forces that are to be found next; `when` the event is; in how many
+    `rounds` what stays closed and sticks is known; twice the energy that the impulses have `gained`, and what adds up
+    in it; by Poisson's law the `compression`, and the impulses with which contacts have `pushed` then and push again at
+    least.
     """
 
     problem: Problem
@@ -417,6 +421,8 @@ class _Round(NamedTuple):
     answers: Answers
     forces: Float[Array, "laws"]
     solvable: Bool[Array, ""]
+    rounds: Int[Array, ""]
+    gained: tuple[Float[Array, ""], Float[Array, ""]]
     trial: _Trial
     share: Float[Array, ""]
     compression: Phase | None

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# A zero is found to this fraction of a step, or in this many evaluations.
-_FRACTION, _EVALUATIONS = 1e-13, 60
+# A zero is found to this fraction of a step, or in this many evaluations, by bisection after the first ones.
+_FRACTION, _EVALUATIONS, _SECANTS = 1e-13, 60, 12
 # A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
 _END = 1e-9
 # After an event that follows another one at once the next step is this fraction of the last one that was tried.
@@ -79,20 +79,29 @@ def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
 _LOOK, _DIP, _RISE, _ZERO, _DONE = range(5)
 
 
-class _Search(NamedTuple):
-    """The search for the first zero in a step, whose times are fractions of it.
-
-    **Fields:** the `phase`; `s`: where guards are evaluated next; an interval from `a` to `b` with the values of what
-    changes its sign in it; which guards are `looked_at`; whether these are positive at the start of the step; guards
-    and their rates at the end of it; whether one is negative in its middle; the number of evaluations in this `phase`.
+class Bracket(NamedTuple):
+    """An interval from `a` to `b` in which a function changes its sign, with its values there; which end was `moved`
+    last: -1 the first, 1 the second, 0 none.
     """
 
-    phase: Any
-    s: Any
     a: Any
     b: Any
     of_a: Any
     of_b: Any
+    moved: Any
+
+
+class _Search(NamedTuple):
+    """The search for the first zero in a step, whose times are fractions of it.
+
+    **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
+    are `looked_at`; whether these are positive at the start of the step; guards and their rates at the end of it;
+    whether one is negative in its middle; the number of evaluations in this `phase`.
+    """
+
+    phase: Any
+    s: Any
+    bracket: Bracket
     looked_at: Any
     positive: Any
     end: Any
@@ -134,10 +143,7 @@ def crossing(
     first = _Search(
         jnp.array(_LOOK),
         one,
-        jnp.zeros_like(one),
-        one,
-        zero,
-        zero,
+        Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0)),
         none > 0,
         jnp.array(False),
         none,
@@ -150,7 +156,7 @@ def crossing(
     lost = jnp.any(jnp.isinf(ravel(y0)))
     within, falling, lost = (x.astype(start.dtype) for x in (found.dips, falling, lost))
     touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
-    return Crossing(error, t0 + found.b * (t1 - t0), within, jnp.min(found.end), falling, lost, touch, near)
+    return Crossing(error, t0 + found.bracket.b * (t1 - t0), within, jnp.min(found.end), falling, lost, touch, near)
 
 
 def _looked(search: _Search, values, rates, start, touch):
@@ -160,12 +166,12 @@ def _looked(search: _Search, values, rates, start, touch):
     # Of several the one that is least at the end.
     least = jnp.argmin(jnp.where(inside, values, jnp.inf))
     dips, crosses = jnp.any(inside) & ~jnp.any(below), jnp.any(below)
-    s = search.s / 2
+    of_a = jnp.where(dips, start[least], search.bracket.of_a)
+    of_b = jnp.where(dips, rates[least], jnp.min(jnp.where(below, values, jnp.inf)))
     return search._replace(
         phase=jnp.where(crosses, _RISE, jnp.where(dips, _DIP, _DONE)),
-        s=s,
-        of_a=jnp.where(dips, start[least], search.of_a),
-        of_b=jnp.where(dips, rates[least], jnp.min(jnp.where(below, values, jnp.inf))),
+        s=search.s / 2,
+        bracket=search.bracket._replace(of_a=of_a, of_b=of_b),
         looked_at=jnp.where(crosses, below, jnp.arange(values.size) == least),
         end=values,
         rates=rates,
@@ -177,16 +183,18 @@ def _dipped(search: _Search, values, rates, start, touch):
     """Towards the zero of a guard's rate, where it is least."""
     del start
     own = jnp.argmax(search.looked_at)
-    narrowed = _narrowed(search, rates[own])
-    ends = _is_short(narrowed)
+    again = _narrowed(search, rates[own])
+    ends = _is_short(again)
     dips = ends & (values[own] < -touch)
-    again = narrowed._replace(
+    bracket, one = again.bracket, jnp.ones_like(search.s)
+    b = jnp.where(dips, search.s, jnp.where(ends, one, bracket.b))
+    return again._replace(
         phase=jnp.where(dips, _RISE, jnp.where(ends, _DONE, _DIP)),
+        s=jnp.where(dips, search.s / 2, again.s),
+        bracket=bracket._replace(a=jnp.where(ends, 0.0, bracket.a), b=b),
         dips=dips,
-        count=jnp.where(ends, 0, narrowed.count),
+        count=jnp.where(ends, 0, again.count),
     )
-    s, b = jnp.where(dips, search.s / 2, again.s), jnp.where(dips, search.s, jnp.where(ends, 1.0, again.b))
-    return again._replace(s=s, b=b, a=jnp.where(ends, 0.0, again.a))
 
 
 def _risen(search: _Search, values, rates, start, touch):
@@ -194,53 +202,55 @@ def _risen(search: _Search, values, rates, start, touch):
     del rates, start, touch
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
     positive, ends = least > 0, search.count >= _HALVINGS
-    found = search._replace(
+    before = search.bracket
+    found = before._replace(a=search.s, of_a=least, moved=jnp.array(0))
+    back = before._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=least)
+    bracket = jax.tree.map(lambda found, back: jnp.where(positive, found, back), found, back)
+    return search._replace(
         phase=jnp.where(positive, _ZERO, jnp.where(ends, _DONE, _RISE)),
-        a=jnp.where(positive, search.s, 0.0),
-        b=jnp.where(positive, search.b, search.s),
-        of_a=jnp.where(positive, least, search.of_a),
-        of_b=jnp.where(positive, search.of_b, least),
+        s=jnp.where(positive, 0.5 * (bracket.a + bracket.b), search.s / 2),
+        bracket=bracket,
         count=jnp.where(positive, 0, search.count),
     )
-    return found._replace(s=jnp.where(positive, 0.5 * (found.a + found.b), search.s / 2))
 
 
 def _zero_found(search: _Search, values, rates, start, touch):
     """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
     del rates, start, touch
-    narrowed = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
-    return narrowed._replace(phase=jnp.where(_is_short(narrowed), _DONE, _ZERO))
+    again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
+    return again._replace(phase=jnp.where(_is_short(again), _DONE, _ZERO))
 
 
 def _is_short(search: _Search):
-    return (search.b - search.a <= _FRACTION) | (search.of_b == 0) | (search.count >= _EVALUATIONS)
+    width = search.bracket.b - search.bracket.a
+    return (width <= _FRACTION) | (search.bracket.of_b == 0) | (search.count >= _EVALUATIONS)
 
 
 def _narrowed(search: _Search, value):
     """The shorter interval with a value at `s` in it, and where the next one is asked for."""
-    # Every third interval is halved, so that the number of evaluations is bounded.
-    bisects = search.count % 3 == 2
-    a, b, of_a, of_b, s = narrowed((search.a, search.b, search.of_a, search.of_b), search.s, value, bisects)
-    return search._replace(a=a, b=b, of_a=of_a, of_b=of_b, s=s)
+    bracket, s = narrowed(search.bracket, search.s, value, search.count >= _SECANTS, 0.5 * _FRACTION)
+    return search._replace(bracket=bracket, s=s)
 
 
-def narrowed(interval: tuple[Any, Any, Any, Any], s: Any, value: Any, bisects: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """An interval in which a function changes its sign, with a further value of it in it, and where the next one is
-    asked for.
+def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 0.0) -> tuple[Bracket, Any]:
+    """An interval with a further value of the function in it, and where the next one is asked for.
 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
-    1971 (the Illinois method).
+    1971 (the Illinois method): where the same end moves twice, the value at the other one counts half.
 
-    **Arguments:** `interval`: its ends, and the values there; `value` at `s`; `bisects`: whether its middle is next.
+    **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: how far the next point is from both
+    ends, so that the interval becomes as short as that once one end is at the zero.
     """
-    a, b, of_a, of_b = interval
+    a, b, of_a, of_b, moved = bracket
     same = jnp.sign(value) == jnp.sign(of_b)
-    a, of_a = jnp.where(same, a, s), jnp.where(same, 0.5 * of_a, value)
-    b, of_b = jnp.where(same, s, b), jnp.where(same, value, 0.5 * of_b)
+    halved_a, halved_b = jnp.where(moved > 0, 0.5 * of_a, of_a), jnp.where(moved < 0, 0.5 * of_b, of_b)
+    a, of_a = jnp.where(same, a, s), jnp.where(same, halved_a, value)
+    b, of_b = jnp.where(same, s, b), jnp.where(same, value, halved_b)
     slope = (of_b - of_a).astype(a.dtype)
     secant = (a * of_b.astype(a.dtype) - b * of_a.astype(a.dtype)) / jnp.where(slope == 0, 1.0, slope)
+    secant = jnp.clip(secant, a + least, b - least)
     good = (secant > a) & (secant < b) & (slope != 0) & ~bisects
-    return a, b, of_a, of_b, jnp.where(good, secant, 0.5 * (a + b))
+    return Bracket(a, b, of_a, of_b, jnp.where(same, 1, -1)), jnp.where(good, secant, 0.5 * (a + b))
 
 
 class EventState(AbstractControllerState):
