@@ -1,12 +1,14 @@
 """Sweeps: cost over a bare `jax.vmap`, a batch with members that fail and that take long, devices against processes,
 and whole studies from the command line.
 
-Run it with `NPROC=1 python tests/benchmarks/sweep.py overhead | long | devices`, and the studies with
+Run it with `NPROC=1 python tests/benchmarks/sweep.py overhead | long | devices`, with `cores` and without `NPROC` to
+compare the cores of one process, and the studies with
 `MEMBERS=100000 jaxmb sweep tests/benchmarks/sweep_four_bar.py --out four_bar.zarr --processes 2` and
 `MEMBERS=2000 jaxmb sweep tests/benchmarks/sweep_vehicle.py --out vehicle.zarr --processes 2`.
 """
 
 import dataclasses
+import functools
 import os
 import shutil
 import sys
@@ -123,6 +125,45 @@ def devices(chunks=8):
     print(f"devices {times[0]:.3f} s, processes {times[1]:.3f} s, ratio {times[0] / times[1]:.2f}")
 
 
+def cores():
+    """A chunk in one thread and in as many as there are cores, and the loop of single runs, in wall time."""
+    cases = {
+        "four_bar": ({}, 2.0),
+        "andrews": ({}, 0.02),
+        "rod_chain": ({"n": 10}, 0.3),
+        "bricard": ({}, 0.3),
+        "tracked_vehicle": ({}, 0.05),
+    }
+    print("wall seconds of 512 members: one thread, all cores, ratio; a loop of single runs")
+    for name, (given, t1) in cases.items():
+        machine = mb.mechanisms.get(name, **given)
+        mass = next(key for key in mb.parameters(machine.system) if key.endswith(".mass"))
+        whole = mb.parameters(machine.system)[mass]
+
+        def of_mass(x, machine=machine, mass=mass, whole=whole, t1=t1):
+            changed = mb.with_parameters(machine.system, {mass: whole * x})
+            motion = mb.simulate(changed, machine.state, t1=t1, rtol=1e-8, max_steps=100_000, throw=False)
+            return {"q": motion.ys.q[-1], "result": motion}
+
+        columns = {"x": np.linspace(0.9, 1.1, DEFAULT)}
+        run = Batch(of_mass, declared(of_mass, {"x": columns["x"][0]}), DEFAULT).compiled()
+        single = jax.jit(lambda x, own=of_mass: own(x)["q"])
+        some = [single(x) for x in columns["x"][:1]] and columns["x"][:: DEFAULT // 32]
+
+        def in_threads(count, run=run, columns=columns):
+            os.environ["NPROC"] = str(count)
+            return run(columns).values["q"]
+
+        forms = [
+            (in_threads, 1),
+            (in_threads, os.cpu_count()),
+            (lambda some, single=single: list(map(single, some)), some),
+        ]
+        times = [min(timed(functools.partial(*form)) for _ in range(4)) for form in forms]
+        loop = times[2] * DEFAULT / len(some)
+        print(f"{name:16} {times[0]:7.3f} {times[1]:7.3f} {times[0] / times[1]:6.2f} {loop:9.3f}", flush=True)
+
+
 _run = []
 
 
@@ -134,4 +175,4 @@ def in_process(columns):
 
 
 if __name__ == "__main__":
-    {"overhead": overhead, "long": long, "devices": devices}[sys.argv[1]]()
+    {"overhead": overhead, "long": long, "devices": devices, "cores": cores}[sys.argv[1]]()
