@@ -15,6 +15,10 @@ from .space import both_points, force_pair, separation, separation_rate
 class Gravity(AbstractPart):
     """Uniform gravity on every body of the scene.
 
+    ```python
+    on_the_moon = jaxmb.Scene([bar], joints=[pin], forces=[jaxmb.Gravity((0.0, -1.62))]).compile()
+    ```
+
     **Arguments:** `acceleration` [m/s²], shape (2,) in a planar scene and (3,) in a spatial one, in world axes.
     """
 
