@@ -239,6 +239,13 @@ class AbstractContact(AbstractPotentialForce):
 class Contact(AbstractContact):
     """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
 
+    ```python
+    wheel = planar.Body("wheel", mass=10.0, inertia=planar.disc(10.0, 0.3), position=(0.0, 0.3))
+    laws = {"normal": jaxmb.contact.Linear(1e5), "friction": jaxmb.contact.Coulomb(0.8, transition_speed=0.01)}
+    ground = planar.Contact("ground contact", "wheel", terrain=jaxmb.terrain.Flat(), radius=0.3, damping=500.0, **laws)
+    system = jaxmb.Scene([wheel], forces=[ground, jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
+
     The penetration depth is smoothed, `δ = ½ (d + √(d² + smoothing²))` for a distance d below the ground, and has a
     potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient
     `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body separates.
