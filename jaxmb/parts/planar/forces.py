@@ -56,6 +56,11 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
 class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """Progressive stops of a relative angle on both sides, `angle = angle_b − angle_a`.
 
+    ```python
+    stop = planar.BumpStop("stop", "ground", "bar", stiffness=1e3, lower=-0.5, upper=1.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[stop]).compile()
+    ```
+
     Beyond a limit the potential is `stiffness δ^(exponent + 1) / (exponent + 1)` of a smoothed depth
     `δ = ½ (d + √(d² + smoothing²))`, d = lower − angle or angle − upper: the restoring moment on B is nearly
     `stiffness d^exponent`.
