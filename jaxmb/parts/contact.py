@@ -1,5 +1,17 @@
 """Compliant contact of bodies with terrain: normal force laws, friction laws, and the contact force.
 
+```python
+from jaxmb import contact, terrain
+soil = contact.Bekker(cohesive_modulus=1e3, frictional_modulus=1.5e6, exponent=1.1, width=0.1, area=0.02)
+shear = contact.Janosi(
+    cohesion=1e3, friction_angle=0.5, shear_modulus=0.02, length=0.2, area=0.02, transition_speed=0.1
+)
+on_sand = planar.Contact("on sand", "wheel", terrain=terrain.Flat(), normal=soil, friction=shear, radius=0.3)
+steel = {"normal": contact.Hertz(1e9), "friction": contact.Coulomb(0.3, transition_speed=0.01)}
+on_rail = planar.Contact("on rail", "wheel", terrain=terrain.Flat(), radius=0.3, **steel)
+on_springs = planar.Contact("on springs", "wheel", terrain=terrain.Flat(), normal=contact.Linear(1e5), radius=0.3)
+```
+
 A body touches the ground with a disc, a sphere or a point. The ground is compliant: its force is a function of the
 penetration depth, so contact adds no constraint and no event.
 """
