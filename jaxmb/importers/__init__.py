@@ -10,7 +10,7 @@ loops and couplings are held softly there.
 
 ```python
 model = jaxmb.importers.mjcf("arm.xml", ignore="collisions")
-print(*model.notes, sep="\n")
+print(*model.notes, sep="\\n")
 system = model.scene.compile()
 state = jaxmb.assemble(system, fix={"elbow.angle": 0.3})
 motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": torque})

@@ -105,6 +105,14 @@ class Pfaffian(AbstractCoordinateConstraint):
 class AccelerationConstraint(AbstractCoordinateConstraint):
     """A constraint between accelerations, `matrix(t, q, v, parameters) q̈ = right(t, q, v, parameters)`.
 
+    ```python
+    pull = jaxmb.lagrangian.AccelerationConstraint(
+        "pull", lambda t, q, v, p: jnp.array([[1.0, 2.0]]), lambda t, q, v, p: jnp.array([jnp.cos(t) - v[0]])
+    )
+    free = lambda t, q, v, p: 0.5 * v @ v
+    system = jaxmb.lagrangian.LagrangianSystem(kinetic=free, constraints=[pull], q=[0.0, 0.0])
+    ```
+
     Nothing keeps the motion on a relation that such a constraint is a derivative of: it is what its rows say.
 
     **Arguments:** `matrix`: shape (rows, nq); `right`: shape (rows,).
