@@ -26,7 +26,13 @@ _LENGTH = 200
 
 
 def every_formulation() -> dict[str, AbstractFormulation]:
-    """All formulations and their options, by name."""
+    """All formulations and their options, by name.
+
+    ```python
+    formulations = jaxmb.report.every_formulation()
+    list(formulations)
+    ```
+    """
     return {
         "Partitioned": Partitioned(),
         "Multipliers": Multipliers(),
