@@ -98,6 +98,10 @@ def formulation_costs(
 ) -> FormulationCosts:
     """Time the accelerations by several formulations, and their derivatives with respect to the state.
 
+    ```python
+    print(jaxmb.report.formulation_costs(jaxmb.mechanisms.four_bar(), repeats=3))
+    ```
+
     Each evaluation depends on the previous one, as in a motion, and eliminates in the pivot order of one chart. The
     formulations are timed in turns.
 

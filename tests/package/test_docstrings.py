@@ -99,7 +99,30 @@ floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius
 bouncing = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
 motion = jaxmb.simulate(bouncing, jaxmb.assemble(bouncing), t1=0.5)
 """
+INERTIA = "<ixx>0.001</ixx><iyy>0.02</iyy><izz>0.02</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz>"
+ARM = f"""
+from pathlib import Path
+rod = "<geom type='capsule' size='0.03' fromto='0 0 0 0.5 0 0'/>"
+Path("arm.xml").write_text(
+    f"<mujoco><worldbody><body name='upper'><joint name='shoulder' axis='0 1 0'/>{{rod}}"
+    f"<body name='lower' pos='0.5 0 0'><joint name='elbow' axis='0 1 0' range='-90 90'/>{{rod}}</body></body>"
+    "</worldbody><actuator><motor name='motor' joint='elbow'/></actuator></mujoco>"
+)
+Path("arm.urdf").write_text(
+    "<robot name='arm'><link name='base'/><link name='upper'><inertial><origin xyz='0.25 0 0'/><mass value='1'/>"
+    "<inertia ixx='0.001' iyy='0.02' izz='0.02' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+    "<joint name='shoulder' type='revolute'><parent link='base'/><child link='upper'/><axis xyz='0 1 0'/>"
+    "<limit lower='-1' upper='1' effort='1' velocity='1'/></joint></robot>"
+)
+Path("arm.sdf").write_text(
+    "<sdf version='1.9'><model name='arm'><link name='upper'><inertial><pose>0.25 0 0 0 0 0</pose><mass>1</mass>"
+    "<inertia>{INERTIA}</inertia></inertial></link>"
+    "<joint name='shoulder' type='revolute'><parent>world</parent><child>upper</child>"
+    "<axis><xyz>0 1 0</xyz></axis></joint></model></sdf>"
+)
+"""
 BEFORE |= dict.fromkeys(("ContactEvents", "Event", "Trajectory.events"), BOUNCE)
+BEFORE |= dict.fromkeys(("importers", "importers.mjcf", "importers.sdf", "importers.urdf"), ARM)
 
 
 def codes(text):
@@ -228,17 +251,15 @@ def referred_to():
 
 
 def needs_no_example(entry):
-    if entry.kind == "module":
+    """Modules, abstract classes, exceptions, tuples of results, mechanisms, machinery, results of functions."""
+    module, is_class = entry.name.rpartition(".")[0], inspect.isclass(entry.thing)
+    if is_class and (entry.short.startswith("Abstract") or issubclass(entry.thing, Exception | tuple)):
         return True
-    if inspect.isclass(entry.thing) and (
-        entry.short.startswith("Abstract") or issubclass(entry.thing, Exception | tuple)
-    ):
+    if module == "mechanisms" and entry.short in mechanisms.names():
         return True
-    if entry.name.rpartition(".")[0] == "mechanisms" and entry.short in mechanisms.names():
+    if module in MACHINERY and not (is_class and issubclass(entry.thing, CHOICES)):
         return True
-    if entry.name.rpartition(".")[0] in MACHINERY:
-        return not (is_class and issubclass(entry.thing, CHOICES))
-    return entry.name in RESULTS_OF
+    return entry.kind == "module" or entry.name in RESULTS_OF
 
 
 def test_every_public_name_has_an_example():
