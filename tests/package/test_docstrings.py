@@ -220,7 +220,6 @@ RESULTS_OF = {
     "report.WorkPrecision": "report.work_precision",
     "parts.Module": "parts.module",
     "trajectory.PartMotion": "Trajectory",
-    "solvers.stability.Formula": "solvers.stability",
 }
 # Modules that hold what a new method or a new kind of system is made of.
 MACHINERY = ("formulations", "manifold", "solvers", "system")
@@ -241,12 +240,11 @@ def referred_to():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom | ast.Import):
                 exec(ast.unparse(node), scope)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Attribute | ast.Name):
-                try:
-                    found.add(id(eval(ast.unparse(node), {"__builtins__": {}}, scope)))
-                except (AttributeError, NameError, TypeError, KeyError, ValueError):
-                    continue
+        dotted = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)}
+        for name in dotted:
+            first, *others = name.split(".")
+            if first in scope and all(other.isidentifier() for other in others):
+                found.add(id(functools.reduce(lambda thing, other: getattr(thing, other, None), others, scope[first])))
     return found
 
 
