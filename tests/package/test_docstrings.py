@@ -8,6 +8,7 @@ import ast
 import functools
 import inspect
 import re
+from typing import Any
 
 import diffrax
 import jax
@@ -150,7 +151,7 @@ TOGETHER = [name for name in examples() if name not in ALONE]
 @pytest.fixture(scope="module")
 def names():
     """What the examples refer to: modules, and the pendulum of that of `Scene`."""
-    scope = dict(MODULES)
+    scope: dict[str, Any] = dict(MODULES)
     exec(example(mb.Scene), scope)
     scope["state"] = mb.assemble(scope["system"], fix={"bar.angle": 0.5})
     return scope
@@ -285,7 +286,7 @@ def test_examples_of_joints(module, name):
     cls, scope = getattr(module, name), dict(MODULES)
     exec(example(cls), scope)
     (joint,) = (own for own in scope.values() if type(own) is cls)
-    system, text = scope["system"], inspect.getdoc(cls)
+    system, text = scope["system"], inspect.getdoc(cls) or ""
     assert joint.name in system.constraint_names()
     for field in ("body_a", "body_b") if hasattr(joint, "body_a") else ("body",):
         assert f"`{field}`" in text
