@@ -21,7 +21,7 @@ def robust(
     """A function whose outputs are mean and spread of another's over samples of parameters that scatter.
 
     ```python
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # `fall` is the function in the example of `optimise`.
     samples = {"bar.inertia": 0.01 * rng.standard_normal(16), "bar.mass": rng.uniform(0.9, 1.1, 16)}
     worst = jaxmb.robust(fall, samples, weight=-2.0)({"bar.inertia": 0.3})  # Mean less two deviations.
     ```
