@@ -23,6 +23,10 @@ SETTINGS = {
 def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: int = MAX_BYTES) -> Path | None:
     """Keep compiled programs on disk, and use those that are there: the second process does not compile again.
 
+    ```python
+    folder = jaxmb.keep_compiled()  # At the head of a script or notebook, before anything is compiled.
+    ```
+
     The name says what is kept, which "cache" alone would not. JAX's persistent compilation cache keeps it, for all of
     JAX in this process. Importing jaxmb never switches that on; the command line does, but for reports. Call it first:
     what was compiled before is not kept. What JAX does not recognise is compiled again: another version of it or

@@ -4,7 +4,14 @@ import diffrax
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """Outcomes; diffrax's, and those of mechanics. Each text says what to try next."""
+    """Outcomes; diffrax's, and those of mechanics. Each text says what to try next.
+
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, throw=False)
+    if motion.result != jaxmb.RESULTS.successful:
+        print(jaxmb.RESULTS[motion.result])
+    ```
+    """
 
     singular_configuration = (
         "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints "

@@ -21,6 +21,12 @@ _FEW = 60
 class State(eqx.Module):
     """Configuration and velocity of a system, and the internal states of its parts.
 
+    ```python
+    state = jaxmb.assemble(system, fix={"bar.angle": 0.5})
+    state.q, state.u  # (x, y, angle) of the bar, and their rates.
+    released = jaxmb.State(q=state.q, u=jnp.zeros(3))
+    ```
+
     **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. Their meaning depends on the
     system: for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m],
     Euler parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame);

@@ -32,6 +32,10 @@ class FoundEvents(NamedTuple):
 class Event(NamedTuple):
     """An event of one contact, or of dry friction.
 
+    ```python
+    impacts = [(event.time, event.part, event.impulse) for event in motion.events if event.kind == "impact"]
+    ```
+
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
     `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; of friction `"stick"`, `"slip"`, or `"impact"`
     for an impulse alone; the `impulse` [N s, N m s]; `energy_lost` [J]: the kinetic energy that was lost at this time,
@@ -48,6 +52,11 @@ class Event(NamedTuple):
 class ContactEvents(eqx.Module):
     """The events of contacts and dry friction along a motion, in the order of time; `print(motion.events)` shows a
     table, and `list(motion.events)` has an `Event` for each part that takes part in one.
+
+    ```python
+    print(motion.events)  # A table, of a motion with contacts such as `RigidContact`.
+    motion.events.times, motion.events.impulses, motion.events.energy_lost
+    ```
 
     A state that is saved just at an event may be that before it or that after it. Times, impulses and energies have
     first derivatives; `rest` counts as a constant.

@@ -482,6 +482,12 @@ def _between(system, interpolation, ts):
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:
-    """Read what `Trajectory.save` wrote, as a dictionary of arrays."""
+    """Read what `Trajectory.save` wrote, as a dictionary of arrays.
+
+    ```python
+    motion.save("motion.npz")
+    jaxmb.load("motion.npz")["bar.angle"]
+    ```
+    """
     with np.load(path) as data:
         return {name: data[name] for name in data.files}

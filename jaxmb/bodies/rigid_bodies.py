@@ -84,6 +84,12 @@ class Implied(NamedTuple):
 class RigidBodySystem(AbstractSystem):
     """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
 
+    ```python
+    system = jaxmb.Scene([bar], joints=[pin], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
+    print(system)  # Bodies, coordinates, constraint rows and their ranks, degrees of freedom.
+    system.body_names, system.coordinate_names(), system.joint_coordinates()
+    ```
+
     **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
     `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`.

@@ -94,6 +94,11 @@ def accelerations(
     """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
     `A u̇ = γ − gamma_shift`. NaN where friction does not determine them.
 
+    ```python
+    method = jaxmb.formulations.Multipliers()
+    udot, multipliers = jaxmb.formulations.accelerations(system, method, 0.0, state.q, state.u)
+    ```
+
     **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
     """
     check_mass(system, formulation)

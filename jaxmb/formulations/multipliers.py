@@ -9,6 +9,10 @@ from .formulation import AbstractFormulation
 class Multipliers(AbstractFormulation):
     """`(A M⁻¹ Aᵀ) λ = γ − A M⁻¹ F` on the independent rows, then `u̇ = M⁻¹ (F + Aᵀ λ)`.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.Multipliers())
+    ```
+
     Needs a mass matrix that is cheap to solve with; cheapest where constraints are few and degrees of freedom many. The
     elimination follows the graph of joints: for chains, trees and local loops time and memory are proportional to the
     number of joints. Solutions are refined until they meet the constraint rows to rounding errors, so that all digits

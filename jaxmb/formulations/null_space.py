@@ -10,6 +10,10 @@ from .formulation import AbstractFormulation
 class NullSpace(AbstractFormulation):
     """Maggi's equations in an orthonormal basis Z of the null space of A: `(ZᵀMZ) ẏ = Zᵀ(F − M c)`, `u̇ = Z ẏ + c`.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.NullSpace())
+    ```
+
     c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
     preferred over others, so no chart can become singular, and no pivots are searched for where no row is redundant.
     The mass matrix may be singular, as long as no velocity without mass is free.

@@ -13,6 +13,10 @@ from .formulation import AbstractFormulation
 class Partitioned(AbstractFormulation):
     """Reduced equations in the independent accelerations, `(EᵀME) u̇_i = Eᵀ(F − M c)`, `u̇ = E u̇_i + c`.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.Partitioned())
+    ```
+
     E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
     Cheapest where a chart is made anyway and the degrees of freedom are few; the default with `Partition`. Where a
     light body moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has;

@@ -9,6 +9,10 @@ from .formulation import AbstractFormulation
 class Poincare(AbstractFormulation):
     r"""Gauss' principle in the quasi-accelerations `ṡ = Lᵀ u̇` of a mass-orthonormal frame, `M = L Lᵀ`.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.Poincare())
+    ```
+
     There Gauss' function is a squared distance, `𝒢 = |ṡ − L⁻¹F|²`, and the constraints are `B ṡ = γ` with
     `B = A L⁻ᵀ`. In a frame adapted to them, from an orthogonal factorisation of Bᵀ, the constraints give the components
     of ṡ along their rows, and nothing changes those across: no equation is left to solve. The multipliers are those of

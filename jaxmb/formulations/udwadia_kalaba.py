@@ -14,6 +14,11 @@ Method = Literal["moore_penrose", "inverses", "singular_mass"]
 class UdwadiaKalaba(AbstractFormulation):
     """Accelerations in closed form, without multipliers; these are found from them afterwards.
 
+    ```python
+    method = jaxmb.formulations.UdwadiaKalaba("inverses")
+    motion = jaxmb.simulate(system, state, t1=1.0, formulation=method)
+    ```
+
     **Arguments:** `method`: which form, with `a = M⁻¹F` and a root L of the mass matrix, `M = L Lᵀ`, for its square
     root:
 

@@ -10,10 +10,11 @@ loops and couplings are held softly there.
 
 ```python
 model = jaxmb.importers.mjcf("arm.xml", ignore="collisions")
-print(*model.notes, sep="\n")
+for note in model.notes:
+    print(note)
 system = model.scene.compile()
 state = jaxmb.assemble(system, fix={"elbow.angle": 0.3})
-motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": torque})
+motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": lambda t: 0.5 * jnp.sin(t)})
 ```
 
 **Exact:**

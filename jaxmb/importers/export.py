@@ -28,6 +28,13 @@ class Exported:
 def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str | Collection[str] = ()) -> Exported:
     """A spatial scene as MJCF.
 
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    hinge = spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    exported = jaxmb.importers.to_mjcf(jaxmb.Scene([arm], joints=[hinge]).compile())
+    exported.text, exported.notes
+    ```
+
     Joints that make a tree become joints of MuJoCo, with the names and the values of the coordinates here; those that
     close loops become equality constraints, which MuJoCo holds softly. Frames of bodies are at their mass centres.
 

@@ -23,6 +23,12 @@ _KINDS = ("free", "ball", "slide", "hinge")
 def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     """A machine from MJCF.
 
+    ```python
+    model = jaxmb.importers.mjcf("arm.xml", ignore=("collisions", "limits"))
+    model.notes, model.coordinates, model.controls
+    system = model.scene.compile()
+    ```
+
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
     `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`. Several
     joints of one body are one `spatial.Composite`, of which each is a coordinate.

@@ -45,6 +45,11 @@ def sdf(
 ) -> ImportedModel:
     """A machine from SDF, of one model or all that stand side by side in the file.
 
+    ```python
+    model = jaxmb.importers.sdf("arm.sdf", gravity=(0.0, 0.0, -9.81))
+    system = model.scene.compile()
+    ```
+
     Links and joints of several models have the names of these before their own, `"arm::hand"`. A model is free unless
     a joint binds it to `world`, or it is static. Before version 1.5 of the format, axes of joints are in the frame of
     the model. Angles that are written with few digits, such as 1.5708, are the multiples of π/12 that they round: the

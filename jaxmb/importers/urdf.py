@@ -40,6 +40,11 @@ def urdf(
 ) -> ImportedModel:
     """A machine from URDF.
 
+    ```python
+    model = jaxmb.importers.urdf("arm.urdf", base="fixed", ignore="limits")
+    system = model.scene.compile()
+    ```
+
     **Arguments:**
 
     - `source`: a path, or the text of a file.

@@ -48,7 +48,14 @@ class AbstractCoordinateConstraint(eqx.Module):
 
 
 class Holonomic(AbstractCoordinateConstraint):
-    """A constraint between positions, `residual(t, q, parameters) = 0`, shape (rows,); twice differentiable."""
+    """A constraint between positions, `residual(t, q, parameters) = 0`, shape (rows,); twice differentiable.
+
+    ```python
+    ring = jaxmb.lagrangian.Holonomic("ring", lambda t, q, p: jnp.array([q @ q - p["radius"] ** 2]))
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "q": [0.6, 0.8], "parameters": {"radius": 1.0}}
+    bead = jaxmb.lagrangian.LagrangianSystem(**common, constraints=[ring])
+    ```
+    """
 
     name: str = eqx.field(static=True)
     residual: Callable[..., Array] = eqx.field(static=True)
@@ -65,6 +72,13 @@ class Holonomic(AbstractCoordinateConstraint):
 class Nonholonomic(AbstractCoordinateConstraint):
     """A constraint between velocities, linear in them or not, `residual(t, q, v, parameters) = 0` with `v = q̇`, shape
     (rows,).
+
+    ```python
+    held = jaxmb.lagrangian.Nonholonomic("held", lambda t, q, v, p: jnp.array([v @ v - p["speed"] ** 2]))
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "potential": lambda t, q, p: 9.81 * q[1]}
+    start = {"q": [0.0, 0.0], "u": [1.0, 0.0], "parameters": {"speed": 1.0}}
+    particle = jaxmb.lagrangian.LagrangianSystem(**common, constraints=[held], **start)
+    ```
     """
 
     name: str = eqx.field(static=True)
@@ -86,6 +100,12 @@ class Nonholonomic(AbstractCoordinateConstraint):
 class Pfaffian(AbstractCoordinateConstraint):
     """A constraint linear in velocities, `matrix(t, q, parameters) q̇ + drift(t, q, parameters) = 0`.
 
+    ```python
+    blade = jaxmb.lagrangian.Pfaffian("blade", lambda t, q, p: jnp.array([[-jnp.sin(q[2]), jnp.cos(q[2]), 0.0]]))
+    kinetic = lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2 + 0.1 * v[2] ** 2)
+    sled = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[blade], q=[0.0, 0.0, 0.0], u=[1.0, 0.0, 0.5])
+    ```
+
     **Arguments:** `matrix`: shape (rows, nq); `drift`: shape (rows,), default zero.
     """
 
@@ -105,6 +125,14 @@ class Pfaffian(AbstractCoordinateConstraint):
 class AccelerationConstraint(AbstractCoordinateConstraint):
     """A constraint between accelerations, `matrix(t, q, v, parameters) q̈ = right(t, q, v, parameters)`.
 
+    ```python
+    pull = jaxmb.lagrangian.AccelerationConstraint(
+        "pull", lambda t, q, v, p: jnp.array([[1.0, 2.0]]), lambda t, q, v, p: jnp.array([jnp.cos(t) - v[0]])
+    )
+    free = lambda t, q, v, p: 0.5 * v @ v
+    system = jaxmb.lagrangian.LagrangianSystem(kinetic=free, constraints=[pull], q=[0.0, 0.0])
+    ```
+
     Nothing keeps the motion on a relation that such a constraint is a derivative of: it is what its rows say.
 
     **Arguments:** `matrix`: shape (rows, nq); `right`: shape (rows,).
@@ -122,6 +150,12 @@ class AccelerationConstraint(AbstractCoordinateConstraint):
 
 class ServoConstraint(AbstractCoordinateConstraint):
     """A desired motion as a constraint: `deviation(t, q, parameters)` is brought to zero and kept there.
+
+    ```python
+    rise = jaxmb.lagrangian.ServoConstraint("rise", lambda t, q, p: q[:1] - 0.1 * t, damping=4.0, stiffness=4.0)
+    kinetic, potential = lambda t, q, v, p: 0.5 * v @ v, lambda t, q, p: 9.81 * q[0]
+    lift = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, potential=potential, constraints=[rise], q=[0.2])
+    ```
 
     The constraint acts on accelerations, `φ̈ + damping φ̇ + stiffness φ = 0`, so the motion may start off it. What it
     takes to do that, its constraint force, is the exact generalized control force, the least one in the metric of M⁻¹.

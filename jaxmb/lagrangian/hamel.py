@@ -19,6 +19,14 @@ from .transposition import Transposition, check_shape, share_of_suslov
 class Hamel(AbstractEquations):
     """Hamel's equations in a frame `X_1, …, X_n` whose first columns are the velocities ξ = u:
 
+    ```python
+    along = lambda t, q, p: jnp.array([[jnp.cos(q[1]), 0.0], [0.0, 1.0], [jnp.sin(q[1]), 0.0]])  # Of (x, angle, y).
+    frame = jaxmb.lagrangian.QuasiVelocityFrame(along, columns=2)
+    common = {"kinetic": lambda t, q, v, p: 0.5 * (v[0] ** 2 + 0.1 * v[1] ** 2 + v[2] ** 2), "q": [0.0, 0.0, 0.0]}
+    equations = jaxmb.lagrangian.Hamel()
+    sled = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=frame, equations=equations, u=[1.0, 0.5])
+    ```
+
     ```text
     d/dt p_c − X_c[ℓ] = γ^a_c p_a − W_c·p + (Nᵀ Q)_c,    [X_b, X_c] = c^a_bc X_a
     ```
@@ -114,6 +122,13 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) -> QuasiVelocityFrame:
     """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
 
+    ```python
+    from jaxmb.linalg.elimination import full_pivot
+    blade = lambda t, q, p: jnp.array([[-jnp.sin(q[2]), jnp.cos(q[2]), 0.0]])
+    order = full_pivot(blade(0.0, jnp.zeros(3), {})).order
+    frame = jaxmb.lagrangian.pivoted_frame(blade, order, rank=1)
+    ```
+
     **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
     `jaxmb.linalg.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the
     coordinates that the pivots leave.
@@ -125,7 +140,17 @@ def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) ->
 def structure_functions(
     frame: QuasiVelocityFrame, t: Scalar, q: Float[Array, "n"], parameters: Parameters
 ) -> Float[Array, "n k k"]:
-    """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c."""
+    """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c.
+
+    ```python
+    def axes(t, q, p):  # Forwards, to the left and a turn, of (x, y, angle).
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    frame = jaxmb.lagrangian.QuasiVelocityFrame(axes, columns=3)
+    jaxmb.lagrangian.structure_functions(frame, 0.0, jnp.array([0.5, 0.4, -0.3]), {})[:, 2, 0]  # (0, 1, 0).
+    ```
+    """
     columns = lambda q: frame.columns_of(t, q, parameters)
     X = columns(q)
     slope = jax.jacfwd(columns)(q)

@@ -41,7 +41,14 @@ class AbstractKinematics(eqx.Module):
 
 
 class Rates(AbstractKinematics):
-    """Velocities are the coordinates' rates, `u = q̇`."""
+    """Velocities are the coordinates' rates, `u = q̇`.
+
+    ```python
+    kinetic = lambda t, q, v, p: 0.5 * v @ v
+    rates = jaxmb.lagrangian.Rates()  # The default.
+    particle = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, kinematics=rates, q=[0.0, 0.0], u=[1.0, 0.0])
+    ```
+    """
 
     identity: ClassVar[bool] = True
     linear: ClassVar[bool] = True
@@ -56,6 +63,13 @@ class Rates(AbstractKinematics):
 
 class QuasiVelocityFrame(AbstractKinematics):
     r"""Quasi-velocities in a frame, `q̇ = N(t, q) u + ν(t, q)`.
+
+    ```python
+    along = lambda t, q, p: jnp.array([[jnp.cos(q[2]), 0.0], [jnp.sin(q[2]), 0.0], [0.0, 1.0]])  # Of (x, y, angle).
+    frame = jaxmb.lagrangian.QuasiVelocityFrame(along, columns=2)
+    kinetic = lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2 + 0.1 * v[2] ** 2)
+    sled = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, kinematics=frame, q=[0.0, 0.0, 0.0], u=[1.0, 0.5])
+    ```
 
     With fewer columns than coordinates the frame eliminates constraints: `u` are then free velocities of a system whose
     constraints `A N = 0` are satisfied by whatever u is, and the equations are projected on the frame's columns.
@@ -95,6 +109,13 @@ class QuasiVelocityFrame(AbstractKinematics):
 
 class Connection(AbstractKinematics):
     """Velocities are the rates of some coordinates r, the base; a connection gives those of the others, the fibre.
+
+    ```python
+    slope = lambda t, q, p: jnp.array([[-jnp.tan(q[2]), 0.0]])  # ẏ = tan(angle) ẋ, of (x, y, angle).
+    blade = jaxmb.lagrangian.Connection(base=(0, 2), fibre=(1,), matrix=slope)
+    kinetic = lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2 + 0.1 * v[2] ** 2)
+    sled = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, kinematics=blade, q=[0.0, 0.0, 0.0], u=[1.0, 0.5])
+    ```
 
     `ṡ = −A(t, q) ṙ − a(t, q)`: constraints solved for rates, as in Voronets' equations.
 

@@ -54,7 +54,15 @@ class AbstractNonIdealForce(eqx.Module):
 
 
 class NonIdealForce(AbstractNonIdealForce):
-    """C from a function, `function(t, q, v, multipliers, parameters)`, shape (nq,)."""
+    """C from a function, `function(t, q, v, multipliers, parameters)`, shape (nq,).
+
+    ```python
+    ring = jaxmb.lagrangian.Holonomic("ring", lambda t, q, p: jnp.array([0.5 * (q @ q - 1.0)]))
+    drag = jaxmb.lagrangian.NonIdealForce("ring", lambda t, q, v, multipliers, p: -p["c"] * multipliers[0] ** 2 * v)
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "q": [0.6, 0.8], "u": [-0.8, 0.6], "parameters": {"c": 0.1}}
+    bead = jaxmb.lagrangian.LagrangianSystem(**common, constraints=[ring], nonideal=[drag])
+    ```
+    """
 
     constraint: str = eqx.field(static=True)
     function: Callable[..., Array] = eqx.field(static=True)
@@ -66,6 +74,13 @@ class NonIdealForce(AbstractNonIdealForce):
 
 class CoulombFriction(AbstractNonIdealForce):
     """Coulomb friction: a force of `coefficient` times the constraint's reaction, against the slip s(t, q, q̇).
+
+    ```python
+    ring = jaxmb.lagrangian.Holonomic("ring", lambda t, q, p: jnp.array([0.5 * (q @ q - 1.0)]))
+    rub = jaxmb.lagrangian.CoulombFriction("ring", "mu")
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "q": [0.6, 0.8], "u": [-0.8, 0.6], "parameters": {"mu": 0.3}}
+    bead = jaxmb.lagrangian.LagrangianSystem(**common, constraints=[ring], nonideal=[rub])
+    ```
 
     Its work is `−μ N s·δs/|s| tanh(|s| / transition_speed)`, which is smooth at rest. If no such N exists, or more than
     one (Painlevé's paradox), a simulation ends with `singular_configuration`.
@@ -98,6 +113,13 @@ class CoulombFriction(AbstractNonIdealForce):
 
 class Viscous(AbstractNonIdealForce):
     """Friction in proportion to the slip s(t, q, q̇): work `−coefficient s·δs`.
+
+    ```python
+    ring = jaxmb.lagrangian.Holonomic("ring", lambda t, q, p: jnp.array([0.5 * (q @ q - 1.0)]))
+    oil = jaxmb.lagrangian.Viscous("ring", "c")
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "q": [0.6, 0.8], "u": [-0.8, 0.6], "parameters": {"c": 0.2}}
+    bead = jaxmb.lagrangian.LagrangianSystem(**common, constraints=[ring], nonideal=[oil])
+    ```
 
     **Arguments:** `coefficient`: its name among the parameters [N s/m]; `slip` as in `CoulombFriction`.
     """

@@ -22,6 +22,14 @@ _ITERATIONS = 50
 class QuasiVelocities(AbstractKinematics):
     r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; those of them that are `dependent` are zero.
 
+    ```python
+    speed_and_heading = lambda t, q, v, p: jnp.array([jnp.hypot(v[0], v[1]) - p["speed"], jnp.arctan2(v[1], v[0])])
+    near = lambda t, q, omega, p: p["speed"] * jnp.array([jnp.cos(omega[1]), jnp.sin(omega[1])])
+    held = jaxmb.lagrangian.QuasiVelocities(speed_and_heading, near=near, dependent=(0,))
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "potential": lambda t, q, p: 9.81 * q[1], "q": [0.0, 0.0]}
+    particle = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=held, u=[0.3], parameters={"speed": 1.0})
+    ```
+
     As many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also nonlinear
     ones; virtual displacements are those of Chetaev, along `∂q̇/∂ω_I`. The system's velocities u are the independent
     ω_I, in their order. The inverse is found by Newton's method from the rates `near`, on whose side of a fold the
@@ -120,6 +128,16 @@ def kinetostatic_forces(
     system: LagrangianSystem, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
 ) -> Float[Array, "dependent"]:
     """The generalized forces Λ_D that hold the dependent quasi-velocities at zero, in the order of `dependent`.
+
+    ```python
+    omega = lambda t, q, v, p: jnp.array([v[0], v[1] - 0.5 * v[0]])  # A slope of 0.5 holds the second one at zero.
+    slope = jaxmb.lagrangian.QuasiVelocities(omega, near=(1.0, 0.5), dependent=(1,))
+    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "potential": lambda t, q, p: 9.81 * q[1], "q": [0.0, 0.0]}
+    block = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=slope, u=[1.0])
+    q, u = block.guess.q, block.guess.u
+    udot, _ = jaxmb.formulations.accelerations(block, jaxmb.formulations.Multipliers(), 0.0, q, u)
+    jaxmb.lagrangian.kinetostatic_forces(block, 0.0, q, u, udot)  # 0.8 times the weight.
+    ```
 
     `Λ_D = (∂q̇/∂ω_D)ᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q)`, the left sides of the equations of those velocities.
     """

@@ -14,6 +14,14 @@ from .transposition import Transposition, check_shape, share_of_suslov
 class Voronets(AbstractEquations):
     """Voronets' equations in the rates of the base coordinates r, with `ṡ = −A ṙ − a` and `L_c(t, q, ṙ) = L(t, q, q̇)`:
 
+    ```python
+    slope = lambda t, q, p: jnp.array([[-jnp.tan(q[2]), 0.0]])  # ẏ = tan(angle) ẋ, of (x, y, angle).
+    blade = jaxmb.lagrangian.Connection(base=(0, 2), fibre=(1,), matrix=slope)
+    common = {"kinetic": lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2 + 0.1 * v[2] ** 2), "q": [0.0, 0.0, 0.0]}
+    equations = jaxmb.lagrangian.Voronets()
+    sled = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=blade, equations=equations, u=[1.0, 0.5])
+    ```
+
     ```text
     d/dt ∂L_c/∂ṙ^α − ∂L_c/∂r^α + A^a_α ∂L_c/∂s^a = p_b (W^b_α − B^b_α) − p_b W^b_α + Q_α − A^a_α Q_a
     ```

@@ -1,5 +1,22 @@
 """Rotations: Euler parameters (unit quaternions, scalar first), planar rotations, and norms that differentiate at zero.
 
+```python
+from jaxmb import rotations
+p = rotations.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)  # A quarter turn about z.
+q = rotations.multiply(rotations.from_axis_angle((1.0, 0.0, 0.0), 0.3), p)  # The second turn stands on the left.
+R, x = rotations.rotation_matrix(p), jnp.array([1.0, 0.0, 0.0])
+rotations.rotate(p, x), rotations.turned(R, x)  # To world components, both (0, 1, 0).
+rotations.unrotate(p, x), rotations.rotate(rotations.conjugate(p), x), rotations.turned_back(R, x)  # All (0, -1, 0).
+rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p)), rotations.normalize(2.0 * p)  # All p.
+omega = jnp.array([0.0, 0.0, 2.0])
+rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
+rotations.rotate_2d(np.pi / 2, x[:2]), rotations.norm(rotations.cross(x, omega))  # (0, 1), and 2.
+# The moment of a potential V(p) or V(R), in the body frame, is minus the gradient, pulled back.
+V = lambda R: 9.81 * R[2, 0]
+rotations.pull_back_matrix(R, jax.grad(V)(R)), rotations.matrix_rates(R, omega)
+rotations.pull_back(p, jax.grad(lambda p: V(rotations.rotation_matrix(p)))(p))
+```
+
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
 components. All formulas are the homogeneous ones (no division by `|p|`), so they are smooth everywhere; `p` and `-p`
 are the same attitude. Angular velocities are in the body frame unless a name ends in `_W`. NumPy in, NumPy out.

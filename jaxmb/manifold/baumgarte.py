@@ -21,6 +21,10 @@ from .manifold import AbstractManifold, normalize_state
 class Baumgarte(AbstractManifold):
     """Integrate all coordinates and velocities, with constraints on accelerations that decay, for any solver.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Baumgarte(rate=20.0))
+    ```
+
     Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, those between velocities `ψ̇ + rate ψ = 0`: the
     state is near the constraints, not on them, and a rate much above that of the motion makes the equations stiff. For
     comparison with `Partition`, which needs no such number.

@@ -16,6 +16,10 @@ from .projection import Projection
 class Unconstrained(AbstractManifold):
     """Integrate all coordinates, and constraints on the level of accelerations only.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Unconstrained())
+    ```
+
     The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
     that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
     """

@@ -352,6 +352,10 @@ _PARTITIONED = Partitioned()
 class Partition(AbstractManifold):
     """Coordinate partitioning with charts chosen by full pivoting.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Partition(max_influence=1.5))
+    ```
+
     There are `nq − rank Φ_q` independent coordinates and `nu − rank [Φ; ψ]` independent velocities; with nonholonomic
     constraints these are two nested charts. Only independent components are integrated; the others satisfy the
     constraints to Newton's tolerance at the end of every step. The error of a step is measured on all of them. A chart

@@ -44,6 +44,10 @@ class Projection(AbstractManifold):
     """Integrate all coordinates and velocities with any diffrax Runge–Kutta solver, with `Adams` or with `Hermite`, and
     project every step on the constraints.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Projection())
+    ```
+
     With a Runge–Kutta solver the projection is the smallest change in the coordinates' scales, first of the
     configuration, then of the velocities. A first-same-as-last derivative is kept across it: the difference is of the
     size of the local error.

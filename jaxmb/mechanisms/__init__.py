@@ -1,4 +1,13 @@
-"""A library of mechanisms with their sources and reference values; `names()` lists them, `get(name)` builds one."""
+"""A library of mechanisms with their sources and reference values; `names()` lists them, `get(name)` builds one.
+
+```python
+machine = jaxmb.mechanisms.get("four_bar", speed=4.0)  # Or jaxmb.mechanisms.four_bar(speed=4.0).
+ts = machine.references.times
+motion = jaxmb.simulate(machine.system, machine.state, t1=machine.t1, saveat=ts)
+machine.observe(motion)["crank"], machine.errors(motion)["crank"]
+len(jaxmb.mechanisms.names())
+```
+"""
 
 from typing import Any
 

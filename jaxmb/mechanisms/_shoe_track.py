@@ -28,6 +28,11 @@ class Shoes:
     """A track of rigid shoes on pins, for `tracked_vehicle(track=Shoes(...))`. One body stands for a left and right
     pair.
 
+    ```python
+    track = jaxmb.mechanisms.Shoes(pitch=0.1524, mass=36.0, tensioner_damping=2e4)
+    vehicle = jaxmb.mechanisms.tracked_vehicle(track=track)
+    ```
+
     Shoes touch sprocket, idler and wheels on their inner side and at the corners between them, and the ground at two
     points, a quarter of their pitch from their middle. Stiffness and damping are those of one shoe, not of a length of
     track.

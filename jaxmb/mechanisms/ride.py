@@ -1,5 +1,13 @@
 """Ride comfort, suspension travel, wheel loads and track tension of a motion of `tracked_vehicle`.
 
+```python
+from jaxmb.mechanisms import ride
+vehicle = jaxmb.mechanisms.tracked_vehicle(track="shoes")
+motion = jaxmb.simulate(vehicle.system, vehicle.state, t1=0.02, saveat=np.linspace(0.0, 0.02, 3), rtol=1e-4)
+ride.seat_acceleration(motion, (0.5, 0.4)), ride.vertical_rms(motion, (0.5, 0.4))
+ride.arm_travel(motion), ride.wheel_loads(motion), ride.track_tension(motion)
+```
+
 `unit` is 1 for the leading carrier and 2 for the towed one.
 """
 

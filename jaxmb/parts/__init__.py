@@ -1,5 +1,27 @@
 """The parts of a scene: base classes and field declarations, also for user-defined parts.
 
+```python
+from jaxmb import parts
+
+class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
+    stiffness: parts.Number = parts.parameter(unit="N/m", sign="positive")
+    damping: parts.Number = parts.parameter(unit="N s/m", sign="positive")
+    tension: parts.Number = parts.internal_state(unit="N")
+    point_a: parts.Number = parts.point(body=0, default="origin")
+    point_b: parts.Number = parts.point(body=1, default="origin")
+
+    def wrenches(self, space, poses, velocities, t):
+        d = parts.separation(space, self, poses)
+        return parts.force_pair(space, self, poses, -self.tension * d / jnp.linalg.norm(d))
+
+    def state_rates(self, space, poses, velocities, t):
+        d, rate = parts.separation(space, self, poses), parts.separation_rate(space, self, poses, velocities)
+        return {"tension": self.stiffness * (d @ rate / jnp.linalg.norm(d) - self.tension / self.damping)}
+
+tie = Maxwell("tie", "ground", "bar", stiffness=100.0, damping=20.0, point_a=(0.0, 1.0))
+system = jaxmb.Scene([bar], joints=[pin], forces=[tie]).compile()
+```
+
 A part is a class derived from one of the base classes. Helpers declare the meaning of its fields (`point()`, `axis()`,
 `length()`, `parameter()`, …), annotated with `Number`, `Numbers` (by name) or `Names`; its kernel is a pure function of
 the poses of its bodies. For examples of a joint, a force and a contact law see `notebooks/05_extending.ipynb`.

@@ -18,6 +18,11 @@ from .forces import generalized_force
 class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     """A motor on a joint's coordinate, which follows a command with lag, and within a limit.
 
+    ```python
+    motor = jaxmb.Motor("motor", "pin.angle", mode="speed", command=10.0, gain=2.0, lag=0.05, limit=20.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+    ```
+
     The demanded force is, for a coordinate x,
 
     - `mode="force"`: `command`;
@@ -76,6 +81,11 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
 
 class Actuator(AbstractScalarPart, AbstractDynamicForce):
     """An actuator with a control: a motor, or a position or velocity servo, with a gear.
+
+    ```python
+    servo = jaxmb.Actuator("servo", "pin.angle", control=0.3, gain=(50.0, 0.0, 0.0), bias=(0.0, -50.0, -5.0))
+    system = jaxmb.Scene([bar], joints=[pin], forces=[servo]).compile()
+    ```
 
     With the length `l = gear x` of the coordinate x, it exerts the generalized force `gear f`,
     `f = (gain · (1, l, l̇)) control + bias · (1, l, l̇)`: a motor has gain (1, 0, 0) and no bias; a position servo has

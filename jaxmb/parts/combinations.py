@@ -65,6 +65,13 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     """A coordinate that is a polynomial of another one, or a sum of polynomials of several others. Rows 1:
     `(x − zero) − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
 
+    ```python
+    link = planar.Body("link", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(1.5, 0.0))
+    elbow = planar.Revolute("elbow", "bar", "link", point=(1.0, 0.0))
+    bend = jaxmb.JointCoupling("bend", "elbow.angle", "pin.angle", coefficients=(0.0, 0.5))
+    system = jaxmb.Scene([bar, link], joints=[pin, elbow, bend]).compile()
+    ```
+
     Of angles known up to full turns, the row and `yᵢ − other_zero[i]` are taken in [−π, π]. A gear whose ratios are
     whole numbers so turns without end, one with other ratios by half a turn to either side.
 
@@ -118,6 +125,11 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
 class JointInertia(AbstractCombination, AbstractInertialConstraint):
     """An inertia that moves with a coordinate of a joint or tendon: kinetic energy `½ inertia ẋ²`, and nothing else.
 
+    ```python
+    rotor = jaxmb.JointInertia("rotor", "pin.angle", inertia=50.0**2 * 1e-5)  # 1e-5 kg m² behind a gear of 50:1.
+    system = jaxmb.Scene([bar], joints=[pin, rotor]).compile()
+    ```
+
     The rotor of a motor with inertia J behind a gear of ratio n adds `n² J` to its joint: the reflected inertia, the
     armature of MuJoCo. It has no mass, no weight and no momentum of its own. The gyroscopic moment of the rotor and the
     reaction of its acceleration on the housing are neglected, as is usual for gears of high ratio; where they count,
@@ -154,6 +166,14 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
 
 class FixedTendon(AbstractCombination, AbstractTendon):
     """A weighted sum of coordinates of joints, `length = Σ coefficients[k] x_k`, as a tendon around pulleys has.
+
+    ```python
+    link = planar.Body("link", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(1.5, 0.0))
+    elbow = planar.Revolute("elbow", "bar", "link", point=(1.0, 0.0))
+    cord = jaxmb.FixedTendon("cord", ("pin.angle", "elbow.angle"), coefficients=(0.03, -0.02))
+    pull = jaxmb.JointForce("pull", "cord.length", force=-50.0)
+    system = jaxmb.Scene([bar, link], joints=[pin, elbow, cord], forces=[pull]).compile()
+    ```
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`.
 
@@ -207,6 +227,12 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
 class Tendon(AbstractTendon):
     """A tendon that runs straight from point to point: its length is the sum of their distances.
+
+    ```python
+    cord = jaxmb.Tendon("cord", [("ground", (0.0, 1.0)), ("bar", (0.5, 0.0))])
+    spring = jaxmb.JointSpring("spring", "cord.length", stiffness=100.0, free=1.2)
+    system = jaxmb.Scene([bar], joints=[pin, cord], forces=[spring]).compile()
+    ```
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`. Neighbouring points must not
     coincide.

@@ -1,5 +1,17 @@
 """Compliant contact of bodies with terrain: normal force laws, friction laws, and the contact force.
 
+```python
+from jaxmb import contact, terrain
+soil = contact.Bekker(cohesive_modulus=1e3, frictional_modulus=1.5e6, exponent=1.1, width=0.1, area=0.02)
+shear = contact.Janosi(
+    cohesion=1e3, friction_angle=0.5, shear_modulus=0.02, length=0.2, area=0.02, transition_speed=0.1
+)
+on_sand = planar.Contact("on sand", "wheel", terrain=terrain.Flat(), normal=soil, friction=shear, radius=0.3)
+steel = {"normal": contact.Hertz(1e9), "friction": contact.Coulomb(0.3, transition_speed=0.01)}
+on_rail = planar.Contact("on rail", "wheel", terrain=terrain.Flat(), radius=0.3, **steel)
+on_springs = planar.Contact("on springs", "wheel", terrain=terrain.Flat(), normal=contact.Linear(1e5), radius=0.3)
+```
+
 A body touches the ground with a disc, a sphere or a point. The ground is compliant: its force is a function of the
 penetration depth, so contact adds no constraint and no event.
 """
@@ -238,6 +250,13 @@ class AbstractContact(AbstractPotentialForce):
 
 class Contact(AbstractContact):
     """Contact of bodies with one terrain, each as a disc (in the plane), a sphere (in space), or a point.
+
+    ```python
+    wheel = planar.Body("wheel", mass=10.0, inertia=planar.disc(10.0, 0.3), position=(0.0, 0.3))
+    laws = {"normal": jaxmb.contact.Linear(1e5), "friction": jaxmb.contact.Coulomb(0.8, transition_speed=0.01)}
+    ground = planar.Contact("ground contact", "wheel", terrain=jaxmb.terrain.Flat(), radius=0.3, damping=500.0, **laws)
+    system = jaxmb.Scene([wheel], forces=[ground, jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
 
     The penetration depth is smoothed, `δ = ½ (d + √(d² + smoothing²))` for a distance d below the ground, and has a
     potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient

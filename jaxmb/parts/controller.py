@@ -31,6 +31,17 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
     parameters) -> forces, rates`.
 
+    ```python
+    def pid(t, measured, states, p):
+        error = p["target"] - measured["angle"]
+        torque = p["kp"] * error + p["ki"] * states["integral"] - p["kd"] * measured["rate"]
+        return torque, {"integral": error}
+
+    numbers = {"states": {"integral": 0.0}, "parameters": {"kp": 50.0, "ki": 20.0, "kd": 5.0, "target": 0.3}}
+    controller = jaxmb.Controller("pid", pid, {"angle": "pin.angle", "rate": "pin.angle_rate"}, "pin.angle", **numbers)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[controller]).compile()
+    ```
+
     **Arguments:**
 
     - `function`: of the time [s] and dictionaries of the measurements, the internal states and the parameters. It
@@ -46,14 +57,6 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"pid.gain"`.
 
     Angles of joints in space are known up to full turns, and jump at half a turn.
-
-        def pid(t, measured, states, p):
-            error = p["target"] - measured["angle"]
-            torque = p["kp"] * error + p["ki"] * states["integral"] - p["kd"] * measured["rate"]
-            return torque, {"integral": error}
-
-        Controller("pid", pid, {"angle": "hinge.angle", "rate": "hinge.angle_rate"}, "hinge.angle",
-                   states={"integral": 0.0}, parameters={"kp": 50.0, "ki": 20.0, "kd": 5.0, "target": 0.3})
     """
 
     function: Callable[..., Any] = fields.function()

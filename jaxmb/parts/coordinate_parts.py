@@ -159,6 +159,11 @@ def turns(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
 class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     """A linear spring and damper on a coordinate: generalized force `−stiffness (value − free) − damping rate`.
 
+    ```python
+    spring = jaxmb.JointSpring("spring", "pin.angle", stiffness=20.0, damping=0.5, free=0.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
+    ```
+
     **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
     ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
     spring of an angle takes the shortest way to it, up to half a turn; with `middle` [rad], of the range in which the
@@ -192,6 +197,11 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
 class JointForce(AbstractCoordinatePart, AbstractForce):
     """A force along a coordinate, or a moment about it, with its reaction on the other body: a motor on a hinge.
 
+    ```python
+    motor = jaxmb.JointForce("motor", "pin.angle", force=2.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+    ```
+
     **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m of an angle, N of a displacement], of the
     coordinate's shape, positive where it increases the coordinate. As an input of `simulate`, `"motor.force"` is a
     function of time.
@@ -210,6 +220,11 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
 
 class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     """A coordinate that is prescribed, `value + rate t`. Rows: one for each of its components.
+
+    ```python
+    turn = jaxmb.JointDriver("turn", "pin.angle", value=0.0, rate=2.0)
+    system = jaxmb.Scene([bar], joints=[pin, turn]).compile()
+    ```
 
     **Arguments:** `coordinate`, such as `"hip.angle"`; `value` [rad, m], default that at the given poses; `rate`
     [rad/s, m/s], default zero; both of the coordinate's shape. As an input of `simulate`, `"drive.value"` is any
@@ -242,6 +257,11 @@ class AbstractScalarPart(AbstractCoordinatePart):
 
 class JointStop(AbstractScalarPart, AbstractPotentialForce):
     """Compliant stops at the ends of a coordinate's range: a spring and a damper where it is outside.
+
+    ```python
+    stop = jaxmb.JointStop("stop", "pin.angle", lower=-0.5, upper=1.0, stiffness=1e4, damping=10.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[stop]).compile()
+    ```
 
     The depth δ beyond a stop is that of a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or
     value − upper. The stop has the potential `½ stiffness δ²` and the dissipation `damping δ̇²`.
@@ -286,6 +306,11 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
 
 class JointFriction(AbstractScalarPart, AbstractForce):
     """Dry friction of constant size on a coordinate: generalized force `−force tanh(rate / transition_speed)`.
+
+    ```python
+    rub = jaxmb.JointFriction("rub", "pin.angle", force=0.1)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[rub]).compile()
+    ```
 
     Unlike `Friction` it does not depend on the reaction of the joint.
 

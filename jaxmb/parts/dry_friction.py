@@ -114,8 +114,10 @@ class DryFriction(AbstractDryFriction):
     """Coulomb friction in a joint with one coordinate, or in a rigid contact, which sticks exactly.
 
     ```python
+    block = planar.Body("block", mass=1.0, inertia=0.1)
+    slide = planar.Prismatic("slide", "ground", "block", point=(0.0, 0.0), axis=(1.0, 0.0))
     rub = jaxmb.DryFriction("rub", "slide", coefficient=0.3, static_coefficient=0.4)
-    scene = jaxmb.Scene([block], joints=[slide], forces=[rub])
+    scene = jaxmb.Scene([block], joints=[slide], forces=[rub, jaxmb.Gravity((0.0, -9.81))])
     ```
 
     The slip of a joint is the rate of its displacement, or `radius` times that of its angle; the normal force is the

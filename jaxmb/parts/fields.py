@@ -181,36 +181,66 @@ def _field(declaration: Declaration, **options: Any) -> Any:
 
 
 def name() -> Any:
-    """The name of the part, or of another part that it refers to; stacked parts may differ in it."""
+    """The name of the part, or of another part that it refers to; stacked parts may differ in it.
+
+    ```python
+    name: str = jaxmb.parts.name()
+    ```
+    """
     return _field(Declaration("identity"))
 
 
 def names(*, optional: bool = False) -> Any:
     """The names of any number of other parts that it refers to; a single name becomes a tuple. `optional`: none by
     default.
+
+    ```python
+    sources: tuple[str, ...] = jaxmb.parts.names(optional=True)
+    ```
     """
     keyword = {"default": (), "kw_only": True} if optional else {}
     return _field(Declaration("identities", optional=optional), converter=_NAMES, **keyword)
 
 
 def body_name(*, default: Any = dataclasses.MISSING) -> Any:
-    """The name of a body that the part acts on. `part.bodies` lists them in the order of the fields."""
+    """The name of a body that the part acts on. `part.bodies` lists them in the order of the fields.
+
+    ```python
+    vehicle: str = jaxmb.parts.body_name()
+    ```
+    """
     keyword = {} if default is dataclasses.MISSING else {"kw_only": True}
     return _field(Declaration("body"), default=default, **keyword)
 
 
 def body_names() -> Any:
-    """The names of any number of bodies, in a field that must be named `bodies`; a single name becomes a tuple."""
+    """The names of any number of bodies, in a field that must be named `bodies`; a single name becomes a tuple.
+
+    ```python
+    bodies: tuple[str, ...] = jaxmb.parts.body_names()
+    ```
+    """
     return _field(Declaration("bodies"), converter=_NAMES)
 
 
 def choice(*values: str, default: Any = dataclasses.MISSING) -> Any:
-    """One of several words; static."""
+    """One of several words; static.
+
+    ```python
+    frame: str = jaxmb.parts.choice("world", "body", default="world")
+    ```
+    """
     return _field(Declaration("choice", of=values), default=default, kw_only=True)
 
 
 def function(*, default: Any = dataclasses.MISSING, kw_only: bool = False) -> Any:
-    """A user function; static."""
+    """A user function; static.
+
+    ```python
+    from collections.abc import Callable
+    height: Callable[..., jax.Array] = jaxmb.parts.function()
+    ```
+    """
     return eqx.field(static=True, kw_only=kw_only, **({} if default is dataclasses.MISSING else {"default": default}))
 
 
@@ -228,6 +258,10 @@ def parameter(
 ) -> Any:
     """A number or an array of numbers.
 
+    ```python
+    stiffness: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N/m", sign="positive")
+    ```
+
     **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, for
     information; `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a
     matrix; `default`; `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size
@@ -243,7 +277,12 @@ def parameter(
 
 
 def length(**options: Any) -> Any:
-    """A length [m] from which the scene's size is computed; arguments as in `parameter`."""
+    """A length [m] from which the scene's size is computed; arguments as in `parameter`.
+
+    ```python
+    radius: jaxmb.parts.Number = jaxmb.parts.length(sign="positive")
+    ```
+    """
     return parameter(**({"unit": "m", "sizes": True} | options))
 
 
@@ -258,6 +297,10 @@ def point(
     needed: bool = True,
 ) -> Any:
     """A point [m], fixed in a body, or in the world with `body=None`.
+
+    ```python
+    point_b: jaxmb.parts.Number = jaxmb.parts.point(body=1, default="origin")
+    ```
 
     A point of a body is given in the frame of the body, or in that of the frame that the part names in its place. The
     origin of a body's frame is its mass centre, unless the body was given `centre=`.
@@ -297,6 +340,10 @@ def axis(
 ) -> Any:
     """A unit vector, fixed in a body, or in the world with `body=None`; arguments as in `point`.
 
+    ```python
+    axis_a: jaxmb.parts.Number = jaxmb.parts.axis(body=0, default=(0.0, 0.0, 1.0))
+    ```
+
     `needed=False`: both the world axis and the body-fixed ones may be omitted.
     """
     declaration = Declaration(
@@ -313,14 +360,24 @@ def axis(
 
 
 def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, state: bool = False) -> Any:
-    """Unit Euler parameters, scalar first."""
+    """Unit Euler parameters, scalar first.
+
+    ```python
+    orientation: jaxmb.parts.Number = jaxmb.parts.attitude(default=(1.0, 0.0, 0.0, 0.0))
+    ```
+    """
     declaration = Declaration("state" if state else "number", shape=(4,), is_attitude=True, optional=optional)
     default = None if optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
 
 def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
-    """A number of a body's initial guess, which `assemble` improves; not a parameter."""
+    """A number of a body's initial guess, which `assemble` improves; not a parameter.
+
+    ```python
+    angular_velocity: jaxmb.parts.Number = jaxmb.parts.guess(unit="rad/s", default=0.0)
+    ```
+    """
     return _field(Declaration("state", shape=shape, unit=unit), converter=_NUMBER, default=default, kw_only=True)
 
 
@@ -328,6 +385,10 @@ def internal_state(
     *, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0, optional: bool = False
 ) -> Any:
     """An internal state, a number that changes by an equation of first order; see `AbstractDynamicForce`.
+
+    ```python
+    torque: jaxmb.parts.Number = jaxmb.parts.internal_state(unit="N m")
+    ```
 
     The kernels of the part see the current value in this field; the value that is given here is that of the initial
     guess. It is not a parameter. `optional`: default None, with which the part has no such state.
@@ -342,12 +403,22 @@ def internal_states_by_name() -> Any:
 
 
 def numbers() -> Any:
-    """Parameters of a user function by name, `"part.key"`: numbers, and modules as in `module`."""
+    """Parameters of a user function by name, `"part.key"`: numbers, and modules as in `module`.
+
+    ```python
+    parameters: jaxmb.parts.Numbers = jaxmb.parts.numbers()
+    ```
+    """
     return _field(Declaration("numbers"), converter=_NUMBERS, default_factory=dict, kw_only=True)
 
 
 def module() -> Any:
     """An equinox module, such as a neural network, whose weights are one parameter `"part.field"`, a vector.
+
+    ```python
+    from typing import Any
+    net: Any = jaxmb.parts.module()
+    ```
 
     The weights are all arrays of floating-point numbers in it; everything else, such as sizes and functions, is static.
     The kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
@@ -365,6 +436,10 @@ def part(of: Any) -> Any:
 
 def law(of: Any, *, what: str, default: Any = dataclasses.MISSING, kw_only: bool = True) -> Any:
     """A module whose numbers are parameters, `"part.field.number"`.
+
+    ```python
+    terrain: jaxmb.terrain.AbstractTerrain = jaxmb.parts.law(jaxmb.terrain.AbstractTerrain, what="a terrain")
+    ```
 
     **Arguments:** `of`: its abstract type, or `X | None`; `what`: a description, for messages.
     """

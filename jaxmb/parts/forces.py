@@ -15,6 +15,10 @@ from .space import both_points, force_pair, separation, separation_rate
 class Gravity(AbstractPart):
     """Uniform gravity on every body of the scene.
 
+    ```python
+    on_the_moon = jaxmb.Scene([bar], joints=[pin], forces=[jaxmb.Gravity((0.0, -1.62))]).compile()
+    ```
+
     **Arguments:** `acceleration` [m/s²], shape (2,) in a planar scene and (3,) in a spatial one, in world axes.
     """
 
@@ -37,6 +41,13 @@ def generalized_force(space, coordinates, poses, velocities, law):
 
 class SpringDamper(AbstractPair, AbstractPotentialForce):
     """A linear spring and damper along the line between two points: tension `stiffness (l − free_length) + damping l̇`.
+
+    ```python
+    spring = planar.SpringDamper(
+        "spring", "ground", "bar", stiffness=100.0, damping=1.0, free_length=1.2, point_a=(0.0, 1.0), point_b=(0.5, 0.0)
+    )
+    system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
+    ```
 
     At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero
     free length is linear there.
@@ -76,6 +87,11 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
 class Damper(AbstractPair, AbstractForce):
     """A linear damper on the relative velocity of two points, in every direction: force `−damping (v_B − v_A)` on B.
 
+    ```python
+    damper = planar.Damper("damper", "ground", "bar", damping=0.5, point_b=(0.5, 0.0))
+    system = jaxmb.Scene([bar], joints=[pin], forces=[damper]).compile()
+    ```
+
     The two points should coincide or `body_a` be the ground; otherwise the pair of forces has a moment.
 
     **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
@@ -92,6 +108,11 @@ class Damper(AbstractPair, AbstractForce):
 
 class PointForce(AbstractForce):
     """A constant force at a body-fixed point.
+
+    ```python
+    push = planar.PointForce("push", "bar", force=(0.0, 5.0), point=(0.5, 0.0), frame="body")
+    system = jaxmb.Scene([bar], joints=[pin], forces=[push]).compile()
+    ```
 
     **Arguments:** `force` [N], in world axes or, with `frame="body"`, turning with the body; `point` [m], body-fixed,
     default the origin of the frame.

@@ -13,6 +13,11 @@ from .smooth import dry_friction
 class Friction(AbstractNonIdeal):
     """Coulomb friction in a joint: `coefficient` times the joint's reaction force, opposing its slip.
 
+    ```python
+    rub = planar.Friction("rub", "pin", coefficient=0.2, radius=0.01)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[rub, jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
+
     The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
     ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
     force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest, so that it creeps where

@@ -29,6 +29,14 @@ def _shaped(part: Any, value: Any, shape: tuple[int, ...]) -> Array:
 class Constraint(AbstractConstraint):
     """A holonomic constraint from a function, `function(poses, t, parameters) = 0`.
 
+    ```python
+    def on_circle(poses, t, p):
+        return jnp.array([poses[0, :2] @ poses[0, :2] - p["radius"] ** 2])
+
+    ring = jaxmb.Constraint("ring", "bar", on_circle, parameters={"radius": 0.5}, rheonomic=False)
+    system = jaxmb.Scene([bar], joints=[ring]).compile()
+    ```
+
     **Arguments:**
 
     - `bodies`: one name or several; `"ground"` may be among them.
@@ -53,6 +61,15 @@ class Constraint(AbstractConstraint):
 
 class VelocityConstraint(AbstractVelocityConstraint):
     """A nonholonomic constraint from a function, `function(poses, velocities, t, parameters) = 0`.
+
+    ```python
+    def no_side_slip(poses, velocities, t, p):
+        (x_rate, y_rate, _), angle = velocities[0], poses[0, 2]
+        return jnp.array([y_rate * jnp.cos(angle) - x_rate * jnp.sin(angle)])
+
+    blade = jaxmb.VelocityConstraint("blade", "bar", no_side_slip, linear=True, homogeneous=True)
+    system = jaxmb.Scene([bar], joints=[blade]).compile()
+    ```
 
     **Arguments:** as `Constraint`; `velocities` has a row per body, of its frame (plane: ẋ, ẏ, angular rate; space: ṙ
     in the world, ω′ in the body frame). `linear`: the function is linear in the velocities up to a constant term
@@ -119,6 +136,15 @@ class Force(AbstractPotentialForce):
 class NonIdeal(AbstractNonIdeal):
     """A non-ideal constraint force (it does virtual work) from a function, `function(poses, velocities, reactions, t,
     parameters) -> wrenches`.
+
+    ```python
+    def rub(poses, velocities, reactions, t, p):
+        moment = p["radius"] * jnp.linalg.norm(reactions[1, :2]) * jnp.tanh(velocities[1, 2] / 0.01)
+        return jnp.zeros((2, 3)).at[:, 2].set(jnp.array([moment, -moment]))  # On the ground and on the bar.
+
+    friction = jaxmb.NonIdeal("rub", "pin", rub, parameters={"radius": 0.002})
+    system = jaxmb.Scene([bar], joints=[pin], forces=[friction, jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
 
     **Arguments:**
 

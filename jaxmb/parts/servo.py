@@ -10,6 +10,13 @@ from .coordinate_parts import AbstractOfJoints
 class Servo(AbstractLink):
     """A desired motion as a constraint: the residual Φ of `program` is brought to zero and kept there.
 
+    ```python
+    lift = {"motion": lambda t, p: p["rate"] * t, "parameters": {"rate": 0.5}}
+    turn = planar.Driver("turn", "ground", "bar", quantity="angle", **lift)
+    servo = jaxmb.Servo(turn, damping=20.0, stiffness=100.0)
+    system = jaxmb.Scene([bar], joints=[pin, servo], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
+    ```
+
     The constraint acts on accelerations, `Φ̈ + damping Φ̇ + stiffness Φ = 0`, so the motion may start off the program.
     The reaction of the servo is the exact control force, the smallest one in the metric of M⁻¹. The servo has the name
     of its program; the numbers of the program and the gains are parameters under that name.

@@ -1,5 +1,18 @@
 """Simple shapes, by which a picture shows bodies and parts.
 
+```python
+from jaxmb import shapes
+beam = [shapes.Box((1.0, 0.1, 0.05)), shapes.Sphere(0.1, position=(0.5, 0.0, 0.0), color=(200, 60, 40))]
+strut = [shapes.cylinder_between((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), 0.03), *shapes.wheel(0.2, position=(0.5, 0.0, 0.0))]
+joints = [shapes.pin((-0.5, 0.0, 0.0), 0.05), shapes.ball((0.5, 0.0, 0.0), 0.05)]
+slider = [shapes.sleeve((0.0, 0.0, 0.0), 0.1, (1.0, 0.0, 0.0))]
+lying = {"orientation": shapes.along((1.0, 0.0, 0.0))}  # From the z axis of a shape to the x axis of its body.
+logs = [shapes.Cylinder(0.1, 1.0, **lying), *shapes.capsule(0.1, 1.0, **lying), *shapes.marked_ball(0.2)]
+egg = shapes.Ellipsoid((0.3, 0.2, 0.2))
+flag = shapes.Mesh([(0.0, 0.0, 0.0), (0.3, 0.1, 0.0), (0.0, 0.2, 0.0)], [(0, 1, 2)])
+jaxmb.viz.show(motion, shapes={"bar": [*beam, *joints], "ground": shapes.Ground()})
+```
+
 A shape is placed in the frame of a body: `position` [m] of its origin, and `orientation`, Euler parameters from its own
 axes to those of the body. In the plane, z points to the viewer. A shape has no mass and no effect on the motion.
 """

@@ -1,5 +1,15 @@
 """Terrains: height as a smooth function of the place, for contact with the ground.
 
+```python
+from jaxmb import terrain
+level, hill = terrain.Flat(), terrain.Slope(0.1, level=-0.2)
+bump, ramp = terrain.Bump(start=2.0, length=0.5, peak=0.1), terrain.Ramp(start=5.0, length=2.0, rise=0.3)
+waves = terrain.Sinusoid(amplitude=0.05, wavelength=3.0)
+measured = terrain.Spline(x=[0.0, 1.0, 2.0, 3.0], heights=[0.0, 0.1, 0.05, 0.0])
+bowl = terrain.Surface(lambda place, p: p["curvature"] * place @ place / 2, parameters={"curvature": 0.1})
+terrain.distance(hill, jnp.array([1.0, 0.5])), terrain.outward(hill, jnp.array([1.0, 0.5]))
+```
+
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
 where z is up. A profile along x is constant along y, so it serves in both.
 """

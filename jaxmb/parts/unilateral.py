@@ -76,7 +76,8 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     """Rigid stops at one end or both ends of a coordinate's range.
 
     ```python
-    jaxmb.Stop("buffer", "slide.displacement", lower=0.0, upper=0.2, restitution=0.6)
+    buffer = jaxmb.Stop("buffer", "pin.angle", lower=-1.0, upper=1.0, restitution=0.6)
+    scene = jaxmb.Scene([bar], joints=[pin, buffer], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
     **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
@@ -182,6 +183,7 @@ class RigidContact(AbstractRigidContact):
     without a `DryFriction`.
 
     ```python
+    ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.0, 0.5))
     floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
     scene = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
@@ -218,6 +220,13 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
     """Rigid contact of two discs (in the plane) or balls (in space) of different bodies; frictionless without a
     `DryFriction`.
 
+    ```python
+    disc = {"mass": 1.0, "inertia": planar.disc(1.0, 0.1)}
+    discs = [planar.Body("a", velocity=(1.0, 0.0), **disc), planar.Body("b", position=(0.5, 0.0), **disc)]
+    meet = jaxmb.RigidBallContact("meet", "a", "b", radius_a=0.1, radius_b=0.1, restitution=0.9)
+    scene = jaxmb.Scene(discs, joints=[meet])
+    ```
+
     **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
     centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0; `impact_law`,
     `"newton"` (default) or `"poisson"`. The centres must not coincide.
@@ -243,6 +252,12 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
 class RigidPlaneContact(AbstractRigidContact, AbstractPair):
     """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`;
     frictionless without a `DryFriction`.
+
+    ```python
+    ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.2, 0.5))
+    on = jaxmb.RigidPlaneContact("on", "bar", "ball", normal=(0.0, 1.0), radius=0.1, restitution=0.5)
+    scene = jaxmb.Scene([bar, ball], joints=[pin, on], forces=[jaxmb.Gravity((0.0, -9.81))])
+    ```
 
     The plane has no end, and the ball is always on the side to which the normal points.
 
@@ -270,7 +285,9 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
     edges and corners; frictionless without a `DryFriction`.
 
     ```python
-    jaxmb.RigidBoxContact("step", "ground", "wheel", size=(1.0, 0.2), point_a=(2.0, 0.1), radius=0.3)
+    wheel = planar.Body("wheel", mass=1.0, inertia=planar.disc(1.0, 0.3), position=(0.0, 0.3))
+    step = jaxmb.RigidBoxContact("step", "ground", "wheel", size=(1.0, 0.2), point_a=(2.0, 0.1), radius=0.3)
+    scene = jaxmb.Scene([wheel], joints=[step])
     ```
 
     The ball rolls or slides from a face over an edge without an event; where it does, its acceleration jumps.
@@ -308,6 +325,12 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
 
 class Slack(AbstractGeometricContact, AbstractPair):
     """A rope between two points, or a coupling with slack: the points are at most `length` apart.
+
+    ```python
+    bob = planar.PointMass("bob", mass=1.0, position=(0.6, 0.0))
+    rope = jaxmb.Slack("rope", "ground", "bob", length=1.0)
+    scene = jaxmb.Scene([bob], joints=[rope], forces=[jaxmb.Gravity((0.0, -9.81))])
+    ```
 
     **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0;
     `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.

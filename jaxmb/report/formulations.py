@@ -26,7 +26,13 @@ _LENGTH = 200
 
 
 def every_formulation() -> dict[str, AbstractFormulation]:
-    """All formulations and their options, by name."""
+    """All formulations and their options, by name.
+
+    ```python
+    formulations = jaxmb.report.every_formulation()
+    list(formulations)
+    ```
+    """
     return {
         "Partitioned": Partitioned(),
         "Multipliers": Multipliers(),
@@ -91,6 +97,10 @@ def formulation_costs(
     mechanism: Mechanism, formulations: Mapping[str, AbstractFormulation] | None = None, *, repeats: int = 5
 ) -> FormulationCosts:
     """Time the accelerations by several formulations, and their derivatives with respect to the state.
+
+    ```python
+    print(jaxmb.report.formulation_costs(jaxmb.mechanisms.four_bar(), repeats=3))
+    ```
 
     Each evaluation depends on the previous one, as in a motion, and eliminates in the pivot order of one chart. The
     formulations are timed in turns.

@@ -92,6 +92,10 @@ def left_out(
 ) -> LeftOut:
     """Measure what it saves that a motion has nothing traced that it does not need.
 
+    ```python
+    print(jaxmb.report.left_out(system, state, t1=1.0, repeats=3))
+    ```
+
     Each thing that the motion does not need is put in, in a form that does not change the motion: a joint twice, a
     term in time of amplitude zero, rows between velocities that a joint implies, a damper of zero, an event that does
     not occur, dense output, and a dense Jacobian with charts where blocks do. Only what is put in is measured. A

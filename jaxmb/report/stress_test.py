@@ -125,6 +125,10 @@ def stress_test(
 ) -> StressTest:
     """Simulate stiff and extreme variants of a motion, and measure the true error of each.
 
+    ```python
+    print(jaxmb.report.stress_test(system, state, t1=1.0, only=("rtol", "mass")))
+    ```
+
     The error is relative to a known motion where there is one: that of the given system for other tolerances, other
     lengths (by dimensional analysis) and doubled joints. Otherwise two of the methods `Adams`, `Dopri8` and `Hermite`
     at a tight tolerance give a reference, and errors below ten times their difference are not known. Variants in which

@@ -146,6 +146,10 @@ def work_precision(
 ) -> WorkPrecision:
     """Measure the errors of solvers on a motion, and their cost.
 
+    ```python
+    print(jaxmb.report.work_precision(system, state, t1=1.0, tolerances=(1e-4, 1e-7), repeats=3))
+    ```
+
     Errors are those of the quantities that a mechanism observes, relative to their sizes; of other systems those of all
     coordinates, relative to the largest, and of all velocities, in units of the system's size or radians. Reference
     values are the published ones of a mechanism, or computed by two methods. Every run is compiled before it is timed;

@@ -107,7 +107,12 @@ class Adams(AbstractMultistep):
     tolerances:
 
     ```python
-    diffrax.diffeqsolve(term, Adams(), t0, t1, None, y0, stepsize_controller=MultistepController(rtol=1e-8, atol=1e-10))
+    import diffrax
+    from jaxmb.solvers import Adams, MultistepController
+
+    term, control = diffrax.ODETerm(lambda t, y, args: -y), MultistepController(rtol=1e-8, atol=1e-10)
+    end = diffrax.diffeqsolve(term, Adams(), 0.0, 1.0, None, jnp.array([1.0]), stepsize_controller=control).ys[-1]
+    motion = jaxmb.simulate(system, state, t1=1.0, solver=Adams(max_order=8))
     ```
 
     The term is a `diffrax.ODETerm` or an `AbstractManifoldTerm`. Every form of `diffrax.SaveAt`,

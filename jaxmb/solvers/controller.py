@@ -95,6 +95,11 @@ class ControllerState(AbstractControllerState):
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
     """The longest steps that the error estimates of a multistep method allow, at the order that allows the longest.
 
+    ```python
+    control = jaxmb.solvers.MultistepController(rtol=1e-6, atol=1e-8, dtmax=0.05)
+    motion = jaxmb.simulate(system, state, t1=1.0, solver=jaxmb.solvers.Adams(), stepsize_controller=control)
+    ```
+
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm, so that
     the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
     `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in

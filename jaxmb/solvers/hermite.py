@@ -98,6 +98,11 @@ class _Step(AbstractAttempt):
 class Hermite(AbstractMultistep):
     """Implicit multistep methods that use `y″ = f_t + f_y f`, of variable order and step, for stiff problems.
 
+    ```python
+    motion = jaxmb.simulate(system, state, t1=1.0, solver=jaxmb.solvers.Hermite())
+    motion.stats["num_steps"]
+    ```
+
     A step interpolates, in the sense of Hermite, at the new point and at k points of the past. The second derivative
     is exact, by one directional derivative of the vector field, which must be differentiable. Families:
 

@@ -1,5 +1,15 @@
 """Linear stability of the multistep formulas, with rational coefficients.
 
+```python
+from jaxmb.solvers import stability
+formula = stability.formula("E", 3)  # Enright's, with three points of the past.
+stability.is_zero_stable(formula), stability.stability_angle(formula), stability.stiff_abscissa(formula)
+stability.damping_at_infinity(formula), stability.largest_growth("B", 2)
+stability.characteristic_roots(formula, -1.0), stability.spectral_radius(stability.adams(4), [-0.1, 0.1j])
+stability.boundary_locus(formula, np.linspace(0.0, np.pi, 50))
+stability.plot_regions([stability.formula("E", k) for k in (1, 2, 3)]).savefig("regions.png")
+```
+
 On the test equation `y' = λ y`, with `μ = h λ`, a multistep formula with second derivatives is a linear recurrence.
 Its solutions are powers of the roots ζ of the characteristic polynomial
 

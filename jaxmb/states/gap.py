@@ -33,6 +33,10 @@ def assembly_gap(
 ) -> Float[Array, ""]:
     """How far a mechanism is from closing, zero where `assemble` finds a configuration.
 
+    ```python
+    gap = jaxmb.assembly_gap(system, fix={"bar.x": 0.8})  # The pin holds the bar's centre at 0.5 m.
+    ```
+
     A coupler that is too short leaves a gap between its joint and the rocker. `assemble(..., throw=False)` then returns
     a state of NaN, which an optimiser learns nothing from. The gap tells it which way to go: as a
     constraint of `optimise`, `{"gap": (None, 0)}`, and as what to make small first where a start cannot be assembled.

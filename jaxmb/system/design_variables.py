@@ -22,6 +22,12 @@ _ROUNDING = 16
 class Variable:
     """A design variable: its value, and what a study needs to know of it.
 
+    ```python
+    length = jaxmb.Variable(1.0, bounds=(0.5, 2.0), unit="m")
+    end = lambda v: {"pin.point_b": jnp.array([-0.5, 0.0]) * v["length"], "bar.inertia": v["length"] ** 2 / 12.0}
+    pendulum = jaxmb.design(system, {"length": length}, end)
+    ```
+
     **Arguments:**
 
     - `value`: a number, or an array of numbers.

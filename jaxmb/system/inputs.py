@@ -20,6 +20,11 @@ Signals = Mapping[str, AbstractSignal | Callable[[Scalar], Array]]
 def with_inputs(system: System, inputs: Signals) -> System:
     """The same system with some parameters as functions of time.
 
+    ```python
+    shaken = jaxmb.with_inputs(system, {"pin.point_a": lambda t: jnp.array([0.1 * jnp.sin(5.0 * t), 0.0])})
+    start = jaxmb.assemble(shaken, fix={"bar.angle": 0.5})
+    ```
+
     Torques, forces, coefficients, lengths, points and the numbers of drivers and of user functions may be inputs;
     their rates take part in the velocities and accelerations that constraints prescribe. Masses, moments of inertia,
     gravity and the gains of servos may not. Derivatives with respect to the values of a series work as those with

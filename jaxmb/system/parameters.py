@@ -21,6 +21,10 @@ System = TypeVar("System", bound=AbstractSystem)
 def parameters(system: AbstractSystem) -> dict[str, Array]:
     """Every parameter of a system by name.
 
+    ```python
+    jaxmb.parameters(system)["bar.mass"], list(jaxmb.parameters(system))
+    ```
+
     **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the
     shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`, and the variables of
     `design` their own names. The weights of a module, `"friction.net"`, are a vector; see `modules`.
@@ -50,6 +54,10 @@ def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
 
 def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module]) -> System:
     """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
+
+    ```python
+    heavier = jaxmb.with_parameters(system, {"bar.mass": 2.0, "bar.inertia": 2.0 / 12.0})
+    ```
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
     the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows. The length

@@ -64,6 +64,10 @@ def show(
 ) -> MovingPicture:
     """A moving picture of one or several motions, to be seen in a notebook, or saved as a page.
 
+    ```python
+    picture = jaxmb.viz.show(motion, points="bar", reactions="pin")  # In a notebook it is seen.
+    ```
+
     It has a time slider, a button that plays and pauses, a choice of speeds, and a list of what is shown; the mouse
     turns, shifts and zooms it. It shows the saved states at their times, with nothing between them: a motion to look
     at is saved at 30 times a second or more, by `saveat=`.
@@ -127,7 +131,12 @@ def show(
 
 
 def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
-    """Write a moving picture as a page that any browser opens, also without a network; options as in `show`."""
+    """Write a moving picture as a page that any browser opens, also without a network; options as in `show`.
+
+    ```python
+    path = jaxmb.viz.save_html(motion, "swing.html", points="bar")
+    ```
+    """
     return show(trajectory, **options).save(path)
 
 

@@ -26,6 +26,10 @@ _EDGE: Color = (40, 40, 40)
 def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     """Draw the bodies at evenly spaced saved times, earlier ones fainter, with the paths of their mass centres.
 
+    ```python
+    jaxmb.viz.plot_mechanism(motion, frames=4).savefig("poses.png")
+    ```
+
     Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars from their mass centre to
     the points where parts act on them, in space as lines; springs, rods and tracks between their points; in the plane
     with terrain. There are paths and a legend where there are at most 8 bodies.

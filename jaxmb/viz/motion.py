@@ -56,6 +56,10 @@ class _Line(NamedTuple):
 def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None) -> "Figure":
     """Plot a motion against time.
 
+    ```python
+    jaxmb.viz.plot_motion(motion, ["bar.angle", "pin.force", "energy"]).savefig("motion.png")
+    ```
+
     By default all that moves is shown: positions and velocities of the mass centres of the bodies; angles and angular
     velocities, in the plane of the bodies, in space of the joints; displacements of sliding joints; the coordinates of
     a system without bodies and their rates q̇; with the energy and the residuals of constraints. A component that stays

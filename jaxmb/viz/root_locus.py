@@ -19,6 +19,10 @@ _ZERO = 1e-6
 def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     """Draw real and imaginary parts of all eigenvalues against the parameter, and in the complex plane.
 
+    ```python
+    jaxmb.viz.plot_root_locus(locus, labels=["swing"]).savefig("locus.png")  # `locus` is that of `jaxmb.root_locus`.
+    ```
+
     A mode has one colour, a pair of conjugate eigenvalues is one mode, and modes that stay at zero are left out.
     Circles are at the first value. Where the system is unstable the background is grey.
 

@@ -1,8 +1,16 @@
-"""The examples in docstrings run: those of joints by themselves, the others, one after the other, on a pendulum."""
+"""The examples in docstrings run, and every public name has one, or stands in that of another name.
 
+Examples refer to `jax`, `jnp`, `np`, `jaxmb` or `mb`, `planar` and `spatial`, to the pendulum of the example of `Scene`
+and a state of it, and to a `motion` of it. Those of joints run by themselves.
+"""
+
+import ast
+import functools
 import inspect
 import re
+from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,24 +18,11 @@ import pytest
 from exports import exported
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import formulations, manifold, mechanisms, planar, spatial
 from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityConstraint
+from jaxmb.reference.entries import entries, members
 
-EXAMPLES = {
-    "Scene": mb.Scene,
-    "assemble": mb.assemble,
-    "simulate": mb.simulate,
-    "equilibrium": mb.equilibrium,
-    "identify": mb.identify,
-    "linearise": mb.linearise,
-    "root_locus": mb.root_locus,
-    "Trajectory": mb.Trajectory,
-    "LagrangianSystem": mb.lagrangian.LagrangianSystem,
-    "Force": mb.Force,
-    "Series": mb.Series,
-}
-
-MODULES = {"jax": jax, "jnp": jnp, "np": np, "jaxmb": mb, "planar": planar, "spatial": spatial}
+MODULES = {"jax": jax, "jnp": jnp, "np": np, "jaxmb": mb, "mb": mb, "planar": planar, "spatial": spatial}
 # The coordinates of the joints in their examples, at the given poses.
 ZERO_3 = (0.0, 0.0, 0.0)
 PLANAR = {
@@ -64,38 +59,220 @@ SPATIAL = {
 JOINTS = [(module, name) for module, known in ((planar, PLANAR), (spatial, SPATIAL)) for name in known]
 
 
+# Examples that go on from that of another name, whose names they use.
+AFTER = {
+    "Identification": "identify",
+    "Optimum": "optimise",
+    "robust": "optimise",
+    "Floquet": "floquet",
+    "viz.plot_root_locus": "root_locus",
+}
+# What examples refer to besides.
+BEFORE = {
+    "modules": """
+import types
+import equinox as eqx
+net = eqx.nn.MLP(2, 1, 4, 1, key=jax.random.key(0))
+law = lambda poses, velocities, t, p: jnp.zeros((1, 3)).at[0, 2].set(p["net"](velocities[0, :2])[0])
+friction = jaxmb.Force("friction", "bar", law, parameters={"net": net})
+system = jaxmb.Scene([bar], joints=[pin], forces=[friction]).compile()
+fit = types.SimpleNamespace(parameters=jaxmb.parameters(system))
+""",
+    "design": """
+system = jaxmb.mechanisms.four_bar().system
+""",
+    "batch": """
+angle_at_end = lambda length, mass: length**2 * mass
+lengths, masses = np.linspace(1.0, 2.0, 5), np.linspace(2.0, 3.0, 5)
+""",
+    "read_measurements": """
+from pathlib import Path
+Path("run.csv").write_text("t,phi,rate\\n0.0,0.5,0.0\\n0.1,0.44,-1.2\\n0.2,0.25,-2.5\\n")
+""",
+    "load_sweep": """
+speeds = mb.cases.grid(speed=np.linspace(0.0, 5.0, 3))
+mb.sweep(lambda speed: {"angle": 2.0 * speed}, speeds, "runs.zarr", progress=False)
+""",
+}
+BOUNCE = """
+ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.0, 0.5))
+floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
+bouncing = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
+motion = jaxmb.simulate(bouncing, jaxmb.assemble(bouncing), t1=0.5)
+"""
+INERTIA = "<ixx>0.001</ixx><iyy>0.02</iyy><izz>0.02</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz>"
+ARM = f"""
+from pathlib import Path
+rod = "<geom type='capsule' size='0.03' fromto='0 0 0 0.5 0 0'/>"
+Path("arm.xml").write_text(
+    f"<mujoco><worldbody><body name='upper'><joint name='shoulder' axis='0 1 0'/>{{rod}}"
+    f"<body name='lower' pos='0.5 0 0'><joint name='elbow' axis='0 1 0' range='-90 90'/>{{rod}}</body></body>"
+    "</worldbody><actuator><motor name='motor' joint='elbow'/></actuator></mujoco>"
+)
+Path("arm.urdf").write_text(
+    "<robot name='arm'><link name='base'/><link name='upper'><inertial><origin xyz='0.25 0 0'/><mass value='1'/>"
+    "<inertia ixx='0.001' iyy='0.02' izz='0.02' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+    "<joint name='shoulder' type='revolute'><parent link='base'/><child link='upper'/><axis xyz='0 1 0'/>"
+    "<limit lower='-1' upper='1' effort='1' velocity='1'/></joint></robot>"
+)
+Path("arm.sdf").write_text(
+    "<sdf version='1.9'><model name='arm'><link name='upper'><inertial><pose>0.25 0 0 0 0 0</pose><mass>1</mass>"
+    "<inertia>{INERTIA}</inertia></inertial></link>"
+    "<joint name='shoulder' type='revolute'><parent>world</parent><child>upper</child>"
+    "<axis><xyz>0 1 0</xyz></axis></joint></model></sdf>"
+)
+"""
+BEFORE |= dict.fromkeys(("ContactEvents", "Event", "Trajectory.events"), BOUNCE)
+BEFORE |= dict.fromkeys(("importers", "importers.mjcf", "importers.sdf", "importers.urdf"), ARM)
+
+
+def codes(text):
+    return re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
 def example(thing):
-    code = re.search(r"```python\n(.*?)```", inspect.getdoc(thing), re.DOTALL)
-    assert code is not None
-    return code.group(1)
+    (code,) = codes(inspect.getdoc(thing))
+    return code
+
+
+@functools.cache
+def examples():
+    """The code in the docstrings of all public names and of members of classes, by name."""
+    known = entries().values()
+    every = [*known, *(own for entry in known if entry.kind == "class" for own in members(entry))]
+    found = {entry.name: codes(inspect.cleandoc(entry.thing.__doc__ or "")) for entry in every if entry.kind != "field"}
+    return {name: "\n".join(own) for name, own in found.items() if own}
+
+
+ALONE = [f"{module.__name__.partition('.')[2]}.{name}" for module, name in JOINTS]
+TOGETHER = [name for name in examples() if name not in ALONE]
 
 
 @pytest.fixture(scope="module")
 def names():
     """What the examples refer to: modules, and the pendulum of that of `Scene`."""
-    scope = dict(MODULES)
+    scope: dict[str, Any] = dict(MODULES)
     exec(example(mb.Scene), scope)
     scope["state"] = mb.assemble(scope["system"], fix={"bar.angle": 0.5})
     return scope
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_examples(name, names):
+@pytest.fixture(scope="module")
+def motion(names):
     scope = dict(names)
-    exec(example(EXAMPLES[name]), scope)
+    exec(example(mb.Trajectory), scope)
+    return scope["motion"]
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_examples(name, names, request, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXMB_CACHE", "off")
+    scope = dict(names)
+    code = examples()[name]
+    before = examples()[AFTER[name]] if name in AFTER else BEFORE.get(name, "")
+    if re.search(r"\bmotion\b", code) and "motion = " not in before + code:
+        scope["motion"] = request.getfixturevalue("motion")
+    exec(before, scope)
+    exec(code, scope)
     match name:
+        case "assembly_gap":
+            # The bar's centre is 0.3 m farther from the pin than the pin holds it, in units of 0.5 m.
+            np.testing.assert_allclose(scope["gap"], 0.6, rtol=1e-9)
         case "equilibrium":
             np.testing.assert_allclose(np.sin(scope["hanging"].q[2]), -1.0, atol=1e-9)
             np.testing.assert_allclose(np.sin(scope["upright"].q[2]), 1.0, atol=1e-9)
+        case "floquet":
+            np.testing.assert_allclose(scope["periodic"].multipliers, 1.0, atol=1e-6)
         case "identify":
             assert scope["fit"].converged
             np.testing.assert_allclose(scope["fit"].parameters["bar.inertia"], 1.0 / 12.0, rtol=1e-6)
-        case "linearise":
+        case "linearise" | "Linearisation":
             # A bar on a pin: the square of its frequency is 3 g / 2 l.
             frequency = np.abs(scope["about_rest"].eigenvalues.imag)
             np.testing.assert_allclose(frequency, np.sqrt(1.5 * 9.81), rtol=1e-9)
+        case "optimise":
+            assert scope["best"].success
+            np.testing.assert_allclose(scope["best"].outputs["angle"], 0.0, atol=1e-6)
+        case "steady_motion":
+            speed = np.linalg.norm(scope["circling"].u)
+            np.testing.assert_allclose(speed, 0.6 * np.sqrt(9.81 / 0.8), rtol=1e-5)
         case "Trajectory":
             assert np.ptp(scope["motion"].energy) < 1e-7
+
+
+# Results that the example of the function shows that returns them, and classes and functions for parts of the package.
+RESULTS_OF = {
+    "importers.Exported": "importers.to_mjcf",
+    "importers.ImportedModel": "importers.mjcf",
+    "viz.MovingPicture": "viz.show",
+    "cases.Cases": "cases",
+    "mechanisms.Mechanism": "mechanisms",
+    "mechanisms.References": "mechanisms",
+    "report.FormulationCost": "report.formulation_costs",
+    "report.FormulationCosts": "report.formulation_costs",
+    "report.LeftOut": "report.left_out",
+    "report.Measured": "report.left_out",
+    "report.MethodCost": "report.method_costs",
+    "report.MethodCosts": "report.method_costs",
+    "report.Case": "report.stress_test",
+    "report.StressTest": "report.stress_test",
+    "report.Run": "report.work_precision",
+    "report.WorkPrecision": "report.work_precision",
+    "parts.Module": "parts.module",
+    "trajectory.PartMotion": "Trajectory",
+}
+# Modules that hold what a new method or a new kind of system is made of.
+MACHINERY = ("formulations", "manifold", "solvers", "system")
+# What users hand to `simulate`.
+CHOICES = (
+    formulations.AbstractFormulation,
+    manifold.AbstractManifold,
+    diffrax.AbstractSolver,
+    diffrax.AbstractStepSizeController,
+)
+
+
+def referred_to():
+    """All that stands in examples as a name in a module, such as `jaxmb.terrain.Flat`."""
+    found = set()
+    for code in examples().values():
+        scope, tree = dict(MODULES), ast.parse(code)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom | ast.Import):
+                exec(ast.unparse(node), scope)
+        dotted = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)}
+        for name in dotted:
+            first, *others = name.split(".")
+            if first in scope and all(other.isidentifier() for other in others):
+                found.add(id(functools.reduce(lambda thing, other: getattr(thing, other, None), others, scope[first])))
+    return found
+
+
+def needs_no_example(entry):
+    """Modules, abstract classes, exceptions, tuples of results, mechanisms, machinery, results of functions."""
+    module, is_class = entry.name.rpartition(".")[0], inspect.isclass(entry.thing)
+    if is_class and (entry.short.startswith("Abstract") or issubclass(entry.thing, Exception | tuple)):
+        return True
+    if module == "mechanisms" and entry.short in mechanisms.names():
+        return True
+    if module in MACHINERY and not (is_class and issubclass(entry.thing, CHOICES)):
+        return True
+    return entry.kind == "module" or entry.name in RESULTS_OF
+
+
+def test_every_public_name_has_an_example():
+    known, found = entries(), referred_to()
+    assert (
+        set(RESULTS_OF) <= known.keys()
+        and set(RESULTS_OF.values()) | AFTER.keys() | set(AFTER.values()) <= examples().keys()
+    )
+    without = [
+        entry.name
+        for entry in known.values()
+        if entry.name not in examples() and id(entry.thing) not in found and not needs_no_example(entry)
+    ]
+    assert not without
 
 
 def test_every_joint_has_an_example():
@@ -109,7 +286,7 @@ def test_examples_of_joints(module, name):
     cls, scope = getattr(module, name), dict(MODULES)
     exec(example(cls), scope)
     (joint,) = (own for own in scope.values() if type(own) is cls)
-    system, text = scope["system"], inspect.getdoc(cls)
+    system, text = scope["system"], inspect.getdoc(cls) or ""
     assert joint.name in system.constraint_names()
     for field in ("body_a", "body_b") if hasattr(joint, "body_a") else ("body",):
         assert f"`{field}`" in text

@@ -45,6 +45,11 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
 class Body(AbstractRigidBody):
     """A rigid body with a frame, whose origin is the mass centre unless `centre` is given.
 
+    ```python
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0), angular_velocity=2.0)
+    from_its_end = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), centre=(0.5, 0.0))
+    ```
+
     Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
     pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
     moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
@@ -77,6 +82,11 @@ class Body(AbstractRigidBody):
 class PointMass(AbstractPlanarPart, AbstractBody):
     """A mass without extension: two coordinates and no angle.
 
+    ```python
+    bob = planar.PointMass("bob", mass=0.2, position=(0.6, 0.0))
+    system = jaxmb.Scene([bob], joints=[planar.Distance("cord", "ground", "bob")]).compile()
+    ```
+
     **Arguments:** `mass` [kg] > 0; `position` [m] and `velocity` [m/s], shape (2,), a guess that `assemble` improves.
     """
 
@@ -98,15 +108,30 @@ class PointMass(AbstractPlanarPart, AbstractBody):
 
 
 def rod(mass: float, length: float) -> float:
-    """Moment of inertia [kg m²] of a thin uniform rod about its centre, `m l² / 12`."""
+    """Moment of inertia [kg m²] of a thin uniform rod about its centre, `m l² / 12`.
+
+    ```python
+    planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0))
+    ```
+    """
     return mass * length**2 / 12
 
 
 def disc(mass: float, radius: float) -> float:
-    """Moment of inertia [kg m²] of a uniform disc about its axis, `m r² / 2`."""
+    """Moment of inertia [kg m²] of a uniform disc about its axis, `m r² / 2`.
+
+    ```python
+    planar.Body("wheel", mass=2.0, inertia=planar.disc(2.0, 0.3))
+    ```
+    """
     return mass * radius**2 / 2
 
 
 def box(mass: float, width: float, height: float) -> float:
-    """Moment of inertia [kg m²] of a uniform rectangle about its centre, `m (w² + h²) / 12`."""
+    """Moment of inertia [kg m²] of a uniform rectangle about its centre, `m (w² + h²) / 12`.
+
+    ```python
+    planar.Body("plate", mass=3.0, inertia=planar.box(3.0, 0.4, 0.2))
+    ```
+    """
     return mass * (width**2 + height**2) / 12

@@ -148,6 +148,13 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
 class PlateContact(AbstractBodyContact):
     """Contact of a disc with plates of other bodies, each a straight line between two points of its body.
 
+    ```python
+    ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.5, 0.3))
+    plate = {"start": (-0.5, 0.0), "end": (0.5, 0.0)}
+    on = planar.PlateContact("on", ("ball", "bar"), normal=jaxmb.contact.Linear(1e5), radius=0.1, **plate)
+    system = jaxmb.Scene([bar, ball], joints=[pin], forces=[on]).compile()
+    ```
+
     A plate bears on both sides: it pushes a disc to the side on which the disc's centre is, so one whose centre is
     driven across the line leaves on the other side. Near its ends the force fades: the depth is measured from the
     plate's line, and the potential is that of `normal` times a step with two continuous derivatives, from one at the
@@ -275,6 +282,13 @@ def _between(space, poses, starts, ends):
 
 class DiscContact(AbstractBodyContact):
     """Contact of a disc with discs of other bodies, from outside.
+
+    ```python
+    disc = {"mass": 1.0, "inertia": planar.disc(1.0, 0.1)}
+    discs = [planar.Body("a", **disc), planar.Body("b", position=(0.5, 0.0), velocity=(-1.0, 0.0), **disc)]
+    meet = planar.DiscContact("meet", ("a", "b"), normal=jaxmb.contact.Linear(1e5), radius=0.1, radii=0.1)
+    system = jaxmb.Scene(discs, forces=[meet]).compile()
+    ```
 
     The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
 

@@ -15,6 +15,12 @@ from ..space import both_points, force_pair, separation, separation_rate
 class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     r"""A friction draft gear: slack, then a preloaded spring with dry friction, then a solid stop; in both directions.
 
+    ```python
+    cars = [planar.Body(name, mass=2e4, inertia=1e5, position=(x, 0.0)) for name, x in (("front", 0), ("rear", -15))]
+    gear = planar.DraftGear("gear", "rear", "front", slack=0.02, point_a=(7.0, 0.0), point_b=(-7.0, 0.0))
+    system = jaxmb.Scene(cars, forces=[gear]).compile()
+    ```
+
     The force acts along the line between the two points. With the extension `s` (length less `free_length`, negative
     in buff), the stroke is `x = s − slack` in draft and `x = −s − slack` in buff, and the force against it is
 

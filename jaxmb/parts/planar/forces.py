@@ -19,6 +19,11 @@ def _moment_pair(moment):
 class Torque(AbstractPlanarPart, AbstractForce):
     """A constant moment on `body`, with its reaction on another one.
 
+    ```python
+    motor = planar.Torque("motor", "bar", torque=2.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+    ```
+
     **Arguments:** `torque` [N m]; `reaction`, the body that bears the reaction, default ground.
     """
 
@@ -33,6 +38,11 @@ class Torque(AbstractPlanarPart, AbstractForce):
 
 class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """A linear spring and damper on the relative angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
+
+    ```python
+    spring = planar.TorsionalSpringDamper("spring", "ground", "bar", stiffness=20.0, damping=0.5, free_angle=0.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
+    ```
 
     **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `free_angle` [rad] of `angle_b − angle_a`,
     default that of the given poses.
@@ -55,6 +65,11 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
 
 class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """Progressive stops of a relative angle on both sides, `angle = angle_b − angle_a`.
+
+    ```python
+    stop = planar.BumpStop("stop", "ground", "bar", stiffness=1e3, lower=-0.5, upper=1.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[stop]).compile()
+    ```
 
     Beyond a limit the potential is `stiffness δ^(exponent + 1) / (exponent + 1)` of a smoothed depth
     `δ = ½ (d + √(d² + smoothing²))`, d = lower − angle or angle − upper: the restoring moment on B is nearly
@@ -87,6 +102,12 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
 
 class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """A compliant joint: springs and dampers on the three relative motions of a frame in B with respect to one in A.
+
+    ```python
+    stiffness, damping = (1e5, 1e5, 10.0), (100.0, 100.0, 0.1)
+    bush = planar.Bushing("bush", "ground", "bar", stiffness=stiffness, damping=damping, point=(0.0, 0.0))
+    system = jaxmb.Scene([bar], forces=[bush]).compile()
+    ```
 
     The motions are the position of B's point in the axes of `body_a` relative to A's point (2) [m] and the relative
     angle less that of the given poses [rad].

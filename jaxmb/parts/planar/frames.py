@@ -12,6 +12,12 @@ from ..frames import AbstractFrame
 class Frame(AbstractPlanarPart, AbstractFrame):
     """A frame fixed in a body, or in another frame.
 
+    ```python
+    tip = planar.Frame("tip", "bar", position=(0.5, 0.0))
+    pull = planar.PointForce("pull", "tip", force=(0.0, 5.0))
+    system = jaxmb.Scene([bar], joints=[pin], forces=[pull], frames=[tip]).compile()
+    ```
+
     Joints, forces and contacts may name it in place of a body. Along a motion it has `position`, `velocity` and
     `acceleration` of its origin (world axes), `angle`, `angular_velocity`, `angular_acceleration`, and
     `specific_force`, what an accelerometer measures: acceleration less gravity, in the frame's axes [m/s²].

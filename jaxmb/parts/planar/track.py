@@ -20,6 +20,14 @@ from ..shapes import wheel
 class Track(AbstractPlanarPart, AbstractPotentialForce):
     """A closed elastic track or belt without mass around points of any number of bodies.
 
+    ```python
+    corners = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "top": (0.0, 0.5)}
+    wheels = [planar.Body(name, mass=5.0, inertia=planar.disc(5.0, 0.2), position=at) for name, at in corners.items()]
+    path = [(name, (0.0, 0.0)) for name in corners]
+    belt = planar.Track("belt", path, pretension=100.0, stiffness=1e4, radii=(0.2, 0.2, 0.2))
+    system = jaxmb.Scene(wheels, forces=[belt]).compile()
+    ```
+
     Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential `pretension
     (length − free_length) + ½ stiffness (length − free_length)²`. Without `radii` the track is a polygon through the
     points. With `radii` it wraps circles, joined by their common tangents, and slides on them without friction, so it

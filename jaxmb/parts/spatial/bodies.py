@@ -49,6 +49,12 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
 class Body(AbstractRigidBody):
     """A rigid body with a frame, whose origin is the mass centre unless `centre` is given.
 
+    ```python
+    top = spatial.Body("top", mass=1.0, inertia=(0.002, 0.002, 0.003), angular_velocity=(0.0, 0.0, 50.0))
+    tilted = jaxmb.rotations.from_axis_angle((1.0, 0.0, 0.0), 0.3)
+    leaning = spatial.Body("top", mass=1.0, inertia=(0.002, 0.002, 0.003), orientation=tilted, centre=(0.0, 0.0, 0.1))
+    ```
+
     Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
     pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
     moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
@@ -113,6 +119,11 @@ def _check_inertia(body: AbstractRigidBody) -> None:
 class PointMass(AbstractSpatialPart, AbstractBody):
     """A mass without extension: three coordinates and no orientation.
 
+    ```python
+    bob = spatial.PointMass("bob", mass=0.2, position=(0.0, 0.0, -0.6))
+    system = jaxmb.Scene([bob], joints=[spatial.Distance("cord", "ground", "bob")]).compile()
+    ```
+
     **Arguments:** `mass` [kg] > 0; `position` [m] and `velocity` [m/s], shape (3,), a guess that `assemble` improves.
     """
 
@@ -146,25 +157,44 @@ def rod(mass: float, length: float, axis: Axis = "x", *, radius: float = 0.0) ->
     """Inertia [kg m²] of a uniform round rod along `axis` about its centre; `m l² / 12` across and zero along for a
     thin one.
 
+    ```python
+    spatial.Body("arm", mass=1.0, inertia=spatial.rod(1.0, 1.0, axis="x", radius=0.02))
+    ```
+
     A thin rod has no inertia about its axis and cannot be a `Body`: give it a `radius`.
     """
     return cylinder(mass, radius, length, axis)
 
 
 def disc(mass: float, radius: float, axis: Axis = "z") -> Float[Array, "3 3"]:
-    """Inertia [kg m²] of a thin uniform disc whose axle is `axis`: `m r² / 2` about it, `m r² / 4` about a diameter."""
+    """Inertia [kg m²] of a thin uniform disc whose axle is `axis`: `m r² / 2` about it, `m r² / 4` about a diameter.
+
+    ```python
+    spatial.Body("wheel", mass=2.0, inertia=spatial.disc(2.0, 0.3, axis="y"))
+    ```
+    """
     return _axial(mass * radius**2 / 2, mass * radius**2 / 4, axis)
 
 
 def box(mass: float, x: float, y: float, z: float) -> Float[Array, "3 3"]:
-    """Inertia [kg m²] of a uniform box with edges of lengths `x`, `y`, `z` [m] along the axes, about its centre."""
+    """Inertia [kg m²] of a uniform box with edges of lengths `x`, `y`, `z` [m] along the axes, about its centre.
+
+    ```python
+    spatial.Body("crate", mass=3.0, inertia=spatial.box(3.0, 0.4, 0.2, 0.1))
+    ```
+    """
     x2, y2, z2 = as_parameter(x) ** 2, as_parameter(y) ** 2, as_parameter(z) ** 2
     moments = as_parameter(mass) / 12 * namespace(x2, y2, z2).stack([y2 + z2, z2 + x2, x2 + y2])
     return namespace(moments).diag(moments)
 
 
 def sphere(mass: float, radius: float) -> Float[Array, "3 3"]:
-    """Inertia [kg m²] of a uniform solid sphere about its centre, `2 m r² / 5`."""
+    """Inertia [kg m²] of a uniform solid sphere about its centre, `2 m r² / 5`.
+
+    ```python
+    spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1))
+    ```
+    """
     moment = 2 * as_parameter(mass) * as_parameter(radius) ** 2 / 5
     return moment * np.eye(3, dtype=moment.dtype)
 
@@ -172,5 +202,9 @@ def sphere(mass: float, radius: float) -> Float[Array, "3 3"]:
 def cylinder(mass: float, radius: float, length: float, axis: Axis = "z") -> Float[Array, "3 3"]:
     """Inertia [kg m²] of a uniform solid cylinder along `axis` about its centre: `m r² / 2` along, `m (3 r² + l²) / 12`
     across.
+
+    ```python
+    spatial.Body("roller", mass=3.0, inertia=spatial.cylinder(3.0, 0.1, 0.5, axis="y"))
+    ```
     """
     return _axial(mass * radius**2 / 2, mass * (3 * radius**2 + length**2) / 12, axis)

@@ -13,6 +13,12 @@ from .axes import angle, measured_from_given_poses, offset_in_a, rotation_error,
 class Torque(AbstractSpatialPart, AbstractForce):
     """A constant moment on `body`, with its reaction on another one.
 
+    ```python
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1))
+    twist = spatial.Torque("twist", "ball", torque=(0.0, 0.0, 0.3), frame="body")
+    system = jaxmb.Scene([ball], forces=[twist]).compile()
+    ```
+
     **Arguments:** `torque` [N m], shape (3,), in world axes or, with `frame="body"`, turning with the body; `reaction`,
     the body that bears the reaction, default ground.
     """
@@ -31,6 +37,13 @@ class Torque(AbstractSpatialPart, AbstractForce):
 
 class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A linear spring and damper on an angle: moment `−stiffness (angle − free_angle) − damping rate` on B.
+
+    ```python
+    arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+    hinge = spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    spring = spatial.TorsionalSpringDamper("spring", "ground", "arm", stiffness=20.0, axis=(0.0, 0.0, 1.0))
+    system = jaxmb.Scene([arm], joints=[hinge], forces=[spring]).compile()
+    ```
 
     The angle from `x_a` to `x_b` about `axis_a` is in (−π, π] and jumps half a turn away from `x_a`, so the joint
     should turn by less than that to either side. It should let B turn about the axis only; otherwise the angle is that
@@ -64,6 +77,13 @@ class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotential
 class RotationalDamper(AbstractSpatialPart, AbstractPair, AbstractForce):
     """A linear damper on the relative angular velocity, about every axis: moment `−damping (ω_B − ω_A)` on B.
 
+    ```python
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1), angular_velocity=(0.0, 0.0, 10.0))
+    oil = spatial.RotationalDamper("oil", "ground", "ball", damping=0.01)
+    socket = spatial.Spherical("socket", "ground", "ball", point=(0.0, 0.0, 0.0))
+    system = jaxmb.Scene([ball], joints=[socket], forces=[oil]).compile()
+    ```
+
     **Arguments:** `damping` [N m s/rad] ≥ 0.
     """
 
@@ -78,6 +98,13 @@ class RotationalDamper(AbstractSpatialPart, AbstractPair, AbstractForce):
 
 class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     """A compliant joint: springs and dampers on the six relative motions of a frame in B with respect to one in A.
+
+    ```python
+    crate = spatial.Body("crate", mass=3.0, inertia=spatial.box(3.0, 0.4, 0.2, 0.1))
+    softness = {"stiffness": (1e4, 1e4, 1e4, 10.0, 10.0, 10.0), "damping": (50.0, 50.0, 50.0, 0.1, 0.1, 0.1)}
+    bush = spatial.Bushing("bush", "ground", "crate", point=(0.0, 0.0, -0.05), **softness)
+    system = jaxmb.Scene([crate], forces=[bush]).compile()
+    ```
 
     The motions are the position of B's point relative to A's point in the axes of `body_a` (3) [m], and twice the
     vector part of the Euler parameters from `orientation` to the relative attitude, in the axes of `body_b` (3): the

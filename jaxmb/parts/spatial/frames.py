@@ -12,6 +12,13 @@ from ..frames import AbstractFrame
 class Frame(AbstractSpatialPart, AbstractFrame):
     """A frame fixed in a body, or in another frame.
 
+    ```python
+    crate = spatial.Body("crate", mass=3.0, inertia=spatial.box(3.0, 0.4, 0.2, 0.1))
+    corner = spatial.Frame("corner", "crate", position=(0.2, 0.1, 0.05))
+    pull = spatial.PointForce("pull", "corner", force=(0.0, 0.0, 40.0))
+    system = jaxmb.Scene([crate], forces=[pull], frames=[corner]).compile()
+    ```
+
     Joints, forces and contacts may name it in place of a body. Along a motion it has `position`, `velocity` and
     `acceleration` of its origin (world axes), `orientation` (Euler parameters), and in the frame's own axes
     `angular_velocity` (what a gyroscope measures), `angular_acceleration` and `specific_force`, what an accelerometer

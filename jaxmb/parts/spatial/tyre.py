@@ -11,6 +11,13 @@ from ..tyre import AbstractTyre
 class Tyre(AbstractSpatialPart, AbstractTyre):
     """A tyre with longitudinal and lateral slip and relaxation, on a thin wheel.
 
+    ```python
+    wheel = spatial.Body("wheel", mass=10.0, inertia=spatial.disc(10.0, 0.3, axis="y"), position=(0.0, 0.0, 0.3))
+    ground = {"terrain": jaxmb.terrain.Flat(), "normal": jaxmb.contact.Linear(2e5)}
+    grip = {"coefficient": 0.9, "slip_stiffness": (15.0, 12.0), "relaxation_length": (0.2, 0.4)}
+    system = jaxmb.Scene([wheel], forces=[spatial.Tyre("tyre", "wheel", radius=0.3, **ground, **grip)]).compile()
+    ```
+
     The tread deflects in both directions as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest
     point and the rolling speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slips `d/σ`
     are `−v_s/V`, the lateral one the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its

@@ -29,6 +29,13 @@ RESIDUAL = "residual"
 class Experiment:
     """One measured motion, for `identify`.
 
+    ```python
+    ts = np.linspace(0.1, 1.0, 10)
+    swing = {"bar.angle": jaxmb.simulate(system, state, t1=1.0, saveat=ts)["bar"].angle}
+    drop = jaxmb.Experiment(swing, ts=ts, fix={"bar.angle": 0.5}, name="drop")
+    fit = jaxmb.identify(system, [drop], free={"bar.inertia": 0.2})
+    ```
+
     **Arguments:**
 
     - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.

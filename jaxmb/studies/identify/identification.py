@@ -32,6 +32,12 @@ _UNDETERMINED = "undetermined"
 class Identification:
     """The result of `identify`; `print` shows a table.
 
+    ```python
+    print(fit)  # A table of estimates and their standard deviations, for `fit` from `identify`.
+    fit.parameters["bar.inertia"], fit.deviations["bar.inertia"], fit.converged
+    motion = jaxmb.simulate(fit.system, fit.state, t1=1.0)
+    ```
+
     **Fields:**
 
     - `parameters`: estimates by name; `start`: where they started from.

@@ -15,6 +15,10 @@ _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 class Measurements(NamedTuple):
     """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, as `identify` and
     `Experiment` take them: `identify(system, data, …)`.
+
+    ```python
+    data = jaxmb.Measurements(ts=np.array([0.1, 0.2, 0.3]), values={"bar.angle": np.array([0.44, 0.25, -0.05])})
+    ```
     """
 
     ts: np.ndarray
@@ -35,6 +39,11 @@ def read_measurements(
     source: str | Path | Any, columns: Mapping[str, str | Sequence[str]] | None = None, *, time: str = "t"
 ) -> Measurements:
     """Read measured data from a CSV file with a header line, a DataFrame, or an xarray Dataset.
+
+    ```python
+    data = jaxmb.read_measurements("run.csv", {"bar.angle": "phi"}, time="t")
+    data.ts, data.values["bar.angle"]
+    ```
 
     **Arguments:**
 

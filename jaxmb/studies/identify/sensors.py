@@ -21,6 +21,10 @@ SENSOR_FIELDS = ("bias", "gain", "delay", "sigma")
 class Sensor:
     """An instrument that shows `gain · x(t − delay) + bias` and noise of standard deviation `sigma`.
 
+    ```python
+    encoder = jaxmb.Sensor("pin.angle", name="encoder", bias=0.01, sigma=1e-3)
+    ```
+
     **Arguments:**
 
     - `quantity`: the name of x, as `Trajectory.quantity` takes it: `"rod.angle"`, `"A.force"`.

@@ -33,6 +33,11 @@ _CLOSED, _OF_TOLERANCE = 1e-6, 1e4
 class Floquet(eqx.Module):
     """The linear map of small perturbations over one period of a periodic motion. `print` shows its multipliers.
 
+    ```python
+    print(periodic)  # Its multipliers, for `periodic` from `floquet`.
+    periodic.multipliers, periodic.monodromy, periodic.states
+    ```
+
     **Fields:** `monodromy` (k, k): the perturbations after a period from those before it; `states`, their names, of
     which the first `coordinates` are coordinates and the others rates; `basis` (nq + nu, k): the changes of all
     coordinates and velocities with them; `period` [s].
@@ -82,6 +87,13 @@ def floquet(
     solver: diffrax.AbstractSolver | None = None,
 ) -> Floquet:
     """Find Floquet's multipliers of a periodic motion, in independent coordinates.
+
+    ```python
+    free = jaxmb.Scene([bar], joints=[pin]).compile()
+    turning = jaxmb.assemble(free, rates={"pin.angle": 3.0})
+    periodic = jaxmb.floquet(free, turning, 2 * np.pi / 3.0)
+    periodic.multipliers  # Both are 1: the bar turns uniformly.
+    ```
 
     The motion and its derivatives with respect to all independent perturbations of its start are integrated over one
     period, on the constraints.

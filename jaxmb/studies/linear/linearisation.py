@@ -52,6 +52,12 @@ class Mode(eqx.Module):
 class Linearisation(eqx.Module):
     """`ż = A z + B w`, `y = C z + D w`: small changes of states z, inputs w and outputs y. `print` shows its modes.
 
+    ```python
+    about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system), outputs=["bar.angle"])
+    print(about_rest)  # Its modes: frequencies, damping and shapes.
+    about_rest.A, about_rest.C, about_rest.states
+    ```
+
     **Fields:**
 
     - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.

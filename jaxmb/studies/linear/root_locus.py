@@ -18,6 +18,11 @@ from .linearise import linearise
 class RootLocus(eqx.Module):
     """Eigenvalues along a parameter. `viz.plot_root_locus` draws them.
 
+    ```python
+    locus = jaxmb.root_locus(system, "bar.inertia", [0.05, 0.08, 0.12], state=jaxmb.equilibrium)
+    locus.eigenvalues[-1], locus.states
+    ```
+
     **Fields:** `name` and `values` of the parameter, (values,); `eigenvalues` [1/s], (values, k): column j is one mode,
     followed; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
     of the system's size; `states`, names of the states.

@@ -45,6 +45,13 @@ def steady_motion(
 ) -> State:
     """Find a steady motion near a guess.
 
+    ```python
+    bob = spatial.PointMass("bob", mass=1.0, position=(0.6, 0.0, -0.8), velocity=(0.0, 2.0, 0.0))
+    cord = spatial.Distance("cord", "ground", "bob")
+    conical = jaxmb.Scene([bob], joints=[cord], forces=[jaxmb.Gravity((0.0, 0.0, -9.81))]).compile()
+    circling = jaxmb.steady_motion(conical, fix={"bob.z": -0.8})  # Its speed is √(9.81 / 0.8) · 0.6.
+    ```
+
     All bodies travel and turn together, uniformly, and may spin about axes of their own in addition: a vehicle that
     runs straight or in a circle, a governor, a top that precesses. With `ignorable` only these coordinates change,
     uniformly, and all velocities are constant. Steady motions form families; the nearest one in the scales of

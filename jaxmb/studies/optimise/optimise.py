@@ -72,6 +72,11 @@ class Attempt:
 class Optimum:
     """The result of `optimise`; `print` shows tables.
 
+    ```python
+    print(best)  # Tables of parameters, outputs and constraints, for `best` from `optimise`.
+    best.parameters["bar.inertia"], best.outputs["angle"], best.success
+    ```
+
     **Fields:**
 
     - `parameters`: the best values by name; `start`: those it started from.
@@ -158,13 +163,13 @@ def optimise(
     """Find the values of named parameters that make an objective smallest, with constraints on named outputs.
 
     ```python
-    def drive(v):
-        s = mb.with_parameters(vehicle, v)
-        motion = mb.simulate(s, start(s), t1=1.5, saveat=ts)
-        return {"comfort": ride.vertical_rms(motion), "travel": jnp.abs(ride.arm_travel(motion)).max(axis=0)}
+    def fall(values):
+        motion = jaxmb.simulate(jaxmb.with_parameters(system, values), state, t1=0.4)
+        return {"inertia": values["bar.inertia"], "angle": motion["bar"].angle[-1]}
 
-    limits = {"travel": (None, 0.3)}
-    best = mb.optimise(drive, ["bar", "damper"], system=vehicle, objective="comfort", constraints=limits)
+    limits = {"constraints": {"angle": (0.0, None)}, "bounds": {"bar.inertia": (0.01, 1.0)}}
+    best = jaxmb.optimise(fall, {"bar.inertia": 0.3}, objective="inertia", **limits)
+    best.parameters["bar.inertia"], best.success
     ```
 
     **Arguments:**

@@ -21,8 +21,9 @@ def robust(
     """A function whose outputs are mean and spread of another's over samples of parameters that scatter.
 
     ```python
-    samples = {"spring.stiffness": 500.0 * rng.standard_normal(32), "payload": rng.uniform(0.0, 2e3, 32)}
-    mb.optimise(mb.robust(ride, samples, weight=1.0), start, objective="comfort")
+    rng = np.random.default_rng(0)  # `fall` is the function in the example of `optimise`.
+    samples = {"bar.inertia": 0.01 * rng.standard_normal(16), "bar.mass": rng.uniform(0.9, 1.1, 16)}
+    worst = jaxmb.robust(fall, samples, weight=-2.0)({"bar.inertia": 0.3})  # Mean less two deviations.
     ```
 
     **Arguments:**

@@ -1,4 +1,12 @@
-"""The cases of a sweep: grids, tables and samples of named parameters."""
+"""The cases of a sweep: grids, tables and samples of named parameters.
+
+```python
+from jaxmb import cases
+every = cases.grid(speed=[1.0, 2.0], height=np.linspace(0.0, 0.2, 5))  # Ten members.
+listed = cases.table(speed=[1.0, 2.0, 4.0], height=0.1)
+spread = cases.sobol(64, speed=(1.0, 5.0), height=(0.01, 1.0), log=["height"], seed=1)
+```
+"""
 
 import dataclasses
 from collections.abc import Iterable, Mapping

@@ -10,6 +10,11 @@ from .dataset import packages, unstacked
 def load_sweep(store: str | Path) -> Any:
     """Read the result of a sweep, also while it runs.
 
+    ```python
+    runs = jaxmb.load_sweep("runs.zarr")
+    int((runs["status"] == 1).sum())  # How many members are computed.
+    ```
+
     **Arguments:** `store`, the folder that `sweep` was given.
 
     **Returns:** an `xarray.Dataset` like that of `sweep`. A sweep over a grid has a dimension for each parameter of it

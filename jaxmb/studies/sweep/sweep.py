@@ -52,15 +52,16 @@ def sweep(
     """Compute a function for many cases of its parameters.
 
     ```python
-    def motion(stiffness, speed):
-        changed = mb.with_parameters(system, {"spring.stiffness": stiffness})
-        state = mb.assemble(changed, rates={"crank.angle": speed}, throw=False)
-        sol = mb.simulate(changed, state, t1=1.0, saveat=ts, throw=False)
-        return {"angle": sol["crank"].angle, "result": sol}
+    def motion(inertia, speed):
+        changed = jaxmb.with_parameters(system, {"bar.inertia": inertia})
+        start = jaxmb.assemble(changed, rates={"pin.angle": speed}, throw=False)
+        sol = jaxmb.simulate(changed, start, t1=1.0, saveat=ts, throw=False)
+        return {"angle": sol["bar"].angle, "result": sol}
 
-    cases = mb.cases.grid(stiffness=np.logspace(2, 4, 50), speed=np.linspace(0.0, 5.0, 40))
-    runs = mb.sweep(motion, cases, "runs.zarr", dims={"angle": ["time"]}, coords={"time": ts}, processes=4)
-    runs["angle"].sel(stiffness=1e3, method="nearest").plot()
+    ts = np.linspace(0.0, 1.0, 11)
+    cases = jaxmb.cases.grid(inertia=np.linspace(0.05, 0.2, 4), speed=np.linspace(0.0, 5.0, 6))
+    runs = jaxmb.sweep(motion, cases, "runs.zarr", dims={"angle": ["time"]}, coords={"time": ts})
+    runs["angle"].sel(inertia=0.1, method="nearest").plot()
     ```
 
     **Main arguments:**
