@@ -20,8 +20,9 @@ class Unconstrained(AbstractManifold):
     motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Unconstrained())
     ```
 
-    The policy of systems without constraints. With constraints the state drifts off them by the error of integration;
-    that is for comparison only. Euler parameters are normalised where they are used, so their length does not matter.
+    The policy of systems without constraints. With constraints the integration drifts off them by its error, which is
+    for comparison only: states that are saved are the nearest ones on the constraints. Euler parameters are normalised
+    where they are used, so their length does not matter.
     """
 
     restores: ClassVar[bool] = False
