@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import ArrayLike
 
 from .._arguments import check_kind
+from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import is_traced
@@ -45,6 +46,8 @@ from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
+# A motion that takes more steps than there was room for is computed again with so many times as much.
+_MORE_ROOM = 8
 _HIDDEN = (
     "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
     "an attribute of an object: make it a parameter, or let the function close over it."
@@ -93,7 +96,7 @@ def simulate(
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
     - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
-        `Trajectory.at(t)`.
+        `Trajectory.at(t)`; under `jit` it takes memory for `max_steps` steps, otherwise for those of the motion.
     - `rtol`, `atol`: tolerances. `Adams` and `Hermite` let a step err by a twentieth of them, as errors add up: the
         error of the result, relative to the largest coordinates and velocities, is then mostly below `rtol`; some ten
         times `rtol` over many periods, more where neighbouring motions part quickly, and about the same as that of
@@ -217,12 +220,13 @@ def simulate(
     traced = is_traced(numbers)
     if not traced and adjoint is None:
         numbers["saveat"] = padded(saved, times["t0"], times["t1"])
+    room = max_steps if adjoint is not None else room_for(max_steps, saved, state, traced)
     problem = Problem(
         **numbers,
         adjoint=adjoint,
-        limit=np.asarray(max_steps),
+        limit=np.asarray(min(max_steps, room)),
         max_events=max_events,
-        room=max_steps if adjoint is not None else room_for(max_steps, saved),
+        room=room,
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
@@ -237,6 +241,12 @@ def simulate(
             trajectory, outcome = solved(problem)
             if is_traced(outcome.flags):
                 raise ValueError(_HIDDEN)
+            while problem.room < max_steps and trajectory.result == RESULTS.max_steps_reached:
+                more = min(_MORE_ROOM * problem.room, max_steps)
+                problem = problem._replace(room=more, limit=np.asarray(more))
+                trajectory, outcome = solved(problem)
+            if room < max_steps:
+                trajectory = eqx.tree_at(lambda own: own.stats["max_steps"], trajectory, np.asarray(max_steps))
             return trajectory, outcome, np.asarray(outcome.flags)
 
     trajectory, outcome, flags = run(problem)

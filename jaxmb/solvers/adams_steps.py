@@ -150,11 +150,16 @@ class AdamsSteps(AbstractSteps):
             terms, args, _ = equations
             return at_solution(terms, first.tprev, flat, row.f, like, row.kept, args)[1]
 
-        # In a run without steps the row is none: of zeros nothing that is not finite comes, in either mode.
-        asked = row.made & (first.solver_state.history.known == 0)
-        along = jax.tree.map(lambda x: jnp.where(asked, x, jnp.zeros((), x.dtype)), along[:2])
-        _, f = eqx.filter_jvp(field, (equations, ravel(like)), along)
-        return jnp.where(asked, given.at[0].set(f), given)
+        # In a run without steps the row is none, and a run that begins with a jump has no field before it: of zeros
+        # nothing that is not finite comes, in either mode.
+        asked = row.made & (first.solver_state.history.known == 0) & ~jnp.asarray(first.made_jump)
+
+        def found():
+            within = jax.tree.map(lambda x: jnp.where(asked, x, jnp.zeros((), x.dtype)), along[:2])
+            _, f = eqx.filter_jvp(field, (equations, ravel(like)), within)
+            return jnp.where(asked, given.at[0].set(f), given)
+
+        return lax.cond(any_of_batch(asked), found, lambda: given)
 
     def linearised(self, of, moved, like, row):
         def at(of_terms, flat):

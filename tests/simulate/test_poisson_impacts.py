@@ -80,6 +80,7 @@ def phase(W, b, again, coefficient):
     raise AssertionError("no case fits")
 
 
+@pytest.mark.always
 @pytest.mark.parametrize("angle, touching", [(0.0, (0, 1)), (0.3, (0,))], ids=["both corners", "one corner"])
 def test_a_block_strikes_the_ground(angle, touching):
     """At random velocities, with random coefficients."""
