@@ -10,9 +10,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
-from ..linalg.complementarity import (
-    placed_pairs,
-)
+from ..linalg.complementarity import placed_pairs
 from ..linalg.rotations import norm
 from ..solvers import AbstractGuards
 from ..system import AbstractEquation

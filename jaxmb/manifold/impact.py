@@ -26,9 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
-from ..linalg.complementarity import (
-    of_pairs,
-)
+from ..linalg.complementarity import of_pairs
 from ..linalg.rotations import norm
 from ..system import AbstractEquation
 from ..system.gaps import (
