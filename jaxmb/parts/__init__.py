@@ -12,11 +12,11 @@ class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
 
     def wrenches(self, space, poses, velocities, t):
         d = parts.separation(space, self, poses)
-        return parts.force_pair(space, self, poses, -self.tension * d / jnp.linalg.norm(d))
+        return parts.force_pair(space, self, poses, -self.tension * d / jaxmb.rotations.norm(d))
 
     def state_rates(self, space, poses, velocities, t):
         d, rate = parts.separation(space, self, poses), parts.separation_rate(space, self, poses, velocities)
-        return {"tension": self.stiffness * (d @ rate / jnp.linalg.norm(d) - self.tension / self.damping)}
+        return {"tension": self.stiffness * (d @ rate / jaxmb.rotations.norm(d) - self.tension / self.damping)}
 
 tie = Maxwell("tie", "ground", "bar", stiffness=100.0, damping=20.0, point_a=(0.0, 1.0))
 system = jaxmb.Scene([bar], joints=[pin], forces=[tie]).compile()

@@ -139,7 +139,7 @@ class NonIdeal(AbstractNonIdeal):
 
     ```python
     def rub(poses, velocities, reactions, t, p):
-        moment = p["radius"] * jnp.linalg.norm(reactions[1, :2]) * jnp.tanh(velocities[1, 2] / 0.01)
+        moment = p["radius"] * jaxmb.rotations.norm(reactions[1, :2]) * jnp.tanh(velocities[1, 2] / 0.01)
         return jnp.zeros((2, 3)).at[:, 2].set(jnp.array([moment, -moment]))  # On the ground and on the bar.
 
     friction = jaxmb.NonIdeal("rub", "pin", rub, parameters={"radius": 0.002})
