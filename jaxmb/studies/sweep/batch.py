@@ -26,7 +26,8 @@ class Batch:
     `budget` is the number of steps that members may take at first. Those that are cut off are computed anew with
     `max_steps`, in blocks of their own: all lanes of a block run as long as its slowest, and so a few members that take
     ten times as long would hold up many others. With `"auto"` a budget is chosen once it pays; members have the same
-    bits with any budget and without.
+    bits with any budget and without. A process that is `alone` with the cores that it may use computes blocks on all of
+    them; workers of an executor of the user's, of which there may be one for each core, one after the other.
     """
 
     function: Callable[..., Any]
@@ -35,6 +36,7 @@ class Batch:
     max_steps: int | None = None
     budget: int | Literal["auto"] | None = None
     devices: tuple[Any, ...] = ()
+    alone: bool = True
 
     def compiled(self) -> "Chunks":
         """A function that computes one chunk, and compiles at its first call."""
@@ -136,6 +138,7 @@ class _Program:
             number = -(-own.chunk // min(member.block_size(own.chunk), own.chunk))
             self.size = -(-own.chunk // number)
             members = member.block(self.size)
+        self._alone = own.alone
         self._run = jax.jit(members).lower(self._block(columns, 0)).compile()
         self.seconds = time.perf_counter() - begin
 
@@ -147,7 +150,7 @@ class _Program:
         # Made in this thread, where a user may have changed how arrays are made.
         blocks = [self._block(columns, start) for start in range(0, count, self.size)]
         found: list[Any] = [None] * len(blocks)
-        with futures.ThreadPoolExecutor(min(threads(), len(blocks))) as pool:
+        with futures.ThreadPoolExecutor(min(threads(), len(blocks)) if self._alone else 1) as pool:
             places = {pool.submit(self._computed, block): k for k, block in enumerate(blocks)}
             try:
                 for done in futures.as_completed(places):

@@ -93,7 +93,8 @@ def sweep(
         a chunk at a time as it has cores, or as the environment variable `NPROC` allows; the bits are the same. Several
         of them, each of which compiles for itself, survive a crash: a process that dies is replaced.
     - `executor`: any `concurrent.futures.Executor` instead: Dask's `client.get_executor()`,
-        `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves.
+        `mpi4py.futures.MPIPoolExecutor()`, and others of this interface. Its workers write their chunks themselves, and
+        compute their blocks one after the other.
     - `devices`: a number of `jax.local_devices()`, or a list of them, among which the members of a chunk are divided,
         each device with loops of its own. Several devices that are parts of one CPU need two threads each, `NPROC=4` in
         the environment for two of them. On several hosts, each with devices, start the same script on every host with
@@ -237,7 +238,10 @@ def _chunks(
     if executor is None and processes == 1:
         yield from here(batch, path, tasks, progress.advance)
         return
-    run = on_processes(batch, path, tasks, processes) if executor is None else on_executor(batch, path, tasks, executor)
+    if executor is None:
+        run = on_processes(batch, path, tasks, processes)
+    else:
+        run = on_executor(dataclasses.replace(batch, alone=False), path, tasks, executor)
     for index, values in run:
         yield index, values
         progress.advance(values["status"].size)
