@@ -134,8 +134,9 @@ class Scene(eqx.Module):
             dry = isinstance(group.part, AbstractDryFriction)
             return VelocityConstraintGroup(group, of_joints(group) if dry else ())
 
-        own_laws = (*laws, *(entry for entry in parts if isinstance(entry[0], AbstractDryFriction)))
-        constraints, of_joint = kind(AbstractConstraint), {law.name: law.joint for law, _ in own_laws}
+        of_joint = {law.name: law.joint for law, _ in laws}
+        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractDryFriction)}
+        constraints = kind(AbstractConstraint)
         system = RigidBodySystem(
             bodies=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),

@@ -169,6 +169,8 @@ def _in_directions(W, b, dry, among):
     m, pairs = len(dry.contacts), of_pairs(dry.pairs)
     n = b.size - m
     both, contact = n + pairs, np.array(dry.contacts)[pairs[:, 0]]
+    # The normal forces of others are not among the unknowns.
+    of_contact = contact >= 0
     known, touches = dry.slips[pairs], among[both[:, 0]]
     may = touches & (known == 0).all(1)
     both_may = placed_pairs(dry.pairs, jnp.stack([touches, may], axis=1), among[n:])
@@ -203,7 +205,9 @@ def _in_directions(W, b, dry, among):
 
     def with_slips(answers, e):
         """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
-        pressed, sticks = answers.closed[contact] | (dry.bound[pairs[:, 0]] > 0), answers.sticks[pairs].all(1)
+        sticks, closed = answers.sticks[pairs].all(1), jnp.concatenate([answers.closed, jnp.ones(1, bool)])
+        # The last entry is that of friction without a contact.
+        pressed = closed[contact] | (dry.bound[pairs[:, 0]] > 0)
         slips = jnp.where((touches & pressed & ~sticks)[:, None], jnp.where(may[:, None], e, known), 0.0)
         slips = placed_pairs(dry.pairs, slips, answers.slips)
         sticks_both = placed_pairs(dry.pairs, jnp.stack([sticks, sticks], axis=1), answers.sticks)
@@ -213,7 +217,8 @@ def _in_directions(W, b, dry, among):
         """The equations of a step of Newton's method for the directions of slip and the forces."""
         laws, slides = with_slips(answers, e)
         matrix, right = laws_of(W, b, dry, laws)
-        load = dry.bound[pairs[:, 0]] + dry.coefficient[pairs[:, 0]] * jnp.maximum(x[contact], 0.0)
+        push = jnp.where(of_contact, jnp.maximum(x[contact], 0.0), 0.0)
+        load = dry.bound[pairs[:, 0]] + dry.coefficient[pairs[:, 0]] * push
         rates = (W @ x + b)[both]
         # Along the direction the force is that of slip. Across, force and slip are zero together.
         across = jnp.stack([-e[:, 1], e[:, 0]], axis=1)

@@ -264,6 +264,8 @@ class AbstractLink(AbstractActor):
 
     # Names of the coordinates that are angles.
     angles: ClassVar[frozenset[str]] = frozenset()
+    # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
+    slides: ClassVar[tuple[str, ...]] = ()
 
     @property
     def periodic(self) -> frozenset[str]:

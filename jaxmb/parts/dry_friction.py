@@ -13,7 +13,15 @@ from jaxtyping import Array, Float
 from ..linalg.complementarity import slip_direction
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractVelocityConstraint, Poses, ScalarCoordinate, Velocities, Wrenches
+from .base import (
+    AbstractLink,
+    AbstractPart,
+    AbstractVelocityConstraint,
+    Poses,
+    ScalarCoordinate,
+    Velocities,
+    Wrenches,
+)
 from .coordinate_parts import AbstractOfJoints, is_length
 from .space import AbstractSpace
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
@@ -31,26 +39,36 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     `static_coefficient` times the normal force; where it slips, the force is `coefficient` times the normal force,
     against the slip. `simulate` finds the times at which one turns into the other.
 
-    In a contact in space all of these are two, along two tangents. Its modes `"rub.mode_1"` and `"rub.mode_2"` are both
-    2 where it sticks, and where it slips the components of a unit vector near the direction of slip, or of half of one
-    where slip has begun from rest and is not to be seen yet.
+    In a contact in space, and in a joint whose bodies slide over each other in two directions, all of these are two.
+    The modes `"rub.mode_1"` and `"rub.mode_2"` are both 2 where it sticks, and where it slips the components of a unit
+    vector near the direction of slip, or of half of one where slip has begun from rest and is not to be seen yet.
 
-    **Fields:** `joint`, its name; `coefficient` μ ≥ 0 of slip; `static_coefficient` ≥ μ of stick, default μ.
+    **Fields:** `joint`, its name, or `"joint.coordinate"`; `coefficient` μ ≥ 0 of slip; `static_coefficient` ≥ μ of
+    stick, default μ.
     """
 
     joint: str = fields.name()
     coefficient: fields.Number = fields.parameter(sign="non-negative", constant=True)
     static_coefficient: fields.Number = fields.parameter(sign="non-negative", optional=True, constant=True)
+    directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
     linear: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = True
 
     @property
     def rows(self) -> int:
-        return 1
+        return self.directions
+
+    @property
+    def homogeneous(self) -> bool:
+        return True
+
+    @property
+    def joint_name(self) -> str:
+        """The name of the joint or contact."""
+        return self.joint.partition(".")[0]
 
     @property
     def sources(self):
-        return (self.joint,)
+        return (self.joint_name,)
 
     @property
     def last(self) -> int:
@@ -70,9 +88,18 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
             )
 
     def scalar_coordinates(self, space, parts):
-        if space.dimension == 3 and isinstance(parts.get(self.joint), AbstractRigidContact):
+        if self._directions(space, parts.get(self.joint_name)) == 2:
             return tuple(ScalarCoordinate(f"{self.name}.mode_{k}", moves=True) for k in (1, 2))
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
+
+    def complete(self, space, poses):
+        return self.with_fields(directions=self._directions(space, self.joints["0"]))
+
+    def _directions(self, space: AbstractSpace, held: AbstractPart | None) -> int:
+        """The number of directions of slip in a joint or contact."""
+        if isinstance(held, AbstractRigidContact):
+            return space.dimension - 1
+        return 2 if isinstance(held, AbstractLink) and held.slides and "." not in self.joint else 1
 
     @abc.abstractmethod
     def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
@@ -111,7 +138,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
 
 
 class DryFriction(AbstractDryFriction):
-    """Coulomb friction in a joint with one coordinate, or in a rigid contact, which sticks exactly.
+    """Coulomb friction in a joint or in a rigid contact, which sticks exactly.
 
     ```python
     block = planar.Body("block", mass=1.0, inertia=0.1)
@@ -120,14 +147,22 @@ class DryFriction(AbstractDryFriction):
     scene = jaxmb.Scene([block], joints=[slide], forces=[rub, jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    The slip of a joint is the rate of its displacement, or `radius` times that of its angle; the normal force is the
-    size of the joint's reaction force, in which moments do not count. The slip of a contact (`RigidContact`,
-    `RigidBallContact`, `RigidPlaneContact`, `RigidBoxContact`) is the velocity of the last body against the other one
-    where they touch: in the plane along the tangent that is the outward normal turned clockwise, so that on level
-    ground it points along x; in space in the tangent plane, where the force has the direction of the slip (there is no
-    moment against a spin about the normal). The normal force is that of the contact. In an impact the friction of the
-    contacts has an impulse of at most `coefficient` times theirs, and just that where slip does not end; friction of
-    joints has none.
+    The slip of a joint is the rate of its displacement, or `radius` times that of its angle. In a `spatial.Cylindrical`
+    it has both as components, and in a `spatial.Planar` both components of the displacement: friction then acts against
+    the direction of slip, so that a pin which turns slides along its axis under the smallest force. In other joints
+    with several coordinates one of them is named, as in `"cardan.angle_a"`; friction in another one is a part of its
+    own. The normal force is the size of the joint's reaction force, in which moments do not count.
+
+    The slip of a contact (`RigidContact`, `RigidBallContact`, `RigidPlaneContact`, `RigidBoxContact`) is the velocity
+    of the last body against the other one where they touch: in the plane along the tangent that is the outward normal
+    turned clockwise, so that on level ground it points along x; in space in the tangent plane, where the force has the
+    direction of the slip (there is no moment against a spin about the normal), with components along two tangents that
+    on level ground are x and y. The normal force is that of the contact. In an impact the friction of the contacts has
+    an impulse of at most `coefficient` times theirs, and just that where slip does not end; friction of joints has
+    none.
+
+    With a `speed` the first body carries a belt, or the terrain is one: its surface moves at this speed along the
+    directions of slip, and slip is measured against it.
 
     Several contacts in space that stick, as the feet of a table do, share forces that are not determined: they are as
     small as they can be, and where one reaches its limit others take more. Where the normal forces are not determined
@@ -140,43 +175,68 @@ class DryFriction(AbstractDryFriction):
 
     **Arguments:**
 
-    - `joint`: the name of the joint or contact. Its reaction must be determinate: no other joint may imply any of its
-      rows.
+    - `joint`: the name of the joint or contact, or `"joint.coordinate"`. The reaction must be determinate: no other
+      joint may imply any of its rows.
     - `coefficient` μ ≥ 0, of slip; `static_coefficient` ≥ μ, of stick, default μ.
-    - `radius` [m] > 0 of the pin, for a joint whose coordinate is an angle.
+    - `radius` [m] > 0 of the pin, for a coordinate that is an angle.
+    - `speed` [m/s] of a belt, one number, or two where slip has two directions; default none.
     """
 
     radius: fields.Number = fields.length(sign="positive", optional=True)
-    within: str = eqx.field(static=True, default_factory=str, init=False)
+    speed: fields.Number = fields.parameter(shape=None, unit="m/s", optional=True, constant=True)
+    # The coordinates of a joint whose rates are those of slip.
+    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
     # In a contact in space the axis from which its tangents turn, see `AbstractRigidContact.tangents`; otherwise zero.
     pole: int = eqx.field(static=True, default_factory=int, init=False)
 
     @property
-    def rows(self):
-        return 2 if self.pole else 1
+    def homogeneous(self):
+        return self.speed is None
 
     def complete(self, space, poses):
-        held = self.joints["0"]
+        held, part = self.joints["0"], super().complete(space, poses)
+        shape = () if part.directions == 1 else (2,)
+        if self.speed is not None and np.shape(self.speed) != shape:
+            raise ValueError(
+                f"{self.label}: slip has {'one direction' if shape == () else 'two directions'}, and speed must have "
+                f"shape {shape}, got {np.shape(self.speed)}."
+            )
         if isinstance(held, AbstractUnilateralConstraint):
-            return self._of_contact(space, held, poses)
+            return part._of_contact(space, held, poses)
+        within = part._own_coordinates(space, held, poses)
+        if all(map(is_length, within)) != (self.radius is None):
+            needs = "slides and has no radius" if self.radius is not None else "turns: give the radius of its pin"
+            raise ValueError(f"{self.label}: {held.label} {needs}.")
+        return part.with_fields(within=within)
+
+    def _own_coordinates(self, space, held, poses) -> tuple[str, ...]:
+        """The coordinates of the joint whose rates are those of slip."""
         coordinates = self.coordinates_of(0, space, poses)
         numbers = [name for name, value in coordinates.items() if value.size == 1]
-        if len(coordinates) != 1 or len(numbers) != 1:
-            raise ValueError(
-                f"{self.label}: {held.label} must have one coordinate, a number, as a pin or a slide has; it has "
-                f"{', '.join(coordinates) or 'none'}. Use Friction."
-            )
-        (within,) = numbers
-        if is_length(within) != (self.radius is None):
-            needs = "slides and has no radius" if is_length(within) else "turns: give the radius of its pin"
-            raise ValueError(f"{self.label}: {held.label} {needs}.")
-        return self.with_fields(within=within)
+        named = self.joint.partition(".")[2]
+        if named:
+            if self.given_coordinate(0, self.joint, space, poses).size != 1:
+                raise ValueError(f"{self.label}: {self.joint!r} must be a number.")
+            return (named,)
+        if held.slides:
+            return held.slides
+        if len(coordinates) == len(numbers) == 1:
+            return tuple(numbers)
+        if numbers:
+            names = " or ".join(repr(f"{self.joint}.{name}") for name in numbers)
+            raise ValueError(f"{self.label}: {held.label} has several coordinates: give {names} as joint.")
+        raise ValueError(
+            f"{self.label}: {held.label} has no coordinate that is a number, as a pin or a slide has; it has "
+            f"{', '.join(coordinates) or 'none'}. Use Friction."
+        )
 
     def _of_contact(self, space, held, poses):
         if self.radius is not None:
             raise ValueError(f"{self.label}: {held.label} slides and has no radius.")
         if not isinstance(held, AbstractRigidContact):
             raise ValueError(f"{self.label}: {held.label} has no point at which bodies touch, and no friction.")
+        if "." in self.joint:
+            raise ValueError(f"{self.label}: friction in {held.label} is given by its name, {self.joint_name!r}.")
         if space.dimension == 2:
             return self
         seen = jnp.asarray(held.seen_poses(space, poses[: len(held.bodies)]))
@@ -188,11 +248,21 @@ class DryFriction(AbstractDryFriction):
         return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
 
     def slip(self, space, poses, velocities):
+        slip = self._relative_velocity(space, poses, velocities)
+        return slip if self.speed is None else slip - self.speed.reshape(-1)
+
+    def _relative_velocity(self, space, poses, velocities):
         held = self.joints["0"]
         if isinstance(held, AbstractRigidContact):
             bodies = len(held.bodies)
             return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]), self.pole)
         rates = jax.vmap(space.rates)(poses, velocities)
-        value = lambda x: held.coordinates_at(space, x)[self.within].reshape(())
-        rate = jax.jvp(value, (poses,), (rates,))[1][None]
-        return rate if self.radius is None else self.radius * rate
+
+        def lengths(poses):
+            own = held.coordinates_at(space, poses)
+            return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
+
+        return jax.jvp(lengths, (poses,), (rates,))[1]
+
+    def _length(self, name, value):
+        return value if self.radius is None or is_length(name) else self.radius * value

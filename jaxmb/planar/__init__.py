@@ -10,7 +10,7 @@
   `DiscContact` of a disc on discs.
 - Rigid contact, from `jaxmb`: `Stop` at the ends of a coordinate's range, `RigidContact` of points and discs with a
   terrain, `RigidBallContact` of two discs, `RigidPlaneContact`, `RigidBoxContact`, `Slack` in ropes and couplings;
-  impacts happen at their exact times. `DryFriction` in them, and in joints with one coordinate, sticks exactly.
+  impacts happen at their exact times. `DryFriction` in them, and in joints, sticks exactly.
 - `Frame`: a named frame fixed in a body, which parts may name in its place, and which measures as an accelerometer and
   a gyroscope there do.
 

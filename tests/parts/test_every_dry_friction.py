@@ -29,13 +29,15 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     at = lambda mode: of.with_modes(system, q, modes.at[-directions:].set(mode))
     slip = np.asarray(of.direction_rates(system, t, q, u)[-directions:])
     speed = np.linalg.norm(slip)
-    assert directions == (2 if "ball" in name else 1) and speed > 1e-3
+    assert directions == (2 if "ball" in name or name in ("sleeve", "face") else 1) and speed > 1e-3
 
     # Where it sticks, its rows are those of the slip.
     udot, multipliers = accelerations(system, Multipliers(), t, at(of.STICK), u)
     np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, udot)[-directions:], 0.0, atol=1e-11)
     rows = np.array(system.contacts.frictions.rows)
-    np.testing.assert_allclose(of.direction_gradients(system, t, q, u)[-directions:] @ u, slip, rtol=1e-11)
+    moves = of.direction_gradients(system, t, q, u)[-directions:] @ u
+    belt = FRICTIONS[name][2].speed
+    np.testing.assert_allclose(moves, slip if belt is None else slip + belt, rtol=1e-11)
     touching = ("pin", "two discs", "point on a plane that moves", "two balls", "ball on a plane that moves")
     assert name in touching or np.all(multipliers[rows] != 0)
 
@@ -53,7 +55,7 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
         # That of a contact has a sign, so that the law is smooth where an iteration passes through zero.
         normal = normal * np.sign(multipliers[system.contacts.rows[0]])
     power = jnp.dot(system.nonideal_force(t, at(mode), u, multipliers), u)
-    np.testing.assert_allclose(power, -0.3 * normal * speed, rtol=1e-10)
+    np.testing.assert_allclose(power, -0.3 * normal * np.dot(slip, moves) / speed, rtol=1e-10)
     reactions = system.friction_reactions(t, q, u, multipliers)
     np.testing.assert_allclose(jnp.linalg.norm(reactions, axis=1), np.full(directions, abs(normal)), rtol=1e-10)
     residual = system.inertia(t, q, u).product(udot) - system.force(t, q, u)
@@ -104,6 +106,11 @@ def test_words_and_numbers():
 BODY = planar.Body("a", mass=1.0, inertia=1.0)
 SLIDE = planar.Prismatic("joint", "ground", "a", axis=(1.0, 0.0), point=(0.0, 0.0))
 PIN = planar.Revolute("joint", "ground", "a", point=(0.0, 0.5))
+BODY_3D = spatial.Body("a", mass=1.0, inertia=(1.0, 1.0, 1.0))
+SLEEVE = spatial.Cylindrical("joint", "ground", "a", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+CARDAN = spatial.Universal(
+    "joint", "ground", "a", point=(0.0, 0.0, 0.0), axis_a_W=(1.0, 0.0, 0.0), axis_b_W=(0.0, 1.0, 0.0)
+)
 FLOOR = mb.RigidContact("joint", "a", terrain=terrain.Flat(), radius=0.1)
 BAD = {
     "a negative coefficient": (BODY, [SLIDE], {"coefficient": -0.1}, "coefficient must be non-negative, got -0.1"),
@@ -116,11 +123,30 @@ BAD = {
     "a pin without radius": (BODY, [PIN], {"coefficient": 0.3}, "turns: give the radius of its pin"),
     "a slide with radius": (BODY, [SLIDE], {"coefficient": 0.3, "radius": 0.1}, "slides and has no radius"),
     "a floor with radius": (BODY, [FLOOR], {"coefficient": 0.3, "radius": 0.1}, "slides and has no radius"),
-    "two coordinates": (
-        spatial.Body("a", mass=1.0, inertia=(1.0, 1.0, 1.0)),
-        [spatial.Cylindrical("joint", "ground", "a", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))],
+    "a sleeve without radius": (BODY_3D, [SLEEVE], {"coefficient": 0.3}, "turns: give the radius of its pin"),
+    "a ball joint": (
+        BODY_3D,
+        [spatial.Spherical("joint", "ground", "a", point=(0.0, 0.0, 0.0))],
         {"coefficient": 0.3},
-        "must have one coordinate, a number, as a pin or a slide has; it has",
+        "has no coordinate that is a number, as a pin or a slide has; it has",
+    ),
+    "several angles": (
+        BODY_3D,
+        [CARDAN],
+        {"coefficient": 0.3, "radius": 0.1},
+        "has several coordinates: give 'joint.angle_a' or 'joint.angle_b' as joint",
+    ),
+    "one speed of two": (
+        BODY_3D,
+        [SLEEVE],
+        {"coefficient": 0.3, "radius": 0.1, "speed": 1.0},
+        "slip has two directions, and speed must have shape (2,), got ()",
+    ),
+    "two speeds of one": (
+        BODY,
+        [SLIDE],
+        {"coefficient": 0.3, "speed": (1.0, 0.0)},
+        "slip has one direction, and speed must have shape (), got (2,)",
     ),
     "a rope": (BODY, [mb.Slack("joint", "ground", "a", length=2.0)], {"coefficient": 0.3}, "has no point at which"),
     "no such joint": (BODY, [PIN.named("other")], {"coefficient": 0.3}, "joint"),
@@ -131,6 +157,24 @@ BAD = {
         "needs the force of 'joint', which is not determined",
     ),
 }
+
+
+@pytest.mark.parametrize(
+    "joint, message",
+    [
+        ("joint.angel", "joint.angle"),
+        ("joint.displacement", "slides and has no radius"),
+        ("face.displacement", "'face.displacement' must be a number"),
+        ("floor.gap", "friction in RigidContact 'floor' is given by its name, 'floor'"),
+    ],
+)
+def test_bad_coordinates(joint, message):
+    face = spatial.Planar("face", "ground", "b", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    floor = mb.RigidContact("floor", "b", terrain=terrain.Flat())
+    rub = mb.DryFriction("rub", joint, coefficient=0.3, radius=None if "floor" in joint else 0.1)
+    with pytest.raises(ValueError, match="DryFriction 'rub'") as caught:
+        mb.Scene([BODY_3D, BODY_3D.named("b")], joints=[SLEEVE, face, floor], forces=[rub]).compile()
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -15,8 +15,9 @@ def _body_2d(name, x=0.4, y=0.9, spin=0.6):
     )
 
 
-def _body_3d(name, x=0.4, z=0.9):
-    return spatial.Body(name, mass=1.5, inertia=(0.2, 0.25, 0.3), position=(x, 0.1, z), **_MOVING_3D)
+def _body_3d(name, x=0.4, z=0.9, **moving):
+    moving = _MOVING_3D | moving
+    return spatial.Body(name, mass=1.5, inertia=(0.2, 0.25, 0.3), position=(x, 0.1, z), **moving)
 
 
 def _rub(**options):
@@ -45,6 +46,30 @@ FRICTIONS = {
         [_body_3d("a")],
         [spatial.Revolute("joint", "ground", "a", point=(0.0, 0.1, 0.5), axis=(0.0, 1.0, 0.0))],
         _rub(radius=0.05),
+    ),
+    "sleeve": (
+        [_body_3d("a"), _body_3d("b", x=1.2, velocity=(0.1, 0.4, 0.3), angular_velocity=(-0.4, 0.2, 0.5))],
+        [spatial.Cylindrical("joint", "a", "b", point=(0.8, 0.1, 0.9), axis=(0.6, 0.0, 0.8))],
+        _rub(radius=0.05, static_coefficient=0.5),
+    ),
+    "face": (
+        [_body_3d("a")],
+        [spatial.Planar("joint", "ground", "a", point=(0.0, 0.1, 0.5), axis=(0.0, 0.6, 0.8))],
+        _rub(speed=(0.3, -0.2)),
+    ),
+    "one angle of a cardan joint": (
+        [_body_3d("a"), _body_3d("b", x=1.2, velocity=(0.1, 0.4, 0.3), angular_velocity=(-0.4, 0.2, 0.5))],
+        [
+            spatial.Universal(
+                "joint", "a", "b", point=(0.8, 0.1, 0.9), axis_a_W=(1.0, 0.0, 0.0), axis_b_W=(0.0, 1.0, 0.0)
+            )
+        ],
+        mb.DryFriction("rub", "joint.angle_a", coefficient=0.3, radius=0.05),
+    ),
+    "disc on a belt": (
+        [_body_2d("a")],
+        [mb.RigidContact("joint", "a", terrain=terrain.Bump(start=0.0, length=2.0, peak=0.2), radius=0.1)],
+        _rub(speed=0.4),
     ),
     "disc on a slope": (
         [_body_2d("a")],

@@ -310,6 +310,7 @@ class Cylindrical(AbstractSliding):
     """
 
     rows: ClassVar[int] = 4
+    slides: ClassVar[tuple[str, ...]] = ("angle", "displacement")
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
@@ -445,6 +446,7 @@ class Planar(AbstractAxial):
     """
 
     rows: ClassVar[int] = 3
+    slides: ClassVar[tuple[str, ...]] = ("displacement",)
 
     def residual(self, space, poses, t):
         height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
