@@ -16,7 +16,7 @@ event by that before it is the saltation matrix: P. C. Müller, "Calculation of 
 with discontinuities", Chaos, Solitons & Fractals 5, 1995.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -49,7 +49,7 @@ from ..system.gaps import (
 from ..system.residuals import binding_velocities, velocity_rows
 from .constraints import dense, push
 from .contact_forces import contact_forces, friction_coefficients, largest_force, stick_reserve
-from .impact_event import NEAR, Phase, find_event
+from .impact_event import NEAR, Event, Phase, find_event
 
 
 class Impact(NamedTuple):
@@ -157,108 +157,146 @@ def _impact_jvp(primals, tangents):
     return (after, event), (State(dq, du, dz), devent)
 
 
-def _struck(event, at, along):
+def _struck(event: Event, at, along):
     """The derivatives of the impulses, and of the velocities after them, by those before an impact.
 
     Of `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held, and slips that end, each phase has one linear system.
     """
-    (system, t, q), (dsystem, *_, du) = at, along
-    contacts, (n, m) = contacts_of(system), counts(system)
-    free, compression = with_modes(system, q, 0.0), event.compression
-    rows = direction_gradients(system, t, q, event.u)
-    jacobian = binding_velocities(system, t, free, event.u).selected(system.velocity_rank, system.velocity_scale())
-    projector = jacobian.projector(system.inertia(t, free, event.u))
-    numbers = np.array(direction_rows(system))
-    moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
-    rebounds = ~event.low & ~np.array(contacts.by_poisson, bool)
-    of_contact, known = np.zeros(0, bool), jnp.zeros(0, q.dtype)
-    coefficient = known
-    if m:
-        of_contact = np.array(frictions_of(system).contacts) >= 0
-        coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
-        known, coefficient = coefficients(*at), push(coefficients, at, along[:3])
-
-    def of_phase(before, dbefore, after: Phase, normal):
-        """The velocities without a change of the impulses, and the equations for that, where those of contacts that are
-        not held change by `normal`.
-        """
-        _, multipliers = projector.solve(after.impulses @ rows, jacobian.product(after.u - before))
-        multipliers = multipliers.at[numbers].set(after.impulses)
-
-        def equations(system, t, q, first, u):
-            unmet = velocity_rows(system, t, q, after.u)
-            bounce = contacts_of(system).restitution * jnp.maximum(-direction_rates(system, t, q, first)[:n], 0.0)
-            bounce = jnp.where(after.held[:n] & rebounds, event.share * bounce, 0.0)
-            unmet = unmet.at[numbers[:n]].add(-bounce)
-            force = system.inertia(t, q, u).product(after.u - u)
-            return unmet, force - system.constraint_force(t, q, after.u, multipliers)
-
-        unmet, forces = push(equations, (system, t, bound(system, q), event.at, before), (*along, dbefore))
-        # Rows of modes ask for nothing.
-        plain, _ = projector.solve(-forces, jnp.where(np.isin(np.arange(unmet.size), numbers), 0.0, -unmet))
-        asked = -(unmet[numbers] + rows @ plain)
-        law = jnp.eye(n + m, dtype=q.dtype)
-        more = jnp.pad(normal, (0, m))
-        if m:
-            frictions = frictions_of(system)
-            pushed = jnp.where(of_contact, after.impulses[np.array(frictions.contacts)], 0.0)
-            more = jnp.concatenate([more[:n], -coefficient * after.slips * pushed])
-            for k in np.flatnonzero(of_contact):
-                law = law.at[n + k, frictions.contacts[k]].set(known[k] * after.slips[k])
-            rates_after = lambda system, t, q: direction_rates(system, t, q, after.u)
-            for k in frictions.pairs:
-                # The direction of slip changes with the velocity after the impact.
-                own = np.array([k, k + 1])
-                turned = push(rates_after, at, along[:3])[n + own]
-                last, speed = rates_after(*at)[n + own], norm(after.slips[own])
-                across = jnp.eye(2, dtype=q.dtype) - jnp.outer(after.slips[own], after.slips[own])
-                by = known[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
-                law = law.at[n + own].add(by @ rows[n + own] @ moves.T, unique_indices=True)
-                more = more.at[n + own].add(-by @ (turned + rows[n + own] @ plain), unique_indices=True)
-        matrix = jnp.where(after.held[:, None], rows @ moves.T, law)
-        return plain, matrix, jnp.where(after.held, asked, more)
+    (system, t, q), tangents, du = at, along[:3], along[3]
+    contacts, (n, m), compression = contacts_of(system), counts(system), event.compression
+    of = _phases(event, at, tangents, du)
 
     def solved(plain, matrix, right):
         impulses = jnp.linalg.solve(matrix, right)
-        return impulses, plain + impulses @ moves
+        return impulses, plain + impulses @ of.moves
 
     # By the share of the rebounds velocities and impulses change as well.
     at_rates = direction_rates(system, t, q, event.at)
     bounce = contacts.restitution * jnp.maximum(-at_rates[:n], 0.0)
-    bounce = jnp.pad(jnp.where(rebounds, bounce, 0.0), (0, m))
+    bounce = jnp.pad(jnp.where(of.rebounds, bounce, 0.0), (0, m))
     none = jnp.zeros(n, q.dtype)
     if compression is None:
         last = Phase(event.u, event.held, event.slips, event.impulses)
-        plain, matrix, right = of_phase(event.at, du, last, none)
+        plain, matrix, right = _equations(of, event.at, du, last, none)
         impulses, change = solved(plain, matrix, right)
         by_share = jnp.linalg.solve(matrix, jnp.where(event.held, bounce, 0.0))
     else:
-        plain, matrix, right = of_phase(event.at, du, compression, none)
+        plain, matrix, right = _equations(of, event.at, du, compression, none)
         first, between = solved(plain, matrix, right)
         first_by_share = jnp.linalg.solve(matrix, jnp.where(compression.held, bounce, 0.0))
         pushes = ~event.low & np.array(contacts.by_poisson, bool)
         again = lambda system, impulses: jnp.where(
             pushes, event.share * contacts_of(system).restitution * impulses[:n], 0.0
         )
-        normal = push(again, (system, compression.impulses), (dsystem, first))
+        normal = push(again, (system, compression.impulses), (tangents[0], first))
         last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
-        plain, matrix, right = of_phase(compression.u, between, last, normal)
+        plain, matrix, right = _equations(of, compression.u, between, last, normal)
         second, change = solved(plain, matrix, right)
         normal = contacts.restitution * (compression.impulses + event.share * first_by_share)[:n]
         normal = jnp.where(pushes, normal, 0.0)
-        closing = bounce - rows @ (first_by_share @ moves)
+        closing = bounce - of.rows @ (first_by_share @ of.moves)
         right = jnp.where(event.held, closing, jnp.pad(normal, (0, m)))
         impulses, by_share = first + second, first_by_share + jnp.linalg.solve(matrix, right)
 
     # The share is that at which no energy is gained.
     both = at_rates + direction_rates(system, t, q, event.u)
     changed = push(direction_rates, (*at, event.at), along)
-    changed = changed + push(direction_rates, (*at, event.u), (*along[:3], change))
+    changed = changed + push(direction_rates, (*at, event.u), (*tangents, change))
     gained = jnp.dot(impulses, both) + jnp.dot(event.impulses, changed)
-    slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, rows @ (by_share @ moves))
+    slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, of.rows @ (by_share @ of.moves))
     less = event.share < 1
     less = jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * by_share
-    return impulses + less, change + less @ moves
+    return impulses + less, change + less @ of.moves
+
+
+class _Phases(NamedTuple):
+    """What the linear equations of the phases of an impact have in common.
+
+    **Fields:** system, t and q `at` the `event`, their `tangents`, and that of the velocities before it, `du`; the
+    `rows` of A of contacts and friction, the `jacobian` of the other constraints with its `projector`, and the changes
+    of velocities, `moves`, by unit impulses; contacts whose rebound is asked for by Newton's law; the `coefficients` of
+    friction and their derivatives.
+    """
+
+    event: Event
+    at: Any
+    tangents: Any
+    du: Float[Array, "nu"]
+    rows: Float[Array, "laws nu"]
+    jacobian: Any
+    projector: Any
+    moves: Float[Array, "laws nu"]
+    rebounds: Bool[Array, "contacts"]
+    coefficients: tuple[Float[Array, "frictions"], Float[Array, "frictions"]]
+
+
+def _phases(event: Event, at, tangents, du) -> _Phases:
+    system, t, q = at
+    free = with_modes(system, q, 0.0)
+    rows = direction_gradients(system, t, q, event.u)
+    jacobian = binding_velocities(system, t, free, event.u).selected(system.velocity_rank, system.velocity_scale())
+    projector = jacobian.projector(system.inertia(t, free, event.u))
+    moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
+    rebounds = ~event.low & ~np.array(contacts_of(system).by_poisson, bool)
+    known = change = jnp.zeros(0, q.dtype)
+    if counts(system)[1]:
+        coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
+        known, change = coefficients(*at), push(coefficients, at, tangents)
+    return _Phases(event, at, tangents, du, rows, jacobian, projector, moves, rebounds, (known, change))
+
+
+def _equations(of: _Phases, before, dbefore, phase: Phase, normal):
+    """The velocities at the end of a phase without a change of its impulses, and the linear equations for that change.
+
+    **Arguments:** the velocities `before` the phase, and their derivative; the changes of the impulses along the
+    `normal` of contacts that are not held.
+    """
+    event, (system, t, q), numbers = of.event, of.at, np.array(direction_rows(of.at[0]))
+    n, m = counts(system)
+    _, multipliers = of.projector.solve(phase.impulses @ of.rows, of.jacobian.product(phase.u - before))
+    multipliers = multipliers.at[numbers].set(phase.impulses)
+
+    def unmet(system, t, q, first, u):
+        """What is left of the rates, and of the balance of momentum."""
+        rates = velocity_rows(system, t, q, phase.u)
+        bounce = contacts_of(system).restitution * jnp.maximum(-direction_rates(system, t, q, first)[:n], 0.0)
+        bounce = jnp.where(phase.held[:n] & of.rebounds, event.share * bounce, 0.0)
+        rates = rates.at[numbers[:n]].add(-bounce)
+        momentum = system.inertia(t, q, u).product(phase.u - u)
+        return rates, momentum - system.constraint_force(t, q, phase.u, multipliers)
+
+    point = system, t, bound(system, q), event.at, before
+    rates, forces = push(unmet, point, (*of.tangents, of.du, dbefore))
+    # Rows of modes ask for nothing.
+    plain, _ = of.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), numbers), 0.0, -rates))
+    asked = -(rates[numbers] + of.rows @ plain)
+    law, right = jnp.eye(n + m, dtype=q.dtype), jnp.pad(normal, (0, m))
+    if m:
+        law, right = _friction_laws(of, plain, phase, law, right)
+    matrix = jnp.where(phase.held[:, None], of.rows @ of.moves.T, law)
+    return plain, matrix, jnp.where(phase.held, asked, right)
+
+
+def _friction_laws(of: _Phases, plain, phase: Phase, law, right):
+    """The equations with those of friction that slips, whose impulses are in proportion to those of the contacts."""
+    (system, *_), frictions = of.at, frictions_of(of.at[0])
+    n, of_contact = counts(system)[0], np.array(frictions.contacts) >= 0
+    known, change = of.coefficients
+    pushed = jnp.where(of_contact, phase.impulses[np.array(frictions.contacts)], 0.0)
+    right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
+    for k in np.flatnonzero(of_contact):
+        law = law.at[n + k, frictions.contacts[k]].set(known[k] * phase.slips[k])
+    rates = lambda system, t, q: direction_rates(system, t, q, phase.u)
+    for k in frictions.pairs:
+        # The direction of slip changes with the velocity after the impact.
+        own = np.array([k, k + 1])
+        turned = push(rates, of.at, of.tangents)[n + own]
+        last, speed = rates(*of.at)[n + own], norm(phase.slips[own])
+        across = jnp.eye(2, dtype=law.dtype) - jnp.outer(phase.slips[own], phase.slips[own])
+        by = known[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
+        law = law.at[n + own].add(by @ of.rows[n + own] @ of.moves.T, unique_indices=True)
+        right = right.at[n + own].add(-by @ (turned + of.rows[n + own] @ plain), unique_indices=True)
+    return law, right
 
 
 def _release(system, formulation, touch, event, at, along):
