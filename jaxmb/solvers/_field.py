@@ -90,14 +90,20 @@ def linearized(
     **Returns:** the changes by the tangents of the field and of time, and the change as a linear function of that of
     `still`.
     """
-    t, (values, structure) = equation.t, eqx.partition(equation.field, eqx.is_inexact_array)
+    t, none = equation.t, lambda x: x is None
+    values, rest = eqx.partition(equation.field, jax.tree.map(lambda d: d is not None, along.field, is_leaf=none))
 
     def at(values, t, change):
-        (state, rate), push, _ = jax.linearize(eqx.combine(values, structure), t, place(change), has_aux=True)
+        (state, rate), push, _ = jax.linearize(eqx.combine(values, rest), t, place(change), has_aux=True)
         return state, rate, push(jnp.ones_like(t), f)[1]
 
-    _, push = jax.linearize(at, values, t, still)
-    none = lambda x: x is None
-    dvalues = jax.tree.map(lambda v, d: None if v is None else filled(d, v), values, along.field, is_leaf=none)
-    zeros = jax.tree.map(jnp.zeros_like, (values, t))
-    return push(dvalues, filled(along.t, t), jnp.zeros_like(still)), lambda change: push(*zeros, change)
+    out, push = jax.linearize(at, values, t, still)
+    zeros = jax.tree.map(jnp.zeros_like, (values, t, still))
+
+    def pushed(*tangents):
+        # As a derivative of the linear function, which leaves out what has no tangent.
+        moved = eqx.filter_jvp(push, zeros, tangents)[1]
+        return jax.tree.map(filled, moved, out, is_leaf=none)
+
+    still_values = jax.tree.map(lambda _: None, values)
+    return pushed(along.field, along.t, None), lambda change: pushed(still_values, None, change)

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -15,14 +15,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ._damping import is_resolved
 from ._dense import DenseLinearization
 from ._field import derivatives
-from ._formulas import FAMILIES, double, formulas, start
+from ._formulas import FAMILIES, Formulas, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._neighbours import a_stable, damped_growth, ladder, responses
 from ._newton import AbstractLinearization, Newton, Solved, StepEquation
-from ._structured import unknown_structure
+from ._structured import structured, unknown_structure
 from .controller import ControllerState, states_inside
 from .evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
+from .hermite_steps import HermiteSteps
 from .manifold_term import Chart
 from .multistep import AbstractAttempt, AbstractMultistep, AbstractMultistepState, tolerances_of
 from .order import LOWER, choose_order, growth_factors
@@ -93,6 +94,19 @@ class _Step(AbstractAttempt):
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
         return self.history.differences, self.slope
+
+
+class _Begun(NamedTuple):
+    """A step before its equation is solved: the `equation`, the `end` in time, the `unit` of the values that formulas
+    integrate, the `coefficients`, the `partial_sums` of the history at the end, and the `predicted` state and rate.
+    """
+
+    equation: StepEquation
+    end: Any
+    unit: Any
+    coefficients: Formulas
+    partial_sums: Float[Array, "length m"]
+    predicted: tuple[Float[Array, " n"], Float[Array, " n"]]
 
 
 class Hermite(AbstractMultistep):
@@ -245,6 +259,30 @@ class Hermite(AbstractMultistep):
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
 
     def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
+        begun = self._begun(terms, t1, before, like, args, state)
+        scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
+        latest = before, state.slope[-before.size :]
+        equation, scale, predicted, latest, matrix = freeze(
+            (begun.equation, scale, begun.predicted, latest, state.matrix)
+        )
+        size = lambda correction: self.weighted_norm(correction, scale, like)
+        return self._completed(begun, state, Newton(equation, size, _NEWTON).solve(predicted, latest, matrix))
+
+    def attempt_to(self, terms, t1, before, like, args, state: HermiteState, after: Float[Array, " n"]) -> _Step:
+        """The numbers of a step that ends in a known state, for which nothing is solved; of the solver's state the
+        `matrix` is not needed.
+        """
+        begun = self._begun(terms, t1, before, like, args, state)
+        equation, after = freeze((begun.equation, after))
+        known = structured(equation.jacobian, after)
+        matrix, inverses = DenseLinearization.unknown(after, equation.free), None
+        if known is not None:
+            matrix, inverses = known, known.inverses(equation)
+        end, none = derivatives(equation.field, t1, after), jnp.zeros(2, np.int32)
+        return self._completed(begun, state, Solved(end, jnp.array(True), matrix, inverses, none))
+
+    def _begun(self, terms, t1, before, like, args, state: HermiteState) -> _Begun:
+        """A step before its equation is solved."""
         family, history, k = FAMILIES[self.family], state.history, state.order_index
         n, dtype = before.size, before.dtype
         nodes = family.multiplicity * k
@@ -269,33 +307,47 @@ class Hermite(AbstractMultistep):
         a, b = h * coefficients.slope[nodes], h**2 * coefficients.curvature[nodes]
         field = field_of(terms, t1, like, state.chart, args)
         free = free_components(terms, before, state.chart)
-        scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
-        latest = before, state.slope[-n:]
         equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, h, past, a, b, free)
-        frozen, scale, predicted, latest, matrix = freeze((equation, scale, predicted, latest, state.matrix))
-        size = lambda correction: self.weighted_norm(correction, scale, like)
-        newton = Newton(frozen, size, _NEWTON).solve(predicted, latest, matrix)
+        return _Begun(equation, end, unit, coefficients, partial_sums, predicted)
+
+    def _completed(self, begun: _Begun, state: HermiteState, newton: Solved) -> _Step:
+        """A step whose equation is solved."""
+        family, history, equation = FAMILIES[self.family], state.history, begun.equation
+        coefficients, h, n = begun.coefficients, equation.h, equation.past.size
         y, f, g = newton.matrix.differentiable(newton.inverses, equation, newton.end[:3])
         chart, broke = newton.end.rest
 
         ends = coefficients.past @ history.differences[:, :n]
         ends = (
-            unit * ends
+            begun.unit * ends
             + (h * coefficients.slope)[:, None] * f[None]
             + (h**2 * coefficients.curvature)[:, None] * g[None]
         )
         z, slope = self._recorded(y, f, g)
-        advanced = advance(history, end, z, partial_sums)
+        advanced = advance(history, begun.end, z, begun.partial_sums)
         doubled = double(advanced, slope)
         history = doubled if family.multiplicity == 2 else advanced
-        return _Step(y, history, slope, ends, doubled, past + a * f + b * g - y, chart, broke, newton)
+        mismatch = equation.past + equation.a * f + equation.b * g - y
+        return _Step(y, history, slope, ends, doubled, mismatch, chart, broke, newton)
+
+    def dense_info(self, step: _Step, like: Any, order_index: Int[Array, ""]) -> dict[str, Any]:
+        """The dense output of a step of an order."""
+        family, n = FAMILIES[self.family], step.after.size
+        used = (np.arange(family.length, dtype=np.int32) < family.multiplicity * order_index + 2)[:, None]
+        return {
+            "y1": unravel_like(like, step.after),
+            "differences": jnp.where(used, step.doubled.differences[:, :n], jnp.zeros((), step.after.dtype)),
+            "mesh": step.doubled.mesh,
+            "mismatch": step.mismatch,
+        }
+
+    def linear_steps(self, jumps):
+        return HermiteSteps(jumps)
 
     def advance(self, terms, t1, y0, args, state: HermiteState):
         family, history, k = FAMILIES[self.family], state.history, state.order_index
         before = ravel(y0)
-        n, dtype = before.size, before.dtype
-        nodes = family.multiplicity * k
-        index = np.arange(family.length, dtype=np.int32)
+        dtype = before.dtype
         h = (step_end(history.mesh, t1) - history.mesh[0]).astype(dtype)
         free = free_components(terms, before, state.chart)
         scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
@@ -352,14 +404,7 @@ class Hermite(AbstractMultistep):
             sizes=self.grown_sizes(state.sizes, step.after),
             tangents=tangents,
         )
-        used = (index < nodes + 2)[:, None]
-        dense_info = {
-            "y1": y1,
-            "differences": jnp.where(used, step.doubled.differences[:, :n], jnp.zeros((), dtype)),
-            "mesh": step.doubled.mesh,
-            "mismatch": step.mismatch,
-        }
-        return y1, estimate, dense_info, new_state, failed
+        return y1, estimate, self.dense_info(step, y0, k), new_state, failed
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.

@@ -136,12 +136,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         solver_state: Any,
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | Crossing | None, dict[str, Any], Any, diffrax.RESULTS]:
-        def restart():
-            after = after_jump(terms, t0, y0, args)
-            chart = chart_after_jump(terms, solver_state.chart)
-            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
-
-        y0, state = _restart_after(made_jump, restart, (y0, solver_state))
+        y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
         chart = chart_after_step(terms, t1, y1, state.chart, args)
         state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
@@ -157,6 +152,20 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
         return y1, estimate, dense_info, state, result
+
+    def restarted(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
+        """The state, and that of the solver, restarted after a jump and otherwise unchanged."""
+        if made_jump is False:
+            return y0, solver_state
+
+        def restarted():
+            after = after_jump(terms, t0, y0, args)
+            chart = chart_after_jump(terms, solver_state.chart)
+            restart = after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
+            return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart, (y0, solver_state))
+
+        # In a batch the restart is evaluated if any member has made a jump.
+        return lax.cond(any_of_batch(made_jump), restarted, lambda: (y0, solver_state))
 
     def linear_steps(self, jumps: bool) -> AbstractSteps | None:
         """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.
@@ -291,15 +300,3 @@ def tolerances_of(
     if rtol is None:
         return from_controller(Tolerances)
     return Tolerances(rtol, atol, MultistepNorm(norm), fixed=True)
-
-
-def _restart_after(made_jump: Any, restart: Callable[[], PyTree], state: PyTree) -> PyTree:
-    """The state, and that of the solver, restarted after a jump and otherwise unchanged."""
-    if made_jump is False:
-        return state
-
-    def restarted():
-        return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart(), state)
-
-    # In a batch the restart is evaluated if any member has made a jump.
-    return lax.cond(any_of_batch(made_jump), restarted, lambda: state)

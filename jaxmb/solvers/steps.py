@@ -97,3 +97,12 @@ class AbstractSteps(eqx.Module):
         """The tangent of a row, from those of the state and the memory before and after its step; None for numbers that
         have none.
         """
+
+
+def refuse_moving_jumps(moved: Moving, solver: Any) -> None:
+    """Raise a `ValueError` for derivatives by the times of jumps."""
+    if moved.jumps is not None:
+        raise ValueError(
+            "Derivatives by the times of jumps are known to jaxmb.solvers.Adams only, got "
+            f"{type(solver).__name__}: use that, or stop_gradient for the times."
+        )

@@ -13,7 +13,7 @@ from .controller import MultistepController
 from .evaluation import freeze, ravel, unravel_like
 from .multistep import AbstractMultistep
 from .one_step import OneStepController, WithTangents
-from .steps import AbstractSteps, LinearStep
+from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
 
 
 class WholeSteps(AbstractSteps):
@@ -57,11 +57,7 @@ class WholeSteps(AbstractSteps):
     def linearised(self, of, moved, like, row):
         t0, t1, y0, state, jump = row
         *_, solver = of(moved.terms)
-        if moved.jumps is not None:
-            raise ValueError(
-                "Derivatives by the times of jumps are known to jaxmb.solvers.Adams only, got "
-                f"{type(solver).__name__}: use that, or stop_gradient for the times."
-            )
+        refuse_moving_jumps(moved, solver)
 
         def step(moved, flat, memory):
             terms, args, solver = of(moved.terms)
