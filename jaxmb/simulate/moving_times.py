@@ -4,6 +4,9 @@ The mesh of a run has no derivatives. Where a time moves, the states that belong
 solution, with coefficients from the field there: its first two terms, so that second derivatives are right as well.
 """
 
+import contextlib
+import contextvars
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -14,15 +17,22 @@ from jax import lax
 
 from ..linalg.arrays import is_traced
 
-
-def is_moving(options: dict[str, Any]) -> tuple[bool, bool]:
-    """Whether the start, and the end or a saved time, of a run with options of `diffeqsolve` may have derivatives."""
-    saved = [sub.ts for sub in jax.tree.leaves(options["saveat"].subs, is_leaf=_is_series)]
-    return is_traced(options["t0"]), is_traced((options["t1"], saved))
+_FROZEN = contextvars.ContextVar("frozen", default=False)
 
 
-def _is_series(x):
-    return isinstance(x, diffrax.SubSaveAt)
+@contextlib.contextmanager
+def frozen_times() -> Iterator[None]:
+    """Nothing is differentiated by the times of runs that begin here, though JAX may trace them."""
+    token = _FROZEN.set(True)
+    try:
+        yield
+    finally:
+        _FROZEN.reset(token)
+
+
+def may_move(times: Any) -> bool:
+    """Whether some times of a run may have derivatives."""
+    return is_traced(times) and not _FROZEN.get()
 
 
 @eqx.filter_custom_jvp

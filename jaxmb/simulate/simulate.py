@@ -41,6 +41,7 @@ from .arguments import (
     with_end,
 )
 from .compiling import told_of_compiling
+from .moving_times import may_move
 from .outcome import message_of_failure, warn_of_jumps, warn_of_stiffness
 from .solve import Problem, made_precise, solved
 
@@ -230,7 +231,8 @@ def simulate(
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
-        moving=(is_traced(times["t0"]), is_traced((times["t1"], first.ts))),
+        # As they were given: under a trace the times of a SaveAt that is made here are traced as well.
+        moving=(may_move(times["t0"]), may_move((times["t1"], saveat))),
     )
     problem.check_impulses()
 

@@ -1,6 +1,7 @@
 """Consistency of a state with the constraints of its system, before a motion starts from it."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -8,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._compat import partial_eval
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.jitted import jitted
-from ..system import AbstractSystem
+from ..system import AbstractSystem, parameters, with_parameters
 from ..system.gaps import contacts_of, gaps
 from ..system.residuals import row_sizes, violations
 
@@ -53,6 +55,19 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
         names = listed(system, velocities, system.velocity_residual(t, state.q, state.u))
         raise ValueError(f"The velocities of the state violate the constraints {names} {cure}")
     return state
+
+
+def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: Iterable[str]) -> bool:
+    """Whether constraints depend on some of these parameters, whatever their values are."""
+    start = parameters(system)
+
+    def rows(values):
+        changed = with_parameters(system, values)
+        return changed.position_residual(t, state.q), changed.velocity_residual(t, state.q, state.u)
+
+    program = jax.make_jaxpr(rows)({name: start[name] for name in names}).jaxpr
+    _, used = partial_eval.dce_jaxpr(program, [True] * len(program.outvars))
+    return any(used)
 
 
 def contradiction(system: AbstractSystem, t: Any, state: State) -> str:

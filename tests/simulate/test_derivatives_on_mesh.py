@@ -13,6 +13,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import parts, planar
+from jaxmb.simulate import solve
 from jaxmb.solvers import Hermite, MeshAdjoint
 
 SYSTEM = mb.Scene(
@@ -183,6 +184,22 @@ def test_derivatives_by_all_times():
     loss = lambda motion: lambda x: jnp.sum(jnp.sin(motion(x)))
     hessian = jax.jit(jax.hessian(loss(motion)))(x)
     np.testing.assert_allclose(hessian, jax.hessian(loss(closed))(x), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_times_that_are_numbers_have_no_derivatives_to_compile(moves, monkeypatch):
+    """Also under `jit`, where JAX traces what is made of them."""
+    found = []
+    monkeypatch.setattr(solve, "at_moving_times", lambda term, ts, ys: found.append(ts) or ys)
+    system = mb.Scene([planar.Body("body", mass=2.0, inertia=1.0)], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+    def end(x):
+        changed = mb.with_parameters(system, {"body.mass": x})
+        saveat = [0.5 * x, 1.0] if moves else [0.5, 1.0]
+        return jnp.sum(mb.simulate(changed, system.guess, t1=1.0, saveat=saveat).ys.q)
+
+    jax.jit(end).trace(2.0)
+    assert bool(found) == moves
 
 
 def test_the_time_of_an_impulse_has_a_derivative():

@@ -1,5 +1,6 @@
 """One measured motion: what was measured, from which initial state, and what was different from other ones."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
 from ...parts.names import unknown
 from ...simulate import simulate
+from ...simulate.moving_times import frozen_times
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory
@@ -87,12 +89,13 @@ class ExperimentModel(eqx.Module):
     """An experiment as a function of its unknowns, which are called without the experiment's name.
 
     **Fields:** `unknowns`: their names and shapes; `changed`: which of them are parameters of the system; `initial`:
-    which are of the initial state.
+    which are of the initial state; `assembled`: whether the initial state is `state`, whatever they are.
     """
 
     unknowns: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
     changed: tuple[str, ...] = eqx.field(static=True)
     initial: tuple[tuple[str, Initial], ...] = eqx.field(static=True)
+    assembled: bool = eqx.field(static=True)
     channels: tuple[Channel, ...]
     residual: Callable[[Trajectory], Array] | None
     loss: Loss = eqx.field(static=True)
@@ -122,6 +125,8 @@ class ExperimentModel(eqx.Module):
     def start(self, system: AbstractSystem, theta: Mapping[str, Array]) -> tuple[AbstractSystem, State]:
         """The system with these unknowns, and its initial state; NaN if there is none."""
         system = self.changed_system(system, theta)
+        if self.assembled:
+            return system, self.state
         fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
         rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
         return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=False)
@@ -135,7 +140,9 @@ class ExperimentModel(eqx.Module):
     ) -> Trajectory:
         """The motion from an initial state."""
         own = {} if self.inputs is None else {"inputs": self.inputs}
-        return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | own))
+        moves = any(channel.delayed for channel in self.channels)
+        with contextlib.nullcontext() if moves else frozen_times():
+            return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | own))
 
     def seen(
         self,

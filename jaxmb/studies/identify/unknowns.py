@@ -13,6 +13,7 @@ from ..._arguments import check_kind
 from ..._types import VectorLike
 from ...parts.names import unknown
 from ...states.assembly import assemble
+from ...states.consistency import constraints_depend_on
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.design import design_bounds
 from ..ranges import Bounds, FreeParameters, range_of
@@ -224,8 +225,9 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
         full if (full := f"{name}_rate") in known_rates else name: x for name, x in arrays(experiment.rates).items()
     }
     initial = tuple((f"initial.{name}", initial_unknown(system, name)) for name in experiment.free_initial)
+    same = with_parameters(system, known)
     if initial:
-        state = assemble(with_parameters(system, known), guess, fix=fix, rates=rates, t=experiment.t0)
+        state = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0)
         sizes = system.coordinate_scale(), system.velocity_scale()
         for (name, what), chosen in zip(initial, experiment.free_initial.values(), strict=True):
             index = (known_rates if what.is_rate else system.coordinate_names())[what.name]
@@ -233,6 +235,12 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
             vector, size = (state.u, sizes[1]) if what.is_rate else (state.q, sizes[0])
             start = start_of(name, vector[index] if chosen is None else chosen)
             unknown_here[name] = label(name), _Unknown(start, vector[index], False, size[index])
+    # Coordinates of joints have parameters of their own.
+    of_bodies = fix.keys() <= system.coordinate_names().keys() and rates.keys() <= known_rates.keys()
+    assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
+    if assembled:
+        # What is the same for all values is found, and differentiated, once.
+        guess = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0, throw=False)
     if not experiment.held_out:
         for source, what in unknown_here.values():
             first = found.setdefault(source, what)
@@ -241,6 +249,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
         unknowns=tuple((name, np.shape(what.like)) for name, (_, what) in unknown_here.items()),
         changed=tuple(changed),
         initial=initial,
+        assembled=assembled,
         channels=channels,
         residual=experiment.residual,
         loss=loss,

@@ -16,6 +16,7 @@ from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
 from jaxmb.studies.identify.covariance import covariance
 from jaxmb.studies.identify.loss import LOSSES
+from jaxmb.studies.identify.unknowns import unknowns
 from jaxmb.studies.minimise import Linearised, levenberg_marquardt
 
 TS = jnp.linspace(0.0, 1.0, 31)[1:]
@@ -33,6 +34,29 @@ def system():
 @pytest.fixture(scope="module")
 def motion(system):
     return mb.simulate(system, mb.assemble(system), t1=TS[-1], saveat=TS)
+
+
+@pytest.mark.parametrize(
+    "free, given, assembled",
+    [
+        (("rod.mass", "spring.stiffness"), {}, True),
+        (("rod.mass",), {"fix": {"rod.angle": 0.3}, "rates": {"rod.angle": 1.0}}, True),
+        (("rod.mass",), {"fix": {"pin.angle": 0.3}}, False),
+        (("rod.mass",), {"free_initial": ["rod.angle"]}, False),
+        (("rod.mass", "pin.point_b"), {}, False),
+    ],
+)
+def test_an_initial_state_that_no_unknown_moves_is_assembled_once(system, free, given, assembled):
+    experiment = mb.Experiment(ts=[1.0], residual=lambda trajectory: trajectory.ts, **given)
+    found = unknowns(system, {"": experiment}, {}, free, None, None, None, LOSSES["linear"])
+    (trial,) = found.trials
+    assert trial.assembled == assembled
+    theta = {name: 1.1 * mb.parameters(system)[name] for name in free} | {"initial.rod.angle": jnp.asarray(0.2)}
+    changed, state = trial.start(system, theta)
+    fix = given.get("fix", {}) | ({"rod.angle": 0.2} if "free_initial" in given else {})
+    exact = mb.assemble(changed, fix=fix, rates=given.get("rates"))
+    np.testing.assert_allclose(state.q, exact.q, atol=1e-12)
+    np.testing.assert_allclose(state.u, exact.u, atol=1e-12)
 
 
 def noisy(motion, seed):
