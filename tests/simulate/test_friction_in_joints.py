@@ -140,3 +140,24 @@ def test_stick_and_slip_on_a_belt_that_is_no_body(on):
     rubs = [event for event in motion.events if event.part == "rub"]
     assert [event.kind for event in rubs][-9:] == ["slip", "stick"] * 4 + ["slip"]
     np.testing.assert_allclose([event.time for event in rubs][-9::2], first + period * np.arange(5.0), rtol=1e-10)
+
+
+def test_derivatives_by_the_speed_of_a_belt():
+    """A block at rest is taken along until it is as fast as the belt."""
+    slide = planar.Prismatic("slide", "ground", "block", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    rub = mb.DryFriction("rub", "slide", coefficient=COEFFICIENT, speed=SPEED)
+    block = planar.Body("block", mass=MASS, inertia=0.1)
+    system = mb.Scene([block], joints=[slide], forces=[mb.Gravity((0.0, -G)), rub]).compile()
+    state = mb.assemble(system)
+
+    def place(p):
+        changed = mb.with_parameters(system, {"rub.speed": p[0], "rub.coefficient": p[1]})
+        return mb.simulate(changed, state, t1=1.0, saveat=[1.0], rtol=1e-10)["block"].position[0, 0]
+
+    p = jnp.array([SPEED, COEFFICIENT])
+    exact = lambda p: p[0] - p[0] ** 2 / (2 * p[1] * G)
+    value, slope = jit_quickly(jax.value_and_grad(place))(p)
+    np.testing.assert_allclose(value, exact(p), rtol=1e-9)
+    np.testing.assert_allclose(slope, jax.grad(exact)(p), rtol=1e-8)
+    forward = jit_quickly(lambda p: jax.jvp(place, (p,), (jnp.array([0.3, -0.2]),))[1])(p)
+    np.testing.assert_allclose(forward, slope @ np.array([0.3, -0.2]), rtol=1e-11)
