@@ -253,7 +253,8 @@ class ConstraintGroup(AbstractConstraintGroup):
 
         def single(at, x, moves):
             def along_one(body):
-                residual = lambda own: self._residual(at, t, x.at[body].set(own))
+                # The residuals themselves are the same for every body, and computed once.
+                residual = lambda own: self._residual(at, t, jnp.stack([*x[:body], own, *x[body + 1 :]]))
                 push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
                 return jax.vmap(push, out_axes=-1)(moves[body])
 

@@ -11,6 +11,7 @@ rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p)), rotations.n
 omega = jnp.array([0.0, 0.0, 2.0])
 rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
 rotations.rotate_2d(np.pi / 2, x[:2]), rotations.norm(rotations.cross(x, omega))  # (0, 1), and 2.
+rotations.dot(x, rotations.turned(R, x))  # 0.
 # The moment of a potential V(p) or V(R), in the body frame, is minus the gradient, pulled back.
 V = lambda R: 9.81 * R[2, 0]
 rotations.pull_back_matrix(R, jax.grad(V)(R)), rotations.matrix_rates(R, omega)
@@ -103,6 +104,11 @@ def turned_back(matrix: Float[Array, "3 3"], v_W: Float[Array, "3"]) -> Float[Ar
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     """Vector product."""
     return _CROSS(a, b)
+
+
+def dot(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+    """Scalar product, as a sum that XLA fuses with its terms."""
+    return (a * b).sum()
 
 
 def conjugate(p: Float[Array, "4"]) -> Float[Array, "4"]:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...linalg import rotations as rot
-from ...linalg.arrays import namespace
+from ...linalg.arrays import add_up, namespace
+from ...linalg.roots import reciprocal_root
 
 Vector3 = Float[Array, "3"]
 
@@ -25,7 +26,7 @@ def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     xp = namespace(axis)
     k = xp.argmin(abs(axis if xp is np else jax.lax.stop_gradient(axis)))
     u = rot.cross((np.arange(3) == k).astype(axis.dtype), axis)
-    u = u / xp.sqrt((u * u).sum())
+    u = u * reciprocal_root((u * u).sum())
     return xp.stack([u, rot.cross(axis, u)])
 
 
@@ -52,19 +53,21 @@ def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array,
     turn away, where its length is two.
     """
     xp = namespace(sine, cosine)
-    square = xp.sum(sine * sine) + cosine * cosine
+    square = add_up([*(s * s for s in sine), cosine * cosine])
     defined = square > 0
-    size = xp.sqrt(xp.where(defined, square, 1.0))
+    square = xp.where(defined, square, 1.0)
+    scale = reciprocal_root(square)
+    size = square * scale
     opposite = size + cosine < _OPPOSITE * size
     half = xp.where(opposite, size, size + cosine)
     # Near half a turn the direction of the sine is undetermined, and any one leads back.
-    away = 2.0 * (np.arange(sine.shape[0]) == 0) - sine / size
-    return xp.where(defined, xp.where(opposite, away, sine * xp.sqrt(2.0 / (size * half))), 0.0)
+    away = 2.0 * (np.arange(sine.shape[0]) == 0) - sine * scale
+    return xp.where(defined, xp.where(opposite, away, sine * reciprocal_root(0.5 * size * half)), 0.0)
 
 
 def displacement_along(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:
     """The component of `d` along `axis_a` [m]."""
-    return jax.numpy.dot(part.axis_a, offset_in_a(space, part, poses))
+    return rot.dot(part.axis_a, offset_in_a(space, part, poses))
 
 
 def relative_orientation(poses: Float[Array, "k p"]) -> Float[Array, "4"]:
@@ -85,7 +88,7 @@ def cosine_sine(space, part, poses: Float[Array, "k p"]) -> tuple[Float[Array, "
     """
     x = direction_in_a(space, poses, part.x_b)
     y_a = rot.cross(part.axis_a, part.x_a)
-    return rot.cross(y_a, part.axis_a) @ x, y_a @ x
+    return rot.dot(rot.cross(y_a, part.axis_a), x), rot.dot(y_a, x)
 
 
 def angle(space, part, poses: Float[Array, "k p"]) -> Float[Array, ""]:

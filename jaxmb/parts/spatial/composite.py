@@ -168,7 +168,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
         if len(hinges) == 2:
             # Turns about either axis leave the angle between them as it is.
             first, last = hinges
-            change = jnp.dot(first, self._after_turn(space, poses, last) - last)
+            change = rot.dot(first, self._after_turn(space, poses, last) - last)
             return (change / rot.norm(rot.cross(first, last)))[None]
         vector = 2.0 * self._turn(poses)[1:]
         return across(hinges[0], vector) if hinges else vector
@@ -189,9 +189,9 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     def _second_angle(self, first, second, last, end):
         """The second of three angles, which alone changes the angle between the first and the last axis."""
-        aside, flat = jnp.dot(first, second) * jnp.dot(second, last), flat_angle(first, second, last)
-        cosine = jnp.dot(first, end) - aside
-        square = (1 - jnp.dot(first, second) ** 2) * (1 - jnp.dot(second, last) ** 2) - cosine**2
+        aside, flat = rot.dot(first, second) * rot.dot(second, last), flat_angle(first, second, last)
+        cosine = rot.dot(first, end) - aside
+        square = (1 - rot.dot(first, second) ** 2) * (1 - rot.dot(second, last) ** 2) - cosine**2
         side = lax.stop_gradient(jnp.where(jnp.sin(self.middle - flat) > 0, 1.0, -1.0))
         return self.middle + shortest(flat + side * jnp.arctan2(jnp.sqrt(square), cosine) - self.middle)
 
@@ -251,9 +251,8 @@ def flat_angle(first: Vector3, second: Vector3, last: Vector3) -> Float[Array, "
     """The angle [rad] about the second of three axes that brings the last into one plane with the others, on the side
     of the first.
     """
-    xp, dot = namespace(first, second, last), lambda a, b: (a * b).sum()
-    away = dot(first, last) - dot(first, second) * dot(second, last)
-    return xp.arctan2(dot(first, rot.cross(second, last)), away)
+    away = rot.dot(first, last) - rot.dot(first, second) * rot.dot(second, last)
+    return namespace(first, second, last).arctan2(rot.dot(first, rot.cross(second, last)), away)
 
 
 def _turned(axis, angle, v):
@@ -264,18 +263,18 @@ def _turned(axis, angle, v):
 
 def _angle_about(axis, turn):
     """The angle [rad] of a turn about an axis, in (−π, π]."""
-    cosine, sine = turn[0], jnp.dot(axis, turn[1:])
+    cosine, sine = turn[0], rot.dot(axis, turn[1:])
     return jnp.arctan2(2 * cosine * sine, cosine**2 - sine**2)
 
 
 def _angle_between(axis, start, end):
     """The angle [rad] about an axis from one direction to another that makes the same angle with it, in (−π, π]."""
     aside = rot.cross(axis, start)
-    return jnp.arctan2(jnp.dot(aside, end), jnp.dot(aside, rot.cross(axis, end)))
+    return jnp.arctan2(rot.dot(aside, end), rot.dot(aside, rot.cross(axis, end)))
 
 
 def _components(ways, vector):
     """The components of a vector along three directions."""
     a, b, c = ways
     normals = [rot.cross(b, c), rot.cross(c, a), rot.cross(a, b)]
-    return jnp.stack([jnp.dot(normal, vector) for normal in normals]) / jnp.dot(a, normals[0])
+    return jnp.stack([rot.dot(normal, vector) for normal in normals]) / rot.dot(a, normals[0])

@@ -20,7 +20,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import conjugate, cross, multiply, rotate, unrotate
+from ...linalg.rotations import conjugate, cross, dot, multiply, rotate, unrotate
 from .. import fields
 from ..base import AbstractJoint, AbstractSpatialPart
 from ..shapes import ball, pin, sleeve
@@ -44,7 +44,7 @@ from .axes import (
 
 def _parallel(space, part, poses):
     b = direction_in_a(space, poses, part.axis_b)
-    return half_sine(across(part.axis_a, b), jnp.dot(part.axis_a, b))
+    return half_sine(across(part.axis_a, b), dot(part.axis_a, b))
 
 
 class AbstractOriented(AbstractSpatialPart, AbstractJoint):
@@ -188,7 +188,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
                 )
 
     def residual(self, space, poses, t):
-        cosine = jnp.dot(self.axis_a, direction_in_a(space, poses, self.axis_b))
+        cosine = dot(self.axis_a, direction_in_a(space, poses, self.axis_b))
         return jnp.concatenate([separation(space, self, poses), cosine[None]])
 
     def complete(self, space, poses):
@@ -259,7 +259,7 @@ class Gimbal(AbstractOriented):
         moved = jnp.stack([rotate(turned, own) for own in triad], axis=1)
         c = jnp.sum(triad[:, :, None] * moved[None], axis=1)
         # With a left-handed triad the turns about its axes, and so all sines, have the other sign.
-        hand = jnp.where(jnp.dot(cross(self.axis_1, self.axis_2), self.axis_3) > 0, 1.0, -1.0)
+        hand = jnp.where(dot(cross(self.axis_1, self.axis_2), self.axis_3) > 0, 1.0, -1.0)
         return {
             "angle_1": jnp.arctan2(-hand * c[1, 2], c[2, 2]),
             "angle_2": jnp.arctan2(hand * c[0, 2], jnp.sqrt(c[1, 2] ** 2 + c[2, 2] ** 2)),
@@ -361,7 +361,7 @@ class Screw(AbstractSliding):
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         lead = self.pitch / (2 * np.pi)
-        turn = (jnp.dot(self.axis_a, shift) - self.offset) / lead
+        turn = (dot(self.axis_a, shift) - self.offset) / lead
         c, s = cosine_sine(space, self, poses)
         cosine, sine = c * jnp.cos(turn) + s * jnp.sin(turn), s * jnp.cos(turn) - c * jnp.sin(turn)
         thread = lead * half_sine(sine[None], cosine)
@@ -449,12 +449,12 @@ class Planar(AbstractAxial):
     slides: ClassVar[tuple[str, ...]] = ("displacement",)
 
     def residual(self, space, poses, t):
-        height = jnp.dot(self.axis_a, offset_in_a(space, self, poses))
+        height = dot(self.axis_a, offset_in_a(space, self, poses))
         return jnp.concatenate([_parallel(space, self, poses), height[None]])
 
     def coordinates(self, space, poses):
         shift, y_a = offset_in_a(space, self, poses), cross(self.axis_a, self.x_a)
-        displacement = jnp.stack([jnp.dot(self.x_a, shift), jnp.dot(y_a, shift)])
+        displacement = jnp.stack([dot(self.x_a, shift), dot(y_a, shift)])
         return {"displacement": displacement, "angle": angle(space, self, poses)}
 
 

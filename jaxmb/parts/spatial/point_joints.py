@@ -2,9 +2,7 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
-from ...linalg.rotations import norm
+from ...linalg.rotations import dot, norm
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
 from ..shapes import ball
@@ -43,7 +41,7 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
 
     def residual(self, space, poses, t):
         d = separation(space, self, poses)
-        return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
+        return ((dot(d, d) - self.length**2) / (2 * self.length))[None]
 
     def path(self, space, poses):
         return both_points(space, self, poses)
@@ -76,7 +74,7 @@ class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     rows: ClassVar[int] = 1
 
     def residual(self, space, poses, t):
-        return jnp.dot(self.axis_a, offset_in_a(space, self, poses))[None]
+        return dot(self.axis_a, offset_in_a(space, self, poses))[None]
 
 
 class PointOnLine(AbstractSpatialPart, AbstractJoint):

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ...linalg.rotations import cross, norm
+from ...linalg.rotations import cross, dot, norm
 from .. import fields
 from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
 from ..shapes import Ground, along, marked_ball, sleeve, wheel
@@ -47,7 +47,7 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         v = space.point_velocity(poses[0], velocities[0], self.point)
-        return jnp.dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
+        return dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
 
     def shapes(self, space, size):
         return (0, sleeve(self.point, size, self.axis)), (None, Ground(orientation=along(self.normal)))
@@ -116,7 +116,7 @@ class DiscContact(AbstractDisc, AbstractConstraint):
 
     def residual(self, space, poses, t):
         lowest = space.point(poses[0], self.centre) + _lowest_rim_point(space, self, poses[0])
-        return jnp.dot(self.normal, lowest - self.point)[None]
+        return dot(self.normal, lowest - self.point)[None]
 
     def shapes(self, space, size):
         disc = ((0, shape) for shape in wheel(self.radius, size, self.centre, self.axis))
@@ -183,7 +183,7 @@ class SphereContact(AbstractBall, AbstractConstraint):
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):
-        height = jnp.dot(self.normal, space.point(poses[0], self.centre) - self.point)
+        height = dot(self.normal, space.point(poses[0], self.centre) - self.point)
         return (height - self.radius * norm(self.normal))[None]
 
     def shapes(self, space, size):
