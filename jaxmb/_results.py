@@ -42,6 +42,6 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )
     invalid_parameters = (
-        "A parameter is not finite, or not of the sign that its part asks for, or a direction is not a unit vector. "
-        "`jaxmb.with_parameters` with numbers that are not traced names it."
+        "A parameter is not finite, or not of the sign that its part asks for, or a direction is not a unit vector, "
+        "or a design variable is outside its bounds. `jaxmb.with_parameters` with numbers that are not traced names it."
     )

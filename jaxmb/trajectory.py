@@ -408,7 +408,14 @@ class Trajectory(eqx.Module):
         return {name: np.asarray(values[name]) for name in names}
 
     def save(self, path: str | Path) -> None:
-        """Write `to_dict` as a compressed `.npz`."""
+        """Write `to_dict` as a compressed `.npz`.
+
+        **Raises:** a `ValueError` for a path that ends otherwise; `to_pandas` has tables for other files.
+        """
+        if Path(path).suffix not in ("", ".npz"):
+            raise ValueError(
+                f"Trajectory.save writes .npz, got {str(path)!r}; to_pandas() and to_xarray() are for other files."
+            )
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
 
 
@@ -423,6 +430,9 @@ class PartMotion:
 
     def __init__(self, trajectory: Trajectory, name: str):
         self._trajectory, self._name = trajectory, name
+
+    def __repr__(self) -> str:
+        return f"Motion of {self._name!r}: {', '.join(dir(self))}"
 
     def __dir__(self) -> list[str]:
         known = (name.partition(".") for name in self._trajectory.system.quantities())

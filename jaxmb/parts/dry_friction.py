@@ -166,7 +166,9 @@ class DryFriction(AbstractDryFriction):
 
     Several contacts in space that stick, as the feet of a table do, share forces that are not determined: they are as
     small as they can be, and where one reaches its limit others take more. Where the normal forces are not determined
-    either, as those of four feet, the motion that slips may not be, and the run may end with a failure.
+    either, as those of four feet, the motion that slips may not be, and the run may end with a failure. In the plane
+    one of the ways to share is found, in which a foot of a body at rest may be at its limit: its mode is that of slip,
+    at the velocity zero, and another foot bears the rest. The motion and the sum of their forces are determined.
 
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 

@@ -33,11 +33,17 @@ def _hint(name: str, known: Iterable[str]) -> str:
         listed = list(of_part.values())
         lead = f"{part!r} has"
     else:
-        near, listed, lead = difflib.get_close_matches(name, known, n=2, cutoff=0.5), known, "there are"
+        near, listed, lead = _alike(name, known), known, "there are"
     if near:
         return f"; did you mean {' or '.join(map(repr, near))}?"
     shown = ", ".join(map(repr, listed[:12])) + (", …" if len(listed) > 12 else "")
     return f"; {lead} {shown}." if listed else "; there are none."
+
+
+def _alike(name: str, known: list[str]) -> list[str]:
+    """A few known names that contain a word, or are spelled nearly alike."""
+    within = [own for own in known if len(name) > 3 and name.lower() in own.lower()]
+    return sorted(within, key=len)[:3] or difflib.get_close_matches(name, known, n=2, cutoff=0.5)
 
 
 def check_arguments(what: str, signature: inspect.Signature, positional: int, names: Iterable[str]) -> None:

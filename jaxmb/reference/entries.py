@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from types import ModuleType
 from typing import Any
 
-from ..parts.names import unknown
+from ..parts.names import UnknownNameError, unknown
 
 PACKAGE = __name__.split(".")[0]
 
@@ -250,7 +250,17 @@ def find(name: str) -> Entry:
         if last in own:
             return own[last]
         raise unknown("name", plain, [f"{head}.{short}" for short in own])
-    raise unknown("name", plain, entries() if dot else _shortest_names())
+    if dot:
+        raise unknown("name", plain, entries())
+    error, speaking = unknown("name", plain, _shortest_names()), _speaking_of(plain)
+    raise UnknownNameError(f"{error} The word is explained in {', '.join(speaking)}.") if speaking else error
+
+
+def _speaking_of(word: str) -> list[str]:
+    """Names whose docstrings have an argument or a quantity with this name; a few of the shortest docstrings."""
+    code = re.compile(rf"[`(, ]{re.escape(word)}(=|`)")
+    found = [entry for entry in entries().values() if entry.kind != "module" and code.search(entry.text)]
+    return [entry.name for entry in sorted(found, key=lambda entry: len(entry.text))[:6]]
 
 
 def _found(name: str) -> Entry | None:

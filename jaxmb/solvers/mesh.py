@@ -150,6 +150,8 @@ class Mesh(eqx.Module):
 
     def of_one_segment(self) -> "Mesh":
         """The same, whose maps can be differentiated by the rows; of a run that has more than them, an error."""
+        if self.segments is None:
+            return self
         rows = eqx.error_if(self.rows, self.count > self.size, _TOO_LONG.format(self.size))
         return dataclasses.replace(self, rows=rows, segments=None)
 

@@ -78,7 +78,8 @@ def assemble(
 
     **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values. It is
     the closest one: the sum of the squares of all changes is the least, of positions and velocities in units of the
-    system's size, of angles in radians.
+    system's size, of angles in radians. Where a parameter moves the mechanism, coordinates that
+    `fix` does not hold change as well, and a derivative by the parameter contains that.
 
     **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
     coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the

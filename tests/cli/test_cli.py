@@ -131,6 +131,10 @@ def test_help_on_a_name(capsys):
 def test_help_on_an_unknown_name(capsys):
     assert main(["help", "simulat"]) == 2
     assert capsys.readouterr().err.startswith("jaxmb: Unknown name 'simulat'; did you mean 'simulate'")
+    assert main(["help", "spring"]) == 2
+    assert "'SpringDamper'" in capsys.readouterr().err
+    assert main(["help", "restitution"]) == 2
+    assert "Stop" in capsys.readouterr().err
 
 
 def test_interrupted(capsys, monkeypatch):

@@ -46,6 +46,12 @@ def test_views_list_what_they_have(motion):
     assert dir(motion["rod"]) == sorted(["position", "velocity", "angle", "orientation", "angular_velocity"])
 
 
+def test_what_is_printed_of_a_joint_and_where_a_motion_is_saved(motion, tmp_path):
+    assert repr(motion["pin"]).startswith("Motion of 'pin': ") and "angle_rate" in repr(motion["pin"])
+    with pytest.raises(ValueError, match=r"writes \.npz, got .*motion.csv"):
+        motion.save(tmp_path / "motion.csv")
+
+
 def test_views_by_name_are_mappings(motion):
     assert "pin" in motion.reactions and "knee" not in motion.reactions
     assert motion.reactions.get("knee") is None

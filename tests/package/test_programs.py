@@ -211,3 +211,15 @@ def test_forces_that_no_reaction_changes_are_not_solved_for(monkeypatch):
     program(mb.mechanisms.get("four_bar").system)
     with pytest.raises(AssertionError, match="find_multipliers is traced"):
         program(mb.mechanisms.get("rough_ring").system)
+
+
+def test_second_derivatives_of_short_motions_call_no_python():
+    """JAX keeps such programs on disk."""
+    four_bar = mb.mechanisms.get("four_bar")
+
+    def end(mass, max_steps):
+        system = mb.with_parameters(four_bar.system, {"crank.mass": mass})
+        return mb.simulate(system, four_bar.state, t1=0.1, max_steps=max_steps).ys.q[-1, 0]
+
+    calls = lambda most: "callback" in str(jax.make_jaxpr(jax.hessian(lambda mass: end(mass, most)))(1.0))
+    assert calls(10000) and not calls(1000)

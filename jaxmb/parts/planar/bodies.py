@@ -50,9 +50,10 @@ class Body(AbstractRigidBody):
     from_its_end = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), centre=(0.5, 0.0))
     ```
 
-    Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
-    pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
-    moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
+    Points that parts have on the body are in its frame, and those of force elements that are left out are its origin;
+    functions see the pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion,
+    `Trajectory["name"]`, and the moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body
+    shows the motion of the origin.
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
     origin of the frame, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), of the

@@ -24,7 +24,8 @@ class Torque(AbstractPlanarPart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
     ```
 
-    **Arguments:** `torque` [N m]; `reaction`, the body that bears the reaction, default ground.
+    **Arguments:** `torque` [N m]; `reaction`, the body that bears the reaction, default ground. In
+    `Trajectory.forces` the reaction is the first row, and the moment on `body` the second.
     """
 
     name: str = fields.name()

@@ -55,9 +55,10 @@ class Body(AbstractRigidBody):
     leaning = spatial.Body("top", mass=1.0, inertia=(0.002, 0.002, 0.003), orientation=tilted, centre=(0.0, 0.0, 0.1))
     ```
 
-    Points that parts have on the body are in its frame, and those that are left out are its origin; functions see the
-    pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion, `Trajectory["name"]`, and the
-    moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body shows the motion of the origin.
+    Points that parts have on the body are in its frame, and those of force elements that are left out are its origin;
+    functions see the pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion,
+    `Trajectory["name"]`, and the moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body
+    shows the motion of the origin.
 
     **Arguments:**
 

@@ -20,7 +20,8 @@ class Torque(AbstractSpatialPart, AbstractForce):
     ```
 
     **Arguments:** `torque` [N m], shape (3,), in world axes or, with `frame="body"`, turning with the body; `reaction`,
-    the body that bears the reaction, default ground.
+    the body that bears the reaction, default ground. In `Trajectory.forces` the reaction is the first row, and the
+    moment on `body` the second.
     """
 
     name: str = fields.name()

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
+from ...linalg.arrays import ARRAYS
 from ...parts.names import names_arguments
 from ...states.arguments import check_no_states
 from ...system import AbstractSystem
@@ -191,6 +192,11 @@ def identify(
 
 def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> tuple[Problem, bool]:
     """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
+    for argument, value in (("sigma", sigma), ("bounds", bounds), ("prior", prior)):
+        if value is not None and not isinstance(value, Mapping):
+            raise ValueError(f"identify: {argument} is given by name, such as {{'crank.angle': …}}; got {value!r}.")
+    if isinstance(measured, ARRAYS):
+        raise ValueError("identify: measured is given by name, such as {'crank.angle': array}; got an array.")
     if measured is None or isinstance(measured, Mapping) or have_times(measured) or is_table(measured):
         experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
@@ -291,7 +297,10 @@ def _check_start(problem: Problem, model: Model) -> None:
     effect = np.max(np.abs(jacobian), axis=0) / size
     for name in problem.free.names:
         if not np.any(effect[problem.free.place(name)] > _NO_EFFECT):
-            raise ValueError(f"{name!r} has no effect on what was measured; leave it out of free, or measure more.")
+            raise ValueError(
+                f"{name!r} has no effect on what was measured; leave it out of free, or measure more. Where the motion "
+                "starts at rest in an equilibrium, state=, fix= or rates= gives it another start."
+            )
     data = model.data + sum(int(np.size(mean)) for mean in problem.priors.means)
     if data < problem.free.size:
         raise ValueError(

@@ -89,13 +89,13 @@ def steady_motion(
 
 
 class _Found(NamedTuple):
-    """A state, the rates that remain at it (n,), how far the conditions are from being met, and whether all vanish
-    there and a little later.
+    """A state, the rates that remain at it (n,), the residuals of all equations, with those of the conditions last, and
+    whether all vanish there and a little later.
     """
 
     state: State
     remaining: Float[Array, "n"]
-    unmet: Float[Array, "c"]
+    left: Float[Array, "e"]
     met: Bool[Array, ""]
     ok: Bool[Array, ""]
 
@@ -181,8 +181,8 @@ def _search(
     carrier = _carrier(system, solution, system.rates(t, state.q, state.u), advancing)
     field, carried = vector_field(system, t, state)[0], carrier.field(state)
     remaining = jnp.concatenate([field.q - carried.q, field.u - carried.u])
-    unmet = left[left.size - len(chosen[0]) - len(chosen[1]) :]
-    return _Found(state, remaining, unmet, solved, solved & same)
+    # An array without entries that a program returns makes XLA lose the types of its LAPACK calls (jaxlib 0.10.2).
+    return _Found(state, remaining, left, solved, solved & same)
 
 
 def _start(system, t, guess, advancing):
@@ -243,7 +243,8 @@ def _residual(system, t, values, chosen, advancing, unknowns, units, later):
 
 
 def _not_found(system, found, names):
-    unmet = [name for name, left in zip(names, np.asarray(found.unmet), strict=True) if not abs(left) < 1e-6]
+    residuals = np.asarray(found.left)[len(found.left) - len(names) :]
+    unmet = [name for name, left in zip(names, residuals, strict=True) if not abs(left) < 1e-6]
     held = f" with {', '.join(names)} prescribed" if names else ""
     if found.met:
         return (

@@ -46,6 +46,10 @@ class Cases:
         if len(self) == 0:
             raise ValueError("A sweep needs at least one member; the cases are empty.")
 
+    def __repr__(self) -> str:
+        lengths = " × ".join(f"{name} ({length})" for name, length in self.grid)
+        return f"Cases: {len(self)} members, {f'a grid of {lengths}' if self.grid else ', '.join(self.columns)}"
+
     def __len__(self) -> int:
         return next(iter(self.columns.values())).shape[0]
 

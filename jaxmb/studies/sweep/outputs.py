@@ -104,7 +104,7 @@ def check_parameters(function: Callable[..., Any], names: Any) -> None:
     if not any(a.kind == kinds.VAR_KEYWORD for a in arguments.values()):
         for name in names:
             if name not in named:
-                raise unknown("parameter of the function", name, named)
+                raise unknown("argument of the function", name, named, "The cases")
     for name, argument in arguments.items():
         needed = argument.default is kinds.empty and argument.kind not in (kinds.VAR_KEYWORD, kinds.VAR_POSITIONAL)
         if needed and name not in names and name != "max_steps":

@@ -236,6 +236,9 @@ def test_no_effect(system):
         ({"t0": 0.5}, "after t0"),
         ({"method": "newton"}, "method must be"),
         ({"saveat": TS}, "identify sets 'saveat'"),
+        ({"sigma": 0.01}, "sigma is given by name"),
+        ({"bounds": [(0.0, 1.0)]}, "bounds is given by name"),
+        ({"measured": np.zeros(30)}, "measured is given by name"),
     ],
 )
 def test_messages(system, change, message):

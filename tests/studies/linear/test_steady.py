@@ -36,6 +36,17 @@ def test_a_conical_pendulum_runs_in_its_circle_and_nutates():
     assert np.max(np.abs(found[:2])) < 1e-6 and np.max(np.abs(found[2:].real)) < 1e-9
 
 
+def test_a_motion_that_nothing_prescribes_is_found_near_the_guess():
+    radius, height = 2.0 * np.sin(0.6), 2.0 * np.cos(0.6)
+    faster = 1.02 * radius * np.sqrt(G / height)
+    guess = mb.State(jnp.array([radius, 0.0, -height]), jnp.array([0.0, faster, 0.0]))
+    state = mb.steady_motion(conical(), guess)
+    x, y, z = state.q
+    assert np.hypot(x, y) == pytest.approx(radius, rel=0.1)
+    np.testing.assert_allclose(np.hypot(*state.u[:2]), np.hypot(x, y) * np.sqrt(G / -z), rtol=1e-9)
+    assert abs(state.u[2]) < 1e-9
+
+
 def test_the_speed_of_a_cone_is_differentiable():
     system = conical()
 

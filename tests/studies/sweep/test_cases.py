@@ -14,6 +14,7 @@ def test_a_grid_has_all_combinations_and_the_last_parameter_runs_fastest():
     assert len(cases) == 6 and cases.grid == (("rod.mass", 2), ("b", 3))
     np.testing.assert_array_equal(cases.columns["rod.mass"], [1, 1, 1, 2, 2, 2])
     np.testing.assert_array_equal(cases.columns["b"], [10, 20, 30, 10, 20, 30])
+    assert repr(cases) == "Cases: 6 members, a grid of rod.mass (2) × b (3)"
     points = grid(point=np.arange(6.0).reshape(3, 2), k=[1, 2])
     assert points.columns["point"].shape == (6, 2)
 
