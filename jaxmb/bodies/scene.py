@@ -260,6 +260,11 @@ def _check_names(scene: Scene):
         if isinstance(part, AbstractActor) and part.sources:
             what, allowed = ("joint, body or frame", places) if part.takes_bodies else ("joint", joints)
             for name in part.sources:
+                if name in known and name not in allowed:
+                    raise ValueError(
+                        f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
+                        f"{', '.join(map(repr, joints)) or 'none'}."
+                    )
                 if name not in allowed or name == part.name:
                     raise unknown(what, name, allowed, part.label)
         elif isinstance(part, AbstractLink):

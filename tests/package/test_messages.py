@@ -93,6 +93,13 @@ def test_unknown_names_are_errors_of_keys_and_of_values(pendulum, motion, lookup
         assert str(raised.value) == message
 
 
+def test_a_body_where_a_joint_is_needed():
+    bar = planar.Body("bar", mass=1.0, inertia=1.0)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    with pytest.raises(ValueError, match=r"JointSpring 'spring': 'bar' is no joint; it acts on joints.*'pin'"):
+        mb.Scene([bar], joints=[pin], forces=[mb.JointSpring("spring", "bar.angle", stiffness=1.0)]).compile()
+
+
 def test_unknown_names_in_functions_of_the_user_keep_their_message(pendulum):
     with pytest.raises(mb.UnknownNameError, match=r"^Unknown parameter 'rod.mas'; did you mean 'rod.mass'"):
         mb.design(
