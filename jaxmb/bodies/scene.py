@@ -51,6 +51,11 @@ from .layout import Layout
 from .rigid_bodies import RigidBodySystem
 from .structure import with_structure
 
+_TRACED = (
+    "A scene cannot be compiled within a function that JAX traces, such as one under jit: compile it before, and "
+    "change its numbers there with jaxmb.with_parameters."
+)
+
 
 class Scene(eqx.Module):
     """Bodies, joints and forces by name.
@@ -95,6 +100,9 @@ class Scene(eqx.Module):
         poses, for constraints that contradict each other, and for singular poses, near which other rows are independent
         than there; the message names the parts. Also within a function under `jit`: change parameters there instead.
         """
+        for part in (*self.bodies, *self.joints, *self.forces, *self.frames):
+            if is_traced(part):
+                raise ValueError(f"{part.label} has a number that JAX traces. {_TRACED}")
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
@@ -112,10 +120,7 @@ class Scene(eqx.Module):
             jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros[moving]])),
         )
         if is_traced(guess):
-            raise ValueError(
-                "A scene cannot be compiled within a function that JAX traces, such as one under jit: compile it "
-                "before, and change its numbers there with jaxmb.with_parameters."
-            )
+            raise ValueError(_TRACED)
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
         frames = frames_by_name(self.frames, self.bodies)

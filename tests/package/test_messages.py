@@ -93,6 +93,16 @@ def test_unknown_names_are_errors_of_keys_and_of_values(pendulum, motion, lookup
         assert str(raised.value) == message
 
 
+@pytest.mark.parametrize("where", ["mass", "position"])
+def test_scenes_are_compiled_outside_of_traced_functions(where):
+    def moved(x):
+        bar = planar.Body("bar", **({"mass": 1.0, "inertia": 1.0} | {where: x if where == "mass" else (x, 0.0)}))
+        return mb.Scene([bar]).compile().guess.q[0]
+
+    with pytest.raises(ValueError, match=r"Body 'bar' has a number that JAX traces.*jaxmb\.with_parameters"):
+        jax.grad(moved)(0.5)
+
+
 def test_a_body_where_a_joint_is_needed():
     bar = planar.Body("bar", mass=1.0, inertia=1.0)
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
