@@ -265,7 +265,7 @@ def _check_names(scene: Scene):
         if isinstance(part, AbstractActor) and part.sources:
             what, allowed = ("joint, body or frame", places) if part.takes_bodies else ("joint", joints)
             for name in part.sources:
-                if name in known and name not in allowed:
+                if name in known and name not in allowed and not part.takes_bodies:
                     raise ValueError(
                         f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
                         f"{', '.join(map(repr, joints)) or 'none'}."
