@@ -1,6 +1,7 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -67,7 +68,7 @@ class Scene(eqx.Module):
     ```
 
     A scene is planar or spatial, never both; its bodies decide. Joints are position or velocity constraints, in any
-    order; closed loops and redundant joints are the normal case.
+    order; closed loops and redundant joints are the normal case. A scene does not change: `extended` makes a new one.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
     including drivers, rolling, `Stop`, rigid contacts and `Servo`, tendons, and inertias of joints; `forces`: force
@@ -86,6 +87,39 @@ class Scene(eqx.Module):
     def __check_init__(self):
         _check_kinds(self)
         _check_names(self)
+
+    def extended(
+        self,
+        *,
+        bodies: Sequence[Any] = (),
+        joints: Sequence[Any] = (),
+        forces: Sequence[Any] = (),
+        frames: Sequence[Any] = (),
+        without: Sequence[str] = (),
+    ) -> "Scene":
+        """A scene with more parts, for one from a file or of a mechanism as well.
+
+        ```python
+        scene = jaxmb.mechanisms.get("four_bar").scene
+        driven = scene.extended(forces=[planar.Torque("motor", "crank", torque=1.0)])
+        cut = scene.extended(without=["D"])  # An open chain.
+        ```
+
+        **Arguments:** `bodies`, `joints`, `forces`, `frames`: parts to add; `without`: names of parts to leave out.
+
+        **Raises:** `ValueError` for a name in `without` that no part has, and as `Scene` does.
+        """
+        names = [part.name for part in (*self.bodies, *self.joints, *self.forces, *self.frames)]
+        for name in without:
+            if name not in names:
+                raise unknown("part", name, names, "without")
+        kept = lambda parts, more: (*(part for part in parts if part.name not in without), *more)
+        return Scene(
+            kept(self.bodies, bodies),
+            joints=kept(self.joints, joints),
+            forces=kept(self.forces, forces),
+            frames=kept(self.frames, frames),
+        )
 
     def describe(self) -> Description:
         """Compile the scene and describe the result, as text and as HTML."""

@@ -12,7 +12,7 @@ loops and couplings are held softly there.
 model = jaxmb.importers.mjcf("arm.xml", ignore="collisions")
 for note in model.notes:
     print(note)
-system = model.scene.compile()
+system = model.scene.extended(forces=[jaxmb.JointSpring("hold", "elbow.angle", stiffness=5.0)]).compile()
 state = jaxmb.assemble(system, fix={"elbow.angle": 0.3})
 motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": lambda t: 0.5 * jnp.sin(t)})
 ```

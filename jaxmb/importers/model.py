@@ -17,10 +17,10 @@ class ImportedModel:
 
     **Fields:**
 
-    - `scene`: its bodies, joints, forces and frames, a `Scene` to extend and compile. Bodies and joints have the names
-        of the file, and bodies their frames; links that are fixed to others, sites and other marks are frames. An
-        angle or displacement of a joint is that of the file. Joints in succession, with no mass in between, are one
-        `Composite`. The armature of a joint is a `JointInertia`.
+    - `scene`: its bodies, joints, forces and frames, a `Scene`, to which `scene.extended(forces=[…])` adds parts.
+        Bodies and joints have the names of the file, and bodies their frames; links that are fixed to others, sites
+        and other marks are frames. An angle or displacement of a joint is that of the file. Joints in succession, with
+        no mass in between, are one `Composite`. The armature of a joint is a `JointInertia`.
     - `notes`: sentences on what is approximated and what is left out, one for each kind; `named`: for each of them all
         the names, or lines of the file, that it holds for: it lists the first ones.
     - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.

@@ -76,8 +76,7 @@ class Mechanism:
     **Fields:**
 
     - `name`: as in `names()`.
-    - `scene`: its parts, to extend: `Scene(m.scene.bodies, joints=(*m.scene.joints, more), forces=m.scene.forces)`;
-        None for a system from a Lagrangian.
+    - `scene`: its parts, to which `m.scene.extended(joints=[more])` adds others; None for a system from a Lagrangian.
     - `system`, `state`: the system, and a consistent state at t = 0.
     - `t1`: the end of its usual motion [s].
     - `references`: reference values, or None if they do not apply to the parameters.

@@ -3,7 +3,6 @@
 import numpy as np
 
 from .. import planar
-from ..bodies.scene import Scene
 from .four_bar import four_bar
 from .mechanism import Mechanism, References, build, mechanism
 from .observe import bar_angles, point_motion
@@ -35,7 +34,6 @@ def stiff_four_bar(
     reference values.
     """
     rigid = four_bar(lengths=lengths, base=base, masses=masses, angle=angle, speed=speed, gravity=gravity)
-    bodies, joints, forces = rigid.scene.bodies, rigid.scene.joints, rigid.scene.forces
     foot = (-lengths[2] / 2, 0.0)
     bushing = planar.Bushing(
         "D",
@@ -50,7 +48,7 @@ def stiff_four_bar(
     angles = [f"{name}.angle" for name in ("crank", "coupler", "rocker")]
     return build(
         "stiff_four_bar",
-        Scene(bodies, joints=[joint for joint in joints if joint.name != "D"], forces=[*forces, bushing]),
+        rigid.scene.extended(forces=[bushing], without=["D"]),
         t1=1.0,
         observe=lambda trajectory: _observe(trajectory, foot, base),
         description="Planar four-bar linkage with a stiff, lightly damped bushing for a ground pivot, under gravity.",

@@ -206,11 +206,7 @@ def cassie(*parts, joints=()):
     # Feet have little inertia, and would be stiff on springs as strong as the others.
     gains = lambda own: {"stiffness": 20.0, "damping": 0.2} if "foot" in own else {"stiffness": 400.0, "damping": 10.0}
     held = [mb.JointSpring(f"{own} hold", f"{own}.angle", **gains(own)) for own in motors]
-    scene = model.scene
-    scene = mb.Scene(
-        scene.bodies, joints=[*scene.joints, *joints], forces=[*scene.forces, *held, *parts], frames=scene.frames
-    )
-    return model, scene.compile()
+    return model, model.scene.extended(joints=joints, forces=[*held, *parts]).compile()
 
 
 def soles(model, system, state):

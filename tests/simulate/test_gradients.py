@@ -66,10 +66,7 @@ def build(name):
     mechanism = mb.mechanisms.get(name)
     space = planar_anchor if name == "four_bar" else spatial_anchor
     anchor, joints, spring = space(body, point)
-    scene = mechanism.scene
-    system = mb.Scene(
-        (*scene.bodies, anchor), joints=(*scene.joints, *joints), forces=(*scene.forces, spring)
-    ).compile()
+    system = mechanism.scene.extended(bodies=[anchor], joints=joints, forces=[spring]).compile()
     rates = dict(mechanism.rates) or {rate: 0.0}
     start = {k: v for k, v in mb.parameters(system).items() if k in [*names, "spring.stiffness", "drive.rate"]}
     whole = rate.rsplit(".", 1)[0] + ".angular_velocity"
