@@ -17,6 +17,7 @@ import numpy as np
 from diffrax._integrate import SaveState, loop
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
+from jax._src import xla_bridge
 from jax.core import ShapedArray
 from jax.extend import core
 from jax.extend.core import Primitive
@@ -51,6 +52,14 @@ def default_float() -> np.dtype:
 def canonical(dtype: Any) -> np.dtype:
     """The type that JAX makes of one: of single precision unless `jax_enable_x64` is on."""
     return jax.dtypes.canonicalize_dtype(dtype)
+
+
+def has_started() -> bool:
+    """Whether JAX has looked for its devices, after which it takes no options of XLA any more.
+
+    (jax._src.xla_bridge.backends_are_initialized, 0.9 and 0.10.)
+    """
+    return xla_bridge.backends_are_initialized()
 
 
 def is_weakly_typed(array: Array) -> bool:

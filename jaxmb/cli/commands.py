@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 
 from .. import mechanisms
-from .._programs import VARIABLE, keep_compiled
+from .._programs import VARIABLE, compile_quickly, keep_compiled
 from . import doctor, help, report, run, sweep
 
 
@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     if not arguments.compile_anew:
-        _keep_compiled()
+        _prepare()
     try:
         arguments.command(arguments)
         sys.stdout.flush()
@@ -58,9 +58,11 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def _keep_compiled() -> None:
+def _prepare() -> None:
+    """Compile quickly, and keep what is compiled."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
+        compile_quickly()
         keep_compiled()
     for warning in caught:
         print(f"jaxmb: {warning.message}", file=sys.stderr)

@@ -48,6 +48,7 @@ done()
 import jaxmb as mb
 done()
 jax.config.update("jax_enable_x64", True)
+mb.compile_quickly()
 mb.keep_compiled()
 machine = mb.mechanisms.get("four_bar")
 

@@ -146,7 +146,8 @@ def simulate(
         A warning tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead, with a `result` that says why; with `True` it is an error there as well, by a call of
-        Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`).
+        Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`). Under
+        `equinox.filter_jit` the message stands alone; `jax.jit` adds a page of JAX's own.
     - `max_events`: the largest number of impacts and other events of contacts (`Stop`, `RigidContact`, …), whose times
         and states are kept: a motion that has more of them fails.
     - `event`, `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the

@@ -24,7 +24,7 @@ COMPAT = ROOT / "_compat.py"
 PRIVATE_MODULES = ("equinox.internal", "jax.extend", "jax.interpreters", "jax._src", "jax.custom_batching")
 PRIVATE_ATTRIBUTES = {
     *("custom_batching", "weak_type", "canonicalize_dtype", "unvmap_any", "scan_kind", "with_stepsize_controller_tols"),
-    *("_enumeration", "_name_to_item", "_index_to_message", "_processes"),
+    *("backends_are_initialized", "_enumeration", "_name_to_item", "_index_to_message", "_processes"),
 }
 
 
@@ -115,6 +115,11 @@ def test_weak_types(compat):
     assert compat.is_weakly_typed(jnp.asarray(1.0)) is True, about
     assert compat.is_weakly_typed(jnp.asarray(1.0, float)) is False, about
     jax.jit(lambda x, y: [x, compat.is_weakly_typed(x) and pytest.fail(about)])(jnp.zeros(1), 1.0)
+
+
+def test_whether_jax_has_started(compat):
+    jnp.zeros(1)
+    assert compat.has_started() is True, "jax._src.xla_bridge no longer tells whether there are backends"
 
 
 def test_programs_can_be_read(compat):

@@ -1,4 +1,4 @@
-"""Compiled programs that are kept on disk, in processes of their own, since JAX has one folder a process."""
+"""How programs are compiled, and kept on disk, in processes of their own, since JAX has one folder a process."""
 
 import ast
 import os
@@ -55,6 +55,24 @@ def kept(*arguments, **options):
     assert str(folder) == str(told)
     jax.config.update("jax_compilation_cache_dir", None)
     return folder
+
+
+def test_options_of_the_compiler_are_set_before_jax_starts():
+    code = 'mb.compile_quickly()\nmb.compile_quickly()\njnp.ones(3)\nprint(repr(os.environ["XLA_FLAGS"]))'
+    own, said = process("import os\n" + code, XLA_FLAGS="")
+    assert said == "" and set(own.split()) == {f"--{name}={value}" for name, value in _programs._XLA_FLAGS.items()}
+    # Those of the user stay.
+    given = "--xla_disable_hlo_passes=reshape-mover --xla_cpu_enable_fast_math=false"
+    both, _ = process("import os\n" + code, XLA_FLAGS=given)
+    assert both == given + " --xla_cpu_use_fusion_emitters=false"
+    late, said = process("import os\njnp.ones(3)\n" + code, XLA_FLAGS="")
+    assert late == "" and "JAX has computed something already" in said and said.count("UserWarning") == 2
+
+
+def test_what_is_compiled_quickly_is_kept(tmp_path):
+    code = "mb.compile_quickly()\nmb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS="")[0] for _ in range(2))
+    assert second == {"asked": first["asked"], "found": first["kept"], "kept": 0}
 
 
 def test_the_second_process_finds_what_the_first_compiled(tmp_path):

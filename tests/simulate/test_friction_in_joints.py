@@ -14,6 +14,7 @@ from jaxmb.parts import terrain
 
 G, MASS, RADIUS, COEFFICIENT = 9.81, 2.0, 0.4, 0.3
 DOWN = mb.Gravity((0.0, 0.0, -G))
+UP, EAST = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 # With this moment of inertia slip changes as the velocity of a particle does, along a straight line.
 INERTIA = MASS * RADIUS**2
 
@@ -104,9 +105,7 @@ def test_a_block_on_a_face_comes_to_rest_on_a_belt():
     """The face moves; the block slips along a straight line until it moves with it."""
     speed = np.array([0.8, -0.6])
     block = spatial.Body("block", mass=MASS, inertia=(0.1, 0.1, 0.1), velocity=(2.0, 1.0, 0.0))
-    face = spatial.Planar(
-        "face", "ground", "block", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), x_a=(1.0, 0.0, 0.0), x_b=(1.0, 0.0, 0.0)
-    )
+    face = spatial.Planar("face", "ground", "block", point=(0.0, 0.0, 0.0), axis=UP, x_a=EAST, x_b=EAST)
     rub = mb.DryFriction("rub", "face", coefficient=COEFFICIENT, speed=speed)
     system = mb.Scene([block], joints=[face], forces=[DOWN, rub]).compile()
     motion = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=[1.0], rtol=1e-9)
@@ -116,6 +115,42 @@ def test_a_block_on_a_face_comes_to_rest_on_a_belt():
     at = speed + 0.5 * slip * np.linalg.norm(slip) / (COEFFICIENT * G)
     np.testing.assert_allclose(motion["block"].position[0, :2], at, rtol=1e-9)
     np.testing.assert_allclose(motion["block"].velocity[0, :2], speed, rtol=1e-9)
+
+
+def block_on_a_belt(on):
+    """A block that slips on a moving face or terrain."""
+    rub = mb.DryFriction("rub", on, coefficient=COEFFICIENT, speed=(0.8, -0.6))
+    if on == "face":
+        joint = spatial.Planar("face", "ground", "block", point=(0.0, 0.0, 0.0), axis=UP, x_a=EAST, x_b=EAST)
+        block = spatial.Body("block", mass=MASS, inertia=(0.1, 0.1, 0.1), velocity=(2.0, 1.0, 0.0))
+    else:
+        joint = mb.RigidContact("floor", "block", terrain=terrain.Flat())
+        block = spatial.PointMass("block", mass=MASS, velocity=(2.0, 1.0, 0.0))
+    return mb.Scene([block], joints=[joint], forces=[DOWN, rub]).compile()
+
+
+@pytest.mark.parametrize("on", ["face", "floor"])
+def test_derivatives_on_a_belt_with_two_directions(on):
+    """With respect to the friction and both components of the belt's speed, of the time at which slip ends and of where
+    the block is after that.
+    """
+    system = block_on_a_belt(on)
+
+    def comes_to_rest(p):
+        moved = mb.with_parameters(system, {"rub.coefficient": p[0], "rub.speed": p[1:]})
+        motion = mb.simulate(moved, mb.assemble(moved), t1=1.0, saveat=[1.0], rtol=1e-10)
+        return jnp.append(motion["block"].position[0, :2], motion.events.times[0])
+
+    def exact(p):
+        slip = jnp.array([2.0, 1.0]) - p[1:]
+        time = jnp.linalg.norm(slip) / (p[0] * G)
+        return jnp.append(p[1:] + 0.5 * slip * time, time)
+
+    p = jnp.array([COEFFICIENT, 0.8, -0.6])
+    np.testing.assert_allclose(jit_quickly(comes_to_rest)(p), exact(p), rtol=1e-9)
+    forward = jit_quickly(jax.jacfwd(comes_to_rest))(p)
+    np.testing.assert_allclose(forward, jax.jacfwd(exact)(p), atol=1e-8)
+    np.testing.assert_allclose(jit_quickly(jax.jacrev(comes_to_rest))(p), forward, atol=1e-11)
 
 
 SPRING, SPEED, STICK, SLIP = 50.0, 0.5, 0.35, 0.2
