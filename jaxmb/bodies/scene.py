@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._traced_functions import traced_by_jax
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..parts.base import (
@@ -287,7 +288,8 @@ def _check_rotation(part, components, own, layout, poses):
     points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
     space = layout.space
     for component in components if points else ():
-        strength = np.asarray(_strength(anonymous(component), space, poses))
+        with traced_by_jax(part.label, "an argument"):
+            strength = np.asarray(_strength(anonymous(component), space, poses))
         if np.any(strength[points, space.dimension :] > 0):
             raise ValueError(
                 f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "

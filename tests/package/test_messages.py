@@ -1,5 +1,6 @@
 """What a user reads after a slip: the nearest names, what an object has, and which values depend on each other."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -30,6 +31,49 @@ def test_an_unknown_coordinate_lists_those_of_the_body(pendulum):
         mb.assemble(pendulum, fix={"rod.phi": 0.3})
     with pytest.raises(ValueError, match=r"did you mean 'rod\.angle'\?"):
         mb.assemble(pendulum, fix={"rod.angel": 0.3})
+
+
+def gust(poses, velocities, t, parameters):
+    return jnp.array([[math.sin(t), 0.0, 0.0]])
+
+
+wind = mb.Force("wind", "bob", gust)
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (
+            lambda system: mb.with_inputs(system, {"pin.point_a": lambda t: np.array([np.sin(t), 0.0])}),
+            r"`.*np\.sin\(t\).*` needs the time as a number, and the input 'pin\.point_a' is traced by JAX: .*Use jnp",
+        ),
+        (
+            lambda system: mb.with_inputs(system, {"rod.mass": lambda t: 1.0 if t > 0.5 else 2.0}),
+            "needs the time as a number",
+        ),
+        (
+            lambda system: mb.design(system, {"length": 1.0}, lambda v: {"rod.inertia": float(v["length"])}),
+            "needs a design variable as a number, and derive",
+        ),
+        (lambda system: mb.optimise(lambda v: np.sin(v["x"]), {"x": 1.0}), "a parameter.* the function of optimise"),
+        (
+            lambda system: mb.Scene([planar.Body("bob", mass=1.0, inertia=0.1)], forces=[wind]).compile(),
+            r"test_messages\.py:\d+: `return .*math\.sin\(t\).*` needs an argument .*wrenches of Force 'wind'",
+        ),
+        (
+            lambda system: mb.Scene([planar.PointMass("bob", mass=1.0)], forces=[wind]).compile(),
+            "needs an argument as a number, and Force 'wind'",
+        ),
+        (
+            lambda system: mb.lagrangian.LagrangianSystem(lambda t, q, v, p: 0.5 * np.dot(v, v), q=[1.0]),
+            r"`.*np\.dot\(v, v\).*` needs an argument as a number, and lagrangian is traced",
+        ),
+    ],
+    ids=["NumPy", "branch", "design", "optimise", "Force", "Force on a point", "LagrangianSystem"],
+)
+def test_numbers_that_functions_of_the_user_do_not_get(pendulum, use, message):
+    with pytest.raises(ValueError, match=message):
+        use(pendulum)
 
 
 def test_an_angle_in_degrees_is_warned_of():

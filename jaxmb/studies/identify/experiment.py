@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._results import RESULTS
+from ..._traced_functions import traced_by_jax
 from ..._types import Scalar, State, VectorLike
 from ...parts.names import unknown
 from ...simulate import simulate
@@ -166,7 +167,8 @@ class ExperimentModel(eqx.Module):
             readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
             rows.append(channel.rows(readings[channel.name], theta, self.loss))
         if self.residual is not None:
-            readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
+            with traced_by_jax("the residual function", "the motion"):
+                readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
             rows.append(_of_user(readings[RESIDUAL], self.loss))
         joined = Rows(
             jnp.concatenate([own.residuals for own in rows]),

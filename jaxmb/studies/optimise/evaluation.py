@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
 from ..batch import batch
@@ -97,7 +98,8 @@ def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
 
     **Raises:** `ValueError` for outputs that are no real numbers.
     """
-    found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
+    with traced_by_jax("the function of optimise", "a parameter"):
+        found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
     found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
     shapes = {}
     for name, own in found.items():
