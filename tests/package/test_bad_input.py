@@ -108,7 +108,7 @@ REFUSED = {
                 planar.Revolute("B", "ground", "b", point_a=(5, 0), point_b=(0.5, 0)),
             ],
         ).compile(),
-        r"cannot be assembled.*residuals \[m, rad\] remain in .*B",
+        r"cannot be compiled.*cannot be assembled.*residuals \[m, rad\] remain in .*B.* position and the angle of each",
     ),
     "inconsistent redundant joints": (
         lambda: mb.Scene(
