@@ -82,6 +82,12 @@ def test_an_angle_in_degrees_is_warned_of():
         scene.compile()
 
 
+def test_a_fixed_angle_in_degrees_is_warned_of(pendulum):
+    with pytest.warns(UserWarning, match=r"fix=\{'rod\.angle': …\}: the angle 90 rad is more than a full") as caught:
+        mb.assemble(pendulum, fix={"rod.angle": 90.0})
+    assert caught[0].filename == __file__
+
+
 def test_views_list_what_they_have(motion):
     with pytest.raises(AttributeError, match="angular_velocity; got 'omega'"):
         getattr(motion["rod"], "omega")  # noqa: B009
@@ -180,6 +186,20 @@ def test_unknown_arguments_of_functions(pendulum):
 def test_fixed_coordinates_that_depend_on_each_other(pendulum):
     with pytest.raises(ValueError, match=r"rod\.x and rod\.angle depend on each other: of these 2 .* only 1 can be"):
         mb.assemble(pendulum, fix={"rod.x": 0.3, "rod.angle": 1.0})
+
+
+def test_a_coordinate_of_a_joint_that_depends_on_another_fixed_one(pendulum):
+    with pytest.raises(ValueError, match=r"with rod\.angle, pin\.angle fixed: rod\.angle and pin\.angle depend"):
+        mb.assemble(pendulum, fix={"rod.angle": 0.3, "pin.angle": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [("rod.angle_rate", "rod.angle"), ("pin.angle_rate", "pin.angle"), ("rod.velocity", "rod.velocity")],
+)
+def test_a_rate_is_no_coordinate(pendulum, name, rate):
+    with pytest.raises(ValueError, match=rf"'{name}' is a rate, .* assemble takes it as rates=\{{'{rate}': …\}}"):
+        mb.assemble(pendulum, fix={name: 1.0})
 
 
 @pytest.mark.parametrize(
