@@ -176,6 +176,24 @@ def test_unknown_arguments_of_parts():
         planar.Revolute("pin", "ground", "rod", (0.0, 0.0), (1.0, 0.0))  # pyright: ignore
 
 
+def test_bodies_and_joints_of_a_scene_by_position():
+    with pytest.raises(TypeError, match=r"Scene takes 1 arguments by position, bodies; got 2; .*: joints, forces"):
+        mb.Scene([planar.PointMass("bob", mass=1.0)], [])  # pyright: ignore
+
+
+def test_the_name_of_a_part_in_place_of_its_numbers(pendulum):
+    with pytest.raises(ValueError, match=r"Unknown parameter 'pin'; 'pin' has 'pin\.point_a', 'pin\.point_b'"):
+        mb.with_inputs(pendulum, {"pin": lambda t: t})
+
+
+def test_initial_states_that_cannot_be(pendulum):
+    measured = {"measured": {"rod.angle": np.zeros(2)}, "ts": [0.01, 0.02], "free": {"rod.inertia": 0.1}}
+    with pytest.raises(ValueError, match=r"coordinates of bodies, not of joints, and 'pin\.angle' is of a joint"):
+        mb.identify(pendulum, **measured, free_initial=("pin.angle",))
+    with pytest.raises(ValueError, match=r"rod\.x and rod\.angle depend on each other"):
+        mb.identify(pendulum, **measured, fix={"rod.angle": 1.0, "rod.x": 0.3})
+
+
 def test_unknown_arguments_of_functions(pendulum):
     with pytest.raises(TypeError, match="simulate has no argument 'tol'; did you mean 'rtol'"):
         mb.simulate(pendulum, mb.assemble(pendulum), t1=1.0, tol=1e-3)  # pyright: ignore
