@@ -1,6 +1,7 @@
 """Checks of arguments that users pass, with messages that name the argument."""
 
 import importlib
+import warnings
 from typing import Any
 
 import jax
@@ -50,6 +51,16 @@ def real_shape(name: str, value: Any, expected: str = "a real number or an array
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name} must be {expected}, got {value!r}.")
     return array.shape
+
+
+def warn_of_degrees(label: str, angle: Any, stacklevel: int) -> None:
+    """Warn of an angle [rad] of more than a full turn; `stacklevel`: the user's place as this function's caller."""
+    if not is_traced(angle) and abs(float(angle)) > 2 * np.pi:
+        warnings.warn(
+            f"{label}: the angle {angle:g} rad is more than a full turn; angles are in radians, "
+            f"np.deg2rad({angle:g}) is {np.deg2rad(float(angle)):.4g}.",
+            stacklevel=stacklevel + 1,
+        )
 
 
 def package_for_tables(name: str, install: str) -> Any:

@@ -1,14 +1,18 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
+import inspect
+import itertools
+import inspect
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._traced_functions import traced_by_jax
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..parts.base import (
@@ -31,7 +35,7 @@ from ..parts.dry_friction import AbstractDryFriction
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
-from ..parts.names import unknown
+from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
 from ..parts.spatial.kinematics import SPACE
@@ -58,6 +62,12 @@ _TRACED = (
 )
 
 
+def _as_tuple(parts: Any) -> tuple[Any, ...]:
+    if isinstance(parts, AbstractPart):
+        raise ValueError(f"A scene takes lists, Scene([body, …], joints=[…]); got {parts.label}: give a list of it.")
+    return tuple(parts)
+
+
 class Scene(eqx.Module):
     """Bodies, joints and forces by name.
 
@@ -79,10 +89,14 @@ class Scene(eqx.Module):
     names the part.
     """
 
-    bodies: tuple[Any, ...] = eqx.field(converter=tuple)
-    joints: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
-    forces: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
-    frames: tuple[Any, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
+    bodies: tuple[Any, ...] = eqx.field(converter=_as_tuple)
+    joints: tuple[Any, ...] = eqx.field(converter=_as_tuple, default=(), kw_only=True)
+    forces: tuple[Any, ...] = eqx.field(converter=_as_tuple, default=(), kw_only=True)
+    frames: tuple[Any, ...] = eqx.field(converter=_as_tuple, default=(), kw_only=True)
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        check_arguments(cls.__name__, inspect.signature(cls), len(args), kwargs)
+        return super().__new__(cls)
 
     def __check_init__(self):
         _check_kinds(self)
@@ -321,7 +335,8 @@ def _check_rotation(part, components, own, layout, poses):
     points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
     space = layout.space
     for component in components if points else ():
-        strength = np.asarray(_strength(anonymous(component), space, poses))
+        with traced_by_jax(part.label, "an argument"):
+            strength = np.asarray(_strength(anonymous(component), space, poses))
         if np.any(strength[points, space.dimension :] > 0):
             raise ValueError(
                 f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "

@@ -58,9 +58,11 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     q, residual, at = _analyse(of_positions)
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
+        turn = "angle" if system.layout.space.dimension == 2 else "orientation"
         raise ValueError(
-            f"The mechanism cannot be assembled from the given poses: residuals [m, rad] remain in {listed}. Check "
-            "lengths, points and axes for joints that contradict each other, or give better poses."
+            "The scene cannot be compiled: the mechanism cannot be assembled from the given poses, residuals [m, rad] "
+            f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
+            "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
         )
     joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, np.asarray(at.scale))
     check_gradients(system, np.asarray(at.row_norms))

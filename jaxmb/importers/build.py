@@ -60,14 +60,14 @@ class Built:
 
 def build_scene(machine: Machine, notes: Notes) -> Built:
     """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
-    without_ends(machine, notes)
+    left_out = without_ends(machine, notes)
     with_rotors(machine, notes)
-    return _Builder(machine, notes).build()
+    return _Builder(machine, notes, left_out).build()
 
 
 class _Builder:
-    def __init__(self, machine: Machine, notes: Notes):
-        self.machine, self.notes = machine, notes
+    def __init__(self, machine: Machine, notes: Notes, left_out: list[str]):
+        self.machine, self.notes, self.left_out = machine, notes, left_out
         self.of_name = {joint.name: joint for joint in machine.joints}
         before = len(notes.refused)
         self.fused = fuse(machine, notes)
@@ -103,7 +103,11 @@ class _Builder:
             self.forces.append(Gravity(machine.gravity, name=self._named("gravity")))
         if self.notes.refused or not self.bodies:
             if not self.fused.carriers:
-                self.notes.refused.append("There is no moving link (base='free' sets the root link of URDF free).")
+                text = "There is no moving link (base='free' sets the root link of URDF free)."
+                if self.left_out:
+                    names = ", ".join(map(repr, self.left_out))
+                    text += f" These were left out, since they have no mass: {names}. Give them an <inertial>."
+                self.notes.refused.append(text)
             scene = none
         else:
             scene = Scene(self.bodies, joints=self.joints, forces=self.forces, frames=self.frames)

@@ -20,12 +20,15 @@ def bodies_of(machine: Machine) -> dict[str, str]:
     return {name: names[k] for name, k in zip(names, connected(len(names), welds), strict=True)}
 
 
-def without_ends(machine: Machine, notes: Notes) -> None:
+def without_ends(machine: Machine, notes: Notes) -> list[str]:
     """Take the links out of a machine that have no mass and hang at one joint, with all that they carry.
 
     They take no force, so none passes their joint, whatever acts there. Those stay that something else holds as well:
     a loop, a tendon, an actuator, or couplings that could pass a force on.
+
+    **Returns:** the names of the links that were taken out.
     """
+    before = list(machine.links)
     while True:
         of = bodies_of(machine)
         heavy = {GROUND, *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
@@ -41,7 +44,7 @@ def without_ends(machine: Machine, notes: Notes) -> None:
                 if of[link] not in heavy and held[of[link]] == 1 and _alone(machine, notes, joint):
                     ends[of[link]] = joint.name
         if not ends:
-            return
+            return [name for name in before if name not in machine.links]
         _take_out(machine, {name for name, body in of.items() if body in ends}, set(ends.values()) - {None}, notes)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._traced_functions import traced_by_jax
 from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
@@ -49,16 +50,17 @@ def constraint_sizes(
     """
     q, p = guess.q, parameters
     t = jnp.zeros((), q.dtype)
-    _shape("kinematics", (q.size,), lambda: kinematics.rates(t, q, guess.u, p))
-    _shape("lagrangian", (), lambda: lagrangian(t, q, q, p))
+    _shape("kinematics", (q.size,), kinematics.rates, t, q, guess.u, p)
+    _shape("lagrangian", (), lagrangian, t, q, q, p)
     if applied is not None:
-        _shape("force", (q.size,), lambda: applied(t, q, q, p))
-    return tuple(math.prod(_shape(c.name, None, lambda c=c: c.value(t, q, q, q, p))) for c in constraints)
+        _shape("force", (q.size,), applied, t, q, q, p)
+    return tuple(math.prod(_shape(c.name, None, c.value, t, q, q, q, p)) for c in constraints)
 
 
-def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[[], Any]) -> tuple[int, ...]:
+def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., Any], *given: Any) -> tuple[int, ...]:
     try:
-        shape = jax.eval_shape(lambda: jnp.asarray(evaluate())).shape
+        with traced_by_jax(name, "an argument"):
+            shape = jax.eval_shape(lambda *given: jnp.asarray(evaluate(*given)), *given).shape
     except TypeError as error:
         raise ValueError(f"{name} does not fit the system: {error}") from error
     if expected is not None and shape != expected:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._traced_functions import NEED_NUMBERS, traced_by_jax
 from .base import (
     AbstractConstraint,
     AbstractDynamicForce,
@@ -63,7 +64,7 @@ def _check_state_rates(part: AbstractDynamicForce, space: AbstractSpace, *given:
     """The same for the rates of internal states, each of which must have a rate of its shape."""
     states = internal_states(part)
     rates = lambda *given: part.state_rates(space, *given)
-    found = jax.eval_shape(rates, *given)
+    found = _evaluated(part.label, "state_rates", rates, given)
     if not isinstance(found, dict) or set(found) != set(states):
         names = ", ".join(states) or "none"
         raise ValueError(f"{part.label}: state_rates must return a dictionary of the internal states, {names}.")
@@ -74,7 +75,7 @@ def _check_state_rates(part: AbstractDynamicForce, space: AbstractSpace, *given:
 
 def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
     """Raise a `ValueError` unless a kernel of NumPy arrays returns this shape, and the dtype of the first of them."""
-    out = _evaluated(label, name, kernel, given)
+    out = _evaluated(label, name, lambda *own: _as_array(kernel(*own)), given)
     if not hasattr(out, "shape") or out.shape != shape:
         found = getattr(out, "shape", type(out).__name__)
         raise ValueError(f"{label}: {name} must return shape {shape}, got {found}.")
@@ -85,15 +86,22 @@ def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callabl
 def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     try:
         # NumPy arrays refuse an out-of-bounds index; JAX arrays clamp it.
-        return jax.eval_shape(lambda: _as_array(kernel(*given)))
+        of_numbers = jax.eval_shape(lambda: kernel(*given))
     except Exception as error:
         # Other errors do not count yet: NumPy arrays lack some operations, such as `.at[...]`.
         if isinstance(error, IndexError) and "out of bounds" in str(error):
             raise ValueError(f"{label}: {name} indexes out of bounds: {error}.") from error
-    try:
-        return jax.eval_shape(lambda *given: _as_array(kernel(*given)), *given)
-    except Exception as error:
-        raise ValueError(f"{label}: {name} cannot be evaluated: {str(error).strip().splitlines()[0]}") from error
+        of_numbers = None
+    with traced_by_jax(f"{name} of {label}", "an argument"):
+        try:
+            return jax.eval_shape(kernel, *given)
+        except NEED_NUMBERS:
+            raise
+        except Exception as error:
+            if of_numbers is None:
+                cause = str(error).strip().splitlines()[0]
+                raise ValueError(f"{label}: {name} cannot be evaluated: {cause}") from error
+    return of_numbers
 
 
 def _as_array(value: Any) -> Any:

@@ -17,8 +17,8 @@ class UnknownNameError(ValueError, KeyError):
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> UnknownNameError:
-    """An error for an unknown name, with the nearest known ones; of `"rod.phi"` with all names of `"rod"`. `where`:
-    the part or argument that has the name.
+    """An error for an unknown name, with the nearest known ones; of `"rod.phi"`, and of `"rod"` where names have dots,
+    with all names of `"rod"`. `where`: the part or argument that has the name.
     """
     lead = f"{where}: " if where else ""
     return UnknownNameError(f"{lead}Unknown {what} {name!r}{_hint(str(name), known)}")
@@ -26,8 +26,10 @@ def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> Unkn
 
 def _hint(name: str, known: Iterable[str]) -> str:
     known = list(dict.fromkeys(known))
-    part, dot, field = name.rpartition(".")
-    of_part = {own[len(part) + 1 :]: own for own in known if dot and own.startswith(f"{part}.")}
+    part, _, field = name.rpartition(".")
+    if any(own.startswith(f"{name}.") for own in known):
+        part, field = name, ""
+    of_part = {own[len(part) + 1 :]: own for own in known if part and own.startswith(f"{part}.")}
     if of_part:
         near = [of_part[own] for own in difflib.get_close_matches(field, of_part, n=2, cutoff=0.6)]
         listed = list(of_part.values())

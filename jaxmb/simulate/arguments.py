@@ -237,8 +237,9 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
 
 def checked_times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
     start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
-    if not is_traced(start) and not np.isfinite(start):
-        raise ValueError(f"t0 must be finite, got {t0}.")
+    for name, time in (("t0", start), ("t1", end)):
+        if not is_traced(time) and not np.isfinite(time):
+            raise ValueError(f"{name} must be finite, got {time}.")
     if dt0 is None:
         return {"t0": start, "t1": end, "dt0": None}
     step = real_array("dt0", dt0, dtype)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._arguments import check_kind, real_array, real_shape
+from .._arguments import check_kind, real_array, real_shape, warn_of_degrees
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import as_array, is_traced, replaced
-from ..parts.names import unknown
+from ..parts.names import UnknownNameError, unknown
 from ..system import AbstractSystem
 from ..system.quantities import rates_of
 
@@ -109,6 +109,30 @@ def split_names(
                 real_array(f"{what.capitalize()} {name!r}", value, dtype, (known[name].shape,))
             )
     return {name: value for name, value in values.items() if name in own}, of_joints
+
+
+def split_coordinates(
+    system: AbstractSystem, values: Mapping[str, VectorLike] | None
+) -> tuple[dict[str, VectorLike], dict[str, Any]]:
+    """As `split_names` of coordinates; of a body's angle of more than a full turn it is warned, as of one in degrees.
+
+    **Raises:** `ValueError` for a rate, and as `split_names`.
+    """
+    if isinstance(values, Mapping):
+        coordinates, rates = system.coordinate_names(), rates_of(system.rate_names())
+        for name in values:
+            base = str(name).removesuffix("_rate")
+            if name not in coordinates and (name in rates or (base != name and base in system.joint_coordinates())):
+                raise UnknownNameError(
+                    f"{name!r} is a rate, and fix holds coordinates: assemble takes it as rates={{{base!r}: …}}."
+                )
+    own, of_joints = split_names("coordinate", system, system.coordinate_names(), values)
+    if isinstance(own, Mapping):
+        for name, value in own.items():
+            if name.endswith(".angle") and real_shape(f"Coordinate {name!r}", value) == ():
+                # The user calls `assemble` and its like, which call this function.
+                warn_of_degrees(f"fix={{{name!r}: …}}", value, stacklevel=4)
+    return own, of_joints
 
 
 def split_rates(

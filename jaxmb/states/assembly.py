@@ -26,8 +26,8 @@ from .arguments import (
     checked_time,
     holding,
     prescribe,
+    split_coordinates,
     split_internal_states,
-    split_names,
     split_rates,
 )
 from .closest import closest_configuration, closest_velocities
@@ -90,7 +90,7 @@ def assemble(
     guess = checked_guess("assemble", system, guess)
     t = checked_time("assemble", t, guess.q.dtype)
     z, fix = split_internal_states(system, guess.z, fix)
-    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    fix, of_joints = split_coordinates(system, fix)
     rates, rates_of_joints = split_rates(system, rates)
     u, fixed_rates = prescribe("rate", rates_of(system.rate_names()), rates, guess.u)
     if not is_traced(u):
@@ -193,10 +193,13 @@ def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: fl
 
 def _cannot_assemble(system, t, q, fixed, names):
     text = "The mechanism cannot be assembled"
-    held = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
+    of_bodies = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
+    # Coordinates of joints that are held are rows of their names.
+    rows = [k for k, (name, _) in enumerate(system.rows) if name in system.joint_coordinates()]
+    held = [*of_bodies, *(system.rows[k][0] for k in rows)]
     if held:
-        text += f" with {', '.join(held)} fixed"
-    dependent = _dependent(system, t, q, held, names)
+        text += f" with {', '.join(dict.fromkeys(held))} fixed"
+    dependent = _dependent(system, t, q, held, [names[name][0] for name in of_bodies], rows)
     violated = violated_joints(system, t, q)
     units = " [m, rad]" if system.body_names else ""
     remain = f"residuals{units} remain in {violated}"
@@ -212,20 +215,25 @@ def _cannot_assemble(system, t, q, fixed, names):
     )
 
 
-def _dependent(system, t, q, held, names):
+def _dependent(system, t, q, held, places, rows):
     """Which fixed coordinates the constraints determine, alone or from each other, in a configuration; empty for none.
+
+    **Arguments:** `held`: their names; `places` in q of the first of them, and `rows` that hold the others, which are
+    coordinates of joints.
 
     A motion that the constraints admit changes the fixed coordinates by the rows of a basis of such motions. Rows that
     depend on each other, or vanish, belong to coordinates that cannot be chosen together.
     """
     scale = np.asarray(system.coordinate_scale())
     jacobian = np.asarray(system.coordinate_jacobian(t, q)) * scale
-    _, sizes, right = np.linalg.svd(jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), 1e-300))
+    jacobian /= np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), 1e-300)
+    _, sizes, right = np.linalg.svd(np.delete(jacobian, rows, axis=0))
     motions = right[np.sum(sizes > _DEPENDENT) :].T
-    of_held = motions[[names[name][0] for name in held]]
+    of_held = np.concatenate([motions[places], jacobian[rows] @ motions])
     left, sizes, _ = np.linalg.svd(of_held)
     combinations = left[:, np.sum(sizes > _DEPENDENT) :]
-    together = [name for name, row in zip(held, combinations, strict=True) if np.max(np.abs(row), initial=0) > 1e-6]
+    sizes = np.max(np.abs(combinations), axis=1, initial=0.0)
+    together = [name for name, size in zip(held, sizes, strict=True) if size > 1e-6]
     if not together:
         return ""
     if len(together) == 1:

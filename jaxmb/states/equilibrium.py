@@ -25,7 +25,7 @@ from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import directions
-from .arguments import check_system, checked_guess, checked_time, holding, split_internal_states, split_names
+from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
 from .closest import tolerance
 
@@ -99,7 +99,7 @@ def equilibrium(
     guess = checked_guess("equilibrium", system, guess)
     time = checked_time("equilibrium", t, guess.q.dtype)
     z, fix = split_internal_states(system, guess.z, fix)
-    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    fix, of_joints = split_coordinates(system, fix)
     system = holding(system if z is None else system.with_states(z), of_joints, {}, time)
     raises = throw is not False
     start, fixed, assembled = configuration(system, guess.q, fix, time, raises)

@@ -12,7 +12,15 @@ from jaxtyping import Array, Float
 from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.newton import newton
 from ..system import AbstractSystem
-from .arguments import check_system, checked_guess, checked_time, holding, prescribe, split_internal_states, split_names
+from .arguments import (
+    check_system,
+    checked_guess,
+    checked_time,
+    holding,
+    prescribe,
+    split_coordinates,
+    split_internal_states,
+)
 from .closest import meet_constraints, residual_size, tolerance
 
 # Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
@@ -58,7 +66,7 @@ def assembly_gap(
     guess = checked_guess("assembly_gap", system, guess)
     t = checked_time("assembly_gap", t, guess.q.dtype)
     _, fix = split_internal_states(system, guess.z, fix)
-    fix, of_joints = split_names("coordinate", system, system.coordinate_names(), fix)
+    fix, of_joints = split_coordinates(system, fix)
     system = holding(system, of_joints, {}, t)
     q, fixed = prescribe("coordinate", system.coordinate_names(), fix, guess.q)
     q, _ = system.normalize_fixed(q, fixed)

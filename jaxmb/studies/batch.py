@@ -12,16 +12,10 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._compat import ClosedJaxpr, Jaxpr
+from .._traced_functions import NEED_NUMBERS
 from ..linalg.arrays import ARRAYS
 from ..parts.names import names_arguments
 
-# What JAX raises where a number is asked for that is not known in tracing.
-NEED_NUMBERS = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-    jax.errors.NonConcreteBooleanIndexError,
-)
 # What the loops of the members of a block may carry [bytes], and the most members of a block.
 _CARRIED, _MOST = 2**20, 64
 

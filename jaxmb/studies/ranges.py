@@ -50,6 +50,11 @@ class AbstractRange(eqx.Module):
         """
 
     @property
+    def ends(self) -> tuple[Array, Array] | None:
+        """Both bounds, each of the value's shape; None where one is missing."""
+        return None
+
+    @property
     def componentwise(self) -> bool:
         """Whether every component of the value belongs to one component of `z`."""
         return self.size == self.start.size
@@ -125,6 +130,10 @@ class Interval(AbstractRange):
         value, width = self(z), np.asarray(self.high - self.low)
         distance = np.asarray(jnp.minimum(value - self.low, self.high - value))
         return _indistinct(distance, width, deviations)
+
+    @property
+    def ends(self):
+        return self.low, self.high
 
     def draw(self, random):
         # Between two bounds every value is as likely as any other.
@@ -247,6 +256,14 @@ class FreeParameters(eqx.Module):
         for name, r, own in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
             out.append(np.ravel(r.at_end(z[self.place(name)], own.reshape(r.start.shape))))
         return np.concatenate(out)
+
+    def ends(self) -> list[tuple[float, float] | None]:
+        """Both bounds of each of all values, raveled one after the other; None where one is missing."""
+        out: list[tuple[float, float] | None] = []
+        for r in self.ranges:
+            ends = [None] * r.start.size
+            out += ends if r.ends is None else zip(*(np.ravel(bound).tolist() for bound in r.ends), strict=True)
+        return out
 
     def locate(self, values: Mapping[str, Array]) -> Float[Array, "n"]:
         """The vector of values by name."""

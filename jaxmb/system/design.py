@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._arguments import check_kind, real_shape
+from .._traced_functions import traced_by_jax
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
@@ -122,7 +123,8 @@ def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Arra
             )
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"The derived parameter {name!r} is not finite: {np.asarray(value)}.")
-    program = jax.make_jaxpr(own.derive)(dict(own.values)).jaxpr
+    with traced_by_jax("derive", "a design variable"):
+        program = jax.make_jaxpr(own.derive)(dict(own.values)).jaxpr
     used = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
     # As JAX orders the entries of a dictionary.
     idle = [name for name, v in zip(sorted(own.values), program.invars, strict=True) if id(v) not in used]

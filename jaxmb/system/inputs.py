@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
+from .._traced_functions import traced_by_jax
 from .._types import Scalar
 from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal
@@ -46,7 +47,8 @@ def with_inputs(system: System, inputs: Signals) -> System:
             raise ValueError(f"The design variable {name!r} must be constant; make a parameter an input instead.")
         signals[name] = as_signal(name, value)
         t: Any = np.zeros((), known[name].dtype)
-        found = eqx.filter_eval_shape(signals[name], t)
+        with traced_by_jax(f"the input {name!r}", "the time"):
+            found = eqx.filter_eval_shape(signals[name], t)
         if not hasattr(found, "shape") or found.shape != known[name].shape:
             raise ValueError(
                 f"The input {name!r} must have shape {known[name].shape} at each time, as the parameter has; got "

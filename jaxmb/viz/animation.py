@@ -12,7 +12,7 @@ from ..parts.names import names_arguments
 from ..parts.shapes import AbstractShape
 from ..trajectory import Trajectory
 from . import scenery
-from .motion_nodes import Motion, chosen, motion
+from .motion_nodes import Motion, check_shapes, chosen, motion
 from .solids import COLORS
 from .stage import SceneNode, page
 
@@ -103,8 +103,11 @@ def show(
         if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be a positive number, got {value!r}.")
     points, reactions, forces = (_listed(names) for names in (points, reactions, forces))
+    shapes = shapes or {}
+    for own in _named(trajectory).values():
+        check_shapes(own.system, shapes)
     motions = [
-        motion(name, chosen(own, frames), shapes or {}, COLORS[k % len(COLORS)] if overlay else None)
+        motion(name, chosen(own, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
         for k, (name, own) in enumerate(_named(trajectory).items())
     ]
     forces_of = [_arrows(own, reactions, forces) for own in motions]

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..parts.base import GROUND
 from ..parts.names import unknown
 from ..parts.shapes import DARK, AbstractShape, Color, along
+from ..system import AbstractSystem
 from ..system.picture import Picture
 from ..trajectory import Trajectory
 from . import stage
@@ -183,13 +184,18 @@ def motion(
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
     shown = trajectory.system.picture(trajectory.ts, trajectory.ys)
+    return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
+
+
+def check_shapes(system: AbstractSystem, given: Mapping[str, AbstractShape | Sequence[AbstractShape]]) -> None:
+    """Raise a `ValueError` for shapes of unknown bodies and for anything but shapes, before a picture is computed."""
+    known = (*system.body_names, GROUND)
     for body, own in given.items():
-        if body not in shown.positions:
-            raise unknown("body", body, shown.positions)
+        if body not in known:
+            raise unknown("body", body, known)
         listed = own if isinstance(own, Sequence) else [own]
         if not all(isinstance(shape, AbstractShape) for shape in listed):
             raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {own!r}.")
-    return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 
 def chosen(trajectory: Trajectory, frames: int) -> Trajectory:

@@ -115,7 +115,10 @@ def test_a_planar_joint():
             "The text:1: the links make no tree: no joints lead from 'a' to 'b', 'c'",
         ),
         (robot(link("a"), joint("j", "a", "b")), r"The text:3: joint 'j' has the child 'b', and there is no such link"),
-        (robot(link("a"), link("b", ""), joint("j", "a", "b")), "There is no moving link .base='free' sets"),
+        (
+            robot(link("a"), link("b", ""), joint("j", "a", "b")),
+            "There is no moving link .base='free' sets.* no mass: 'b'. Give them an <inertial>",
+        ),
         (
             robot(link("a"), link("b", INERTIAL.replace('"2"', '"0"')), joint("j", "a", "b")),
             "The text:3: Body 'b': mass must be positive, got 0.0",

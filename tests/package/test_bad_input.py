@@ -34,6 +34,8 @@ REFUSED = {
     "dot in a name": (lambda: mb.Scene([bar("a.b")]), "dot"),
     "unknown body": (lambda: mb.Scene([bar()], joints=[pin(b="baar")]), "pin.*Unknown body 'baar'; did you mean 'bar'"),
     "joint with itself": (lambda: mb.Scene([bar()], joints=[pin(a="bar")]), "pin.*with itself"),
+    "a body without a list": (lambda: mb.Scene(bar()), "A scene takes lists, .*got Body 'bar': give a list of it"),
+    "a joint without a list": (lambda: mb.Scene([bar()], joints=pin()), "got Revolute 'pin': give a list of it"),
     "no bodies": (lambda: mb.Scene([]), "at least one body"),
     "force among joints": (
         lambda: mb.Scene([bar()], joints=[mb.Gravity((0, -1))]),
@@ -108,7 +110,7 @@ REFUSED = {
                 planar.Revolute("B", "ground", "b", point_a=(5, 0), point_b=(0.5, 0)),
             ],
         ).compile(),
-        r"cannot be assembled.*residuals \[m, rad\] remain in .*B",
+        r"cannot be compiled.*cannot be assembled.*residuals \[m, rad\] remain in .*B.* position and the angle of each",
     ),
     "inconsistent redundant joints": (
         lambda: mb.Scene(
@@ -335,6 +337,7 @@ ARGUMENTS = {
     "two ends": ({"t1": [1.0, 2.0]}, "t1 must be a real number"),
     "NaN as the start": ({"t0": np.nan}, "t0 must not be NaN"),
     "endless past": ({"t0": -np.inf}, "t0 must be finite"),
+    "endless future": ({"t1": np.inf}, "t1 must be finite, got inf"),
     "complex start": ({"t0": 1j}, "t0 must be a real number"),
     "tolerance in words": ({"rtol": "1e-6"}, "rtol must be a real number"),
     "no tolerance": ({"rtol": None}, "rtol must be a real number, got None"),

@@ -1,5 +1,6 @@
 """What a user reads after a slip: the nearest names, what an object has, and which values depend on each other."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -32,10 +33,59 @@ def test_an_unknown_coordinate_lists_those_of_the_body(pendulum):
         mb.assemble(pendulum, fix={"rod.angel": 0.3})
 
 
+def gust(poses, velocities, t, parameters):
+    return jnp.array([[math.sin(t), 0.0, 0.0]])
+
+
+wind = mb.Force("wind", "bob", gust)
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (
+            lambda system: mb.with_inputs(system, {"pin.point_a": lambda t: np.array([np.sin(t), 0.0])}),
+            r"`.*np\.sin\(t\).*` needs the time as a number, and the input 'pin\.point_a' is traced by JAX: .*Use jnp",
+        ),
+        (
+            lambda system: mb.with_inputs(system, {"rod.mass": lambda t: 1.0 if t > 0.5 else 2.0}),
+            "needs the time as a number",
+        ),
+        (
+            lambda system: mb.design(system, {"length": 1.0}, lambda v: {"rod.inertia": float(v["length"])}),
+            "needs a design variable as a number, and derive",
+        ),
+        (lambda system: mb.optimise(lambda v: np.sin(v["x"]), {"x": 1.0}), "a parameter.* the function of optimise"),
+        (
+            lambda system: mb.Scene([planar.Body("bob", mass=1.0, inertia=0.1)], forces=[wind]).compile(),
+            r"test_messages\.py:\d+: `return .*math\.sin\(t\).*` needs an argument .*wrenches of Force 'wind'",
+        ),
+        (
+            lambda system: mb.Scene([planar.PointMass("bob", mass=1.0)], forces=[wind]).compile(),
+            "needs an argument as a number, and Force 'wind'",
+        ),
+        (
+            lambda system: mb.lagrangian.LagrangianSystem(lambda t, q, v, p: 0.5 * np.dot(v, v), q=[1.0]),
+            r"`.*np\.dot\(v, v\).*` needs an argument as a number, and lagrangian is traced",
+        ),
+    ],
+    ids=["NumPy", "branch", "design", "optimise", "Force", "Force on a point", "LagrangianSystem"],
+)
+def test_numbers_that_functions_of_the_user_do_not_get(pendulum, use, message):
+    with pytest.raises(ValueError, match=message):
+        use(pendulum)
+
+
 def test_an_angle_in_degrees_is_warned_of():
     scene = mb.Scene([mb.planar.Body("rod", mass=1.0, inertia=0.1, angle=90.0)])
     with pytest.warns(UserWarning, match=r"'rod': the angle 90 rad is more than .*; .*np.deg2rad\(90\) is 1.571"):
         scene.compile()
+
+
+def test_a_fixed_angle_in_degrees_is_warned_of(pendulum):
+    with pytest.warns(UserWarning, match=r"fix=\{'rod\.angle': …\}: the angle 90 rad is more than a full") as caught:
+        mb.assemble(pendulum, fix={"rod.angle": 90.0})
+    assert caught[0].filename == __file__
 
 
 def test_views_list_what_they_have(motion):
@@ -126,6 +176,24 @@ def test_unknown_arguments_of_parts():
         planar.Revolute("pin", "ground", "rod", (0.0, 0.0), (1.0, 0.0))  # pyright: ignore
 
 
+def test_bodies_and_joints_of_a_scene_by_position():
+    with pytest.raises(TypeError, match=r"Scene takes 1 arguments by position, bodies; got 2; .*: joints, forces"):
+        mb.Scene([planar.PointMass("bob", mass=1.0)], [])  # pyright: ignore
+
+
+def test_the_name_of_a_part_in_place_of_its_numbers(pendulum):
+    with pytest.raises(ValueError, match=r"Unknown parameter 'pin'; 'pin' has 'pin\.point_a', 'pin\.point_b'"):
+        mb.with_inputs(pendulum, {"pin": lambda t: t})
+
+
+def test_initial_states_that_cannot_be(pendulum):
+    measured = {"measured": {"rod.angle": np.zeros(2)}, "ts": [0.01, 0.02], "free": {"rod.inertia": 0.1}}
+    with pytest.raises(ValueError, match=r"coordinates of bodies, not of joints, and 'pin\.angle' is of a joint"):
+        mb.identify(pendulum, **measured, free_initial=("pin.angle",))
+    with pytest.raises(ValueError, match=r"rod\.x and rod\.angle depend on each other"):
+        mb.identify(pendulum, **measured, fix={"rod.angle": 1.0, "rod.x": 0.3})
+
+
 def test_unknown_arguments_of_functions(pendulum):
     with pytest.raises(TypeError, match="simulate has no argument 'tol'; did you mean 'rtol'"):
         mb.simulate(pendulum, mb.assemble(pendulum), t1=1.0, tol=1e-3)  # pyright: ignore
@@ -136,6 +204,20 @@ def test_unknown_arguments_of_functions(pendulum):
 def test_fixed_coordinates_that_depend_on_each_other(pendulum):
     with pytest.raises(ValueError, match=r"rod\.x and rod\.angle depend on each other: of these 2 .* only 1 can be"):
         mb.assemble(pendulum, fix={"rod.x": 0.3, "rod.angle": 1.0})
+
+
+def test_a_coordinate_of_a_joint_that_depends_on_another_fixed_one(pendulum):
+    with pytest.raises(ValueError, match=r"with rod\.angle, pin\.angle fixed: rod\.angle and pin\.angle depend"):
+        mb.assemble(pendulum, fix={"rod.angle": 0.3, "pin.angle": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [("rod.angle_rate", "rod.angle"), ("pin.angle_rate", "pin.angle"), ("rod.velocity", "rod.velocity")],
+)
+def test_a_rate_is_no_coordinate(pendulum, name, rate):
+    with pytest.raises(ValueError, match=rf"'{name}' is a rate, .* assemble takes it as rates=\{{'{rate}': …\}}"):
+        mb.assemble(pendulum, fix={name: 1.0})
 
 
 @pytest.mark.parametrize(

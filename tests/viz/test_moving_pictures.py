@@ -186,6 +186,12 @@ def test_given_shapes_take_the_place_of_bars(pendulum, tmp_path):
     assert np.array_equal(page.values(mesh, "batched_colors")[1][0], (1, 2, 3))
 
 
+def test_shapes_of_unknown_bodies_are_refused_before_anything_is_computed(pendulum):
+    motion = dataclasses.replace(pendulum[0], ys=None)
+    with pytest.raises(ValueError, match="Unknown body 'baar'; did you mean 'bar'"):
+        viz.show(motion, shapes={"baar": shapes.Sphere(0.2)})
+
+
 def test_bodies_on_which_nothing_acts_are_cuboids_of_their_inertia():
     moments = np.array([[2.0, 0.3, 0.1], [0.3, 1.5, -0.2], [0.1, -0.2, 1.2]])
     bodies = [spatial.Body("free", mass=3.0, inertia=moments), spatial.PointMass("mass", mass=1.0)]

@@ -1,11 +1,11 @@
 """Planar bodies, and moments of inertia of common shapes."""
 
-import warnings
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..._arguments import warn_of_degrees
 from ...linalg.rotations import rotate_2d
 from .. import fields
 from ..base import AbstractBody, AbstractPlanarPart
@@ -28,12 +28,8 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
 
     def validate(self):
         # A system's bodies of one kind share their numbers, and have no guess.
-        if self.angle is not None and abs(self.angle) > 2 * np.pi:
-            warnings.warn(
-                f"{self.label}: the angle {self.angle:g} rad is more than a full turn; angles are in radians, "
-                f"np.deg2rad({self.angle:g}) is {np.deg2rad(self.angle):.4g}.",
-                stacklevel=2,
-            )
+        if self.angle is not None:
+            warn_of_degrees(self.label, self.angle, stacklevel=2)
 
     def pose(self):
         return np.append(self.position, self.angle)

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._results import RESULTS
+from ..._traced_functions import traced_by_jax
 from ..._types import Scalar, State, VectorLike
-from ...parts.names import unknown
+from ...parts.names import UnknownNameError, unknown
 from ...simulate import simulate
 from ...simulate.moving_times import frozen_times
 from ...states.assembly import assemble
@@ -122,14 +123,18 @@ class ExperimentModel(eqx.Module):
         """The system with these unknowns."""
         return with_parameters(system, self.known | {name: theta[name] for name in self.changed})
 
-    def start(self, system: AbstractSystem, theta: Mapping[str, Array]) -> tuple[AbstractSystem, State]:
-        """The system with these unknowns, and its initial state; NaN if there is none."""
+    def start(
+        self, system: AbstractSystem, theta: Mapping[str, Array], throw: bool | None = False
+    ) -> tuple[AbstractSystem, State]:
+        """The system with these unknowns, and its initial state; NaN if there is none, or with `throw` as `assemble`
+        has it.
+        """
         system = self.changed_system(system, theta)
         if self.assembled:
             return system, self.state
         fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
         rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
-        return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=False)
+        return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=throw)
 
     def simulated(
         self,
@@ -166,7 +171,8 @@ class ExperimentModel(eqx.Module):
             readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
             rows.append(channel.rows(readings[channel.name], theta, self.loss))
         if self.residual is not None:
-            readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
+            with traced_by_jax("the residual function", "the motion"):
+                readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
             rows.append(_of_user(readings[RESIDUAL], self.loss))
         joined = Rows(
             jnp.concatenate([own.residuals for own in rows]),
@@ -307,6 +313,11 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
         return Initial(name, False)
     if name in rates:
         return Initial(name, True)
+    if name in (joints := system.joint_coordinates()) or name.removesuffix("_rate") in joints:
+        raise UnknownNameError(
+            f"free_initial takes coordinates of bodies, not of joints, and {name!r} is of a joint; there are "
+            f"{', '.join(map(repr, [*coordinates, *rates]))}."
+        )
     raise unknown("initial coordinate or rate", name, [*coordinates, *rates])
 
 

@@ -296,13 +296,16 @@ def _judged(problem, z, components, ends, segments, found, own, far, known_noise
         )
         reasons |= dict.fromkeys(undetermined, _UNDETERMINED)
     at_end = problem.free.at_end(z, deviations)
-    each = zip(components, at_end, _flat(problem.free(z)), _flat(problem.free.start), strict=True)
-    for name, reached, value, start in each:
+    values, starts = _flat(problem.free(z)), _flat(problem.free.start)
+    each = zip(components, at_end, values, starts, problem.free.ends(), strict=True)
+    for name, reached, value, start, bounds in each:
         if reached:
+            cure = "restrict it to plausible values (bounds=)"
+            if bounds is not None:
+                cure = "it is held by bounds=({:.6g}, {:.6g}): widen them".format(*bounds)
             warnings.append(
-                f"{name} = {value:.3g} is at an end of its range, from a start at {start:.3g}: "
-                "restrict it to plausible values (bounds=), try other starts (starts=), or leave it out of free if its "
-                "effect is nothing"
+                f"{name} = {value:.3g} is at an end of its range, from a start at {start:.3g}: {cure}, try other "
+                "starts (starts=), or leave it out of free if its effect is nothing"
             )
             reasons[name] = "at its end"
     if finite and len(ends) > 1:

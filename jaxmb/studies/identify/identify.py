@@ -284,11 +284,17 @@ def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int
 
 
 def _check_start(problem: Problem, model: Model) -> None:
-    fitted = [name for name, own in zip(problem.names, problem.fitted, strict=True) if own]
-    for name, result in zip(fitted, model.results, strict=True):
+    fitted = [number for number, own in enumerate(problem.fitted) if own]
+    for number, result in zip(fitted, model.results, strict=True):
         if not bool(result == RESULTS.successful):
             text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
+            name = problem.names[number]
             where = f" of experiment {name!r}" if name else ""
+            try:
+                problem.trials[number].start(problem.system, problem.own(number, problem.free.start), throw=None)
+            except ValueError as error:
+                # It names the coordinates, of fix, rates and free_initial together.
+                text = str(error)
             raise ValueError(f"The simulation{where} fails with the starting values: {text}")
     residuals, jacobian, _ = model.plain
     if not np.all(np.isfinite(residuals)):

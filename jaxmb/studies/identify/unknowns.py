@@ -240,7 +240,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
         # What is the same for all values is found, and differentiated, once.
-        guess = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0, throw=False)
+        guess = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():
             first = found.setdefault(source, what)

@@ -39,6 +39,8 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
             callback=trials.record,
             options={"ftol": tol, "maxiter": left},
         )
+        if result.status == 0:
+            trials.ended(result.x)
         return result.nit, result.status == 0, str(result.message)
 
     return _repeated(run, trials, start, tol, limit)

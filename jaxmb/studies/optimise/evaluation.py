@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
 from ..batch import batch
@@ -87,6 +88,15 @@ class Limits:
     low: np.ndarray
     high: np.ndarray
 
+    def worst(self, values: np.ndarray, scales: np.ndarray) -> str:
+        """The component that is farthest out of its bounds, relative to its size, in words."""
+        k = int(np.argmax(self.excess(values) / scales))
+        low, high = self.low[k], self.high[k]
+        if low == high:
+            return f"{self.components[k]!r} is {values[k]:.6g} instead of {low:.6g}"
+        side = f"below {low:.6g}" if values[k] < low else f"above {high:.6g}"
+        return f"{self.components[k]!r} is {values[k]:.6g}, {side}"
+
     def excess(self, values: np.ndarray) -> np.ndarray:
         """How far components are out of their bounds; zero within."""
         return np.maximum(np.maximum(self.low - values, values - self.high), 0.0)
@@ -97,7 +107,8 @@ def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
 
     **Raises:** `ValueError` for outputs that are no real numbers.
     """
-    found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
+    with traced_by_jax("the function of optimise", "a parameter"):
+        found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
     found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
     shapes = {}
     for name, own in found.items():

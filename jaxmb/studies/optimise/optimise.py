@@ -204,7 +204,8 @@ def optimise(
     assembled and gives no warning of it: where the best designs lie there, constrain a margin as well, such as the sine
     of the transmission angle.
 
-    **Returns:** an `Optimum`, the best of all trials whose constraints hold.
+    **Returns:** an `Optimum`, the best of all trials whose constraints hold to a millionth of their size; of
+    `"slsqp"`, where it converged, the last one, unless a better one breaks them by no more.
 
     **Raises:** `ValueError` for unknown names, bounds that are reversed, a start out of bounds, an objective that is no
     number, a function without derivatives, and a start that fails if no constraint leads away from it.
@@ -250,7 +251,8 @@ def optimise(
     if spent:
         message = f"{message}; {spent} trials led from the start, which failed, to one that does not"
     if trials.violation(best) > HOLDS:
-        message = f"{message}; constraints are violated"
+        worst = limited.worst(best.rows[1:], trials.scales)
+        message = f"{message}; constraints are violated, most of all {worst}"
     rows_before = _rows(before, names)
     columns = (limited.components, limited.low, limited.high, rows_before[1:], best.rows[1:], active, sizes)
     return Optimum(

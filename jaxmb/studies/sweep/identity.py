@@ -5,7 +5,6 @@ import functools
 import hashlib
 import importlib.util
 import sys
-import sysconfig
 import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -16,14 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ..._traced_functions import is_installed
 from .cases import Cases
 
 # What jaxmb itself rests on. A new version of these is no other study.
 _FOUNDATION = {"jaxmb", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "lineax", "optimistix", "jaxtyping"}
-_PACKAGES = {
-    Path(place).resolve()
-    for place in (*(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")), Path(__file__).parents[2])
-}
 # What `functools.wraps` and `jax.jit` write on a function, which says nothing that the function does not.
 _OF_WRAPPERS = {"__wrapped__", *functools.WRAPPER_ASSIGNMENTS, "_jit_info"}
 
@@ -60,13 +56,6 @@ def identity_of_outputs(variables: Mapping[str, Any], cases: Cases) -> str:
         elif name not in cases.columns:
             digest.update(f"{dims} {values.dtype} {shape}".encode() + np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
-
-
-@functools.cache
-def is_installed(file: str | None) -> bool:
-    """Whether a file belongs to an installed package, the standard library or jaxmb, and not to the user."""
-    # Code that was never in a file has a name in angle brackets.
-    return file is not None and file[0] != "<" and any(place in _PACKAGES for place in Path(file).resolve().parents)
 
 
 class _Hash:

@@ -1,7 +1,6 @@
 """Outputs of a swept function: arrays by name, and how each member ended."""
 
 import inspect
-import traceback
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -11,9 +10,8 @@ import numpy as np
 from jax.core import Tracer
 
 from ..._compat import ClosedJaxpr, Jaxpr, Literal, canonical, codes_of, is_enumerated, messages_of
+from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
-from ..batch import NEED_NUMBERS
-from .identity import is_installed
 
 PENDING, OK, NOT_FINITE = 0, 1, 2
 RESERVED = ("member", "status", "message", "num_steps", "result")
@@ -44,10 +42,8 @@ class Outputs(NamedTuple):
 
 def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixed: Any) -> Returned:
     """Call the function for one member, and sort what it returns."""
-    try:
+    with traced_by_jax("the function of a sweep", "a parameter"):
         given = function(**parameters, **fixed)
-    except NEED_NUMBERS as error:
-        raise ValueError(_explained(error)) from error
     if not isinstance(given, Mapping):
         raise ValueError(
             f"The function of a sweep must return a dictionary of outputs by name, got {type(given).__name__}."
@@ -66,17 +62,6 @@ def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixe
     if not values:
         raise ValueError("The function of a sweep returned no outputs.")
     return Returned(values, result, steps)
-
-
-def _explained(error: Exception) -> str:
-    """Which line of the user's needs the number of a parameter, and what to write instead."""
-    lines = [f for f in traceback.extract_tb(error.__traceback__) if not is_installed(f.filename)]
-    where = f"{lines[-1].filename}:{lines[-1].lineno}: `{lines[-1].line}`" if lines else "The function"
-    return (
-        f"{where} needs a parameter as a number, and the function of a sweep is traced by JAX, for all members at "
-        "once: there is no `if`, `while`, `float()`, `int()` or NumPy function of what depends on a parameter. Use "
-        "jnp.where or jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy."
-    )
 
 
 def _flat(prefix: str, given: Mapping[str, Any]):

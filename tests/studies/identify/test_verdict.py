@@ -121,7 +121,7 @@ def test_a_wrong_fit_says_so(system, exact, name, sigma):
     if name == "another zero":
         assert "'theta.bias'" in words
     if name == "bounds without the truth":
-        assert "length = 0.85 is at an end of its range" in words
+        assert "length = 0.85 is at an end of its range" in words and "it is held by bounds=(" in words
 
 
 # The speed is such that the phase of the crank depends much on the spring.

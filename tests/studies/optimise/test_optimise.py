@@ -44,6 +44,17 @@ def test_what_is_printed(in_disk):
     assert in_disk.iterations[0].violation > 0 and in_disk.trials >= len(in_disk.iterations) - 1
 
 
+def test_the_end_is_preferred_to_trials_that_gain_by_breaking_a_constraint():
+    cube = lambda v: {"x": v["x"], "cube": v["x"] ** 3}
+    best = mb.optimise(cube, {"x": 3.0}, objective="x", constraints={"cube": (0.7, None)})
+    assert best.success and best.outputs["cube"] >= 0.7 - 1e-12
+
+
+def test_a_problem_without_solution_names_the_constraint():
+    best = mb.optimise(valley, START, objective="f", constraints={"square": (None, 1.0), "x": ([-2.0, 3.0], None)})
+    assert not best.success and "most of all 'square' is " in best.message and best.message.endswith(", above 1")
+
+
 def test_trust_constr_agrees(in_disk):
     other = mb.optimise(valley, START, objective="f", constraints=DISK, method="trust-constr")
     assert other.success
