@@ -2,8 +2,6 @@
 
 import inspect
 import itertools
-import inspect
-import itertools
 from collections.abc import Sequence
 from typing import Any, Self
 
