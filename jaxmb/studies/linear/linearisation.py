@@ -203,16 +203,15 @@ class Linearisation(eqx.Module):
 
 def _without_rounding(linear):
     """Eigenvalues with zero for what rounding explains, and their vectors in units of the states' sizes."""
-    values, vectors = map(np.asarray, _spectrum(linear))
-    widths = np.asarray(_widths(linear))
-    shapes = vectors * widths[:, None]
+    (values, vectors), widths = _spectrum(linear), np.asarray(_widths(linear))
+    shapes = np.asarray(vectors) * widths[:, None]
     if not np.all(np.isfinite(shapes)):
-        return values, shapes
+        return np.asarray(values), shapes
     # The norms of the left eigenvectors w with wᵀ v = 1 and |v| = 1: a change dA moves λ by |w| |dA| at most.
     conditions = np.linalg.norm(np.linalg.pinv(shapes / np.linalg.norm(shapes, axis=0)), axis=1)
     largest, eps = np.linalg.norm(np.asarray(linear.A) * widths[:, None] / widths), np.finfo(widths.dtype).eps
     least = _ROUNDING * largest * np.minimum(eps * conditions, np.sqrt(eps))
-    real, imaginary = (np.where(np.abs(x) > least, x, 0.0) for x in (values.real, values.imag))
+    real, imaginary = (np.where(np.abs(x) > least, x, 0.0) for x in map(np.asarray, (values.real, values.imag)))
     return real + 1j * imaginary, shapes
 
 
