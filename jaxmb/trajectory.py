@@ -20,10 +20,11 @@ from ._results import RESULTS
 from ._types import State
 from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
-from .linalg.arrays import is_traced
+from .linalg.arrays import ARRAYS, is_traced
 from .manifold import after_jumps, next_number, project_normalized
-from .parts.names import unknown
+from .parts.names import UnknownNameError, unknown
 from .system import Reaction, Solved
+from .system.quantities import with_shapes
 from .system.residuals import row_sizes
 
 
@@ -36,9 +37,20 @@ class ConstraintViolation(NamedTuple):
     position: Float[Array, "times"]
     velocity: Float[Array, "times"]
 
+    def __repr__(self) -> str:
+        if is_traced(self) or not all(isinstance(values, ARRAYS) for values in self):
+            return f"ConstraintViolation: {with_shapes(self._asdict(), {})}"
+        position, velocity = (np.max(values, initial=0.0) for values in self)
+        return f"ConstraintViolation: at most {position:.2g} of positions, {velocity:.2g} 1/s of velocities"
+
 
 # The number of names that `print` of a motion shows.
 _SHOWN = 12
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{more}"
 
 
 class _ByName(Mapping[str, Any]):
@@ -110,9 +122,13 @@ class Trajectory(eqx.Module):
     found_events: FoundEvents | None = None
     closer: "Trajectory | None" = None
 
-    def __repr__(self) -> str:
+    def _is_known(self) -> bool:
+        """Whether there are numbers to print."""
         known = isinstance(self.ts, jax.Array | np.ndarray) and "num_steps" in self.stats
-        if not known or is_traced((self.ts, self.result, self.stats)):
+        return known and not is_traced((self.ts, self.result, self.stats))
+
+    def __repr__(self) -> str:
+        if not self._is_known():
             return super().__repr__()
         ts, steps, ended = (np.asarray(x) for x in (self.ts, self.stats["num_steps"], self.result._value))
         finite, names = ts[np.isfinite(ts)], list(self)
@@ -124,15 +140,30 @@ class Trajectory(eqx.Module):
             text = (
                 f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result] or 'successful'}"
             )
-        more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
-        return f"{text}\nNames: {', '.join(names[:_SHOWN])}{more}"
+        forces = self._force_names()
+        own = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
+        return f"{text}\nNames: {_listed(names)}{own}"
 
     def __getitem__(self, name: str) -> Any:
         if name in self.system.motion_names():
             return self._motion(name)
         if name in self:
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
+        if name in self._force_names():
+            raise UnknownNameError(f"{name!r} is a force: motion.forces[{name!r}] is what it exerts.")
         raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self)
+
+    def __getattr__(self, name: str) -> Any:
+        # Private names are what JAX and notebooks look for; fields are missing while an object is made.
+        if not name.startswith("_") and "system" in vars(self):
+            for view, names in (("motion", self), ("motion.forces", self._force_names())):
+                if name in names:
+                    raise AttributeError(f"A motion has its parts by their names: {view}[{name!r}].")
+        # Python's own error, or that which the property of this name raised.
+        return super().__getattribute__(name)
+
+    def _force_names(self) -> tuple[str, ...]:
+        return self.system.force_names() if self.system.body_names else ()
 
     def __iter__(self) -> Iterator[str]:
         """The names that `trajectory[name]` takes."""
@@ -454,6 +485,20 @@ class GlobalError(NamedTuple):
     motion: Trajectory
     closer: Trajectory
 
+    def __repr__(self) -> str:
+        if not self.motion._is_known() or not isinstance(self.motion.ys, State):
+            return f"GlobalError of a {type(self.motion).__name__}"
+        found = np.asarray(self.largest)
+        of_batch = f", in {found.size} runs" if found.ndim else ""
+        return f"GlobalError: at most {np.max(found):.2g} of the largest coordinate or velocity{of_batch}"
+
+    @property
+    def largest(self) -> Array:
+        """The largest error of the saved coordinates, velocities and internal states, relative to the largest of each
+        kind: in units of the system's size, or of what is typical of a state, so that metres and radians compare.
+        """
+        return _largest_error(self.motion)
+
     @property
     def ys(self) -> Any:
         """Of every saved state, in the units of each coordinate and velocity."""
@@ -475,6 +520,19 @@ def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[A
     names = {4: "euler_parameter", 3 if 3 in sizes else 2: "axis"}
     labels = lambda size: list("xyz"[:size]) if names.get(size) == "axis" else list(range(size))
     return {size: (names.get(size, f"component_of_{size}"), labels(size)) for size in sizes}
+
+
+@eqx.filter_jit
+@_of_each_member
+def _largest_error(motion):
+    system, errors = motion.system, _distance(motion.ys, motion.closer.ys)
+    scales = State(system.coordinate_scale(), system.velocity_scale(), system.state_scale() if system.nz else None)
+
+    def relative(error, values, scale):
+        error, size = (jnp.max(jnp.abs(x) / scale[None], initial=0.0) for x in (error, values))
+        return error / jnp.where(size > 0, size, 1.0)
+
+    return jnp.max(jnp.stack(jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))))
 
 
 def _distance(a, b):

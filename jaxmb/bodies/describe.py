@@ -1,10 +1,20 @@
-"""A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and what is specialised away."""
+"""A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and what is left out."""
 
 from typing import Any
 
 from ..parts.base import AbstractInertialConstraint
 from ..parts.unilateral import AbstractUnilateralConstraint
-from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
+from ..system.description import (
+    LEFT_OUT,
+    NO_FREEDOM,
+    Description,
+    count_independent,
+    count_rows,
+    counted,
+    held_in_place,
+    left_out_of_constraints,
+    shorten,
+)
 from ..system.design_variables import description_rows
 
 
@@ -26,33 +36,30 @@ def describe_scene(system: Any) -> Description:
     counts = sum(len(g.group.names) * g.group.rows for g in system.tendons)
     normalizations = system.coordinate_rows - system.position_rows - counts
     facts = [
-        ("scene", f"{'spatial' if system.spatial else 'planar'}, {count} bodies"),
+        ("scene", f"{'spatial' if system.spatial else 'planar'}, {counted(count, 'body', 'bodies')}"),
         ("velocities", str(system.nu)),
         ("constraint rows", count_rows(system)),
         ("degrees of freedom", f"{system.nu - system.velocity_rank} by rank, {grubler} by Grübler's count of rows"),
         ("independent", count_independent(system)),
     ]
     if normalizations:
-        with_them = f"{system.nq}, with {normalizations} normalisations"
-        with_them += f" and {counts} counts of turns" * (counts > 0)
-        with_them += f"; rank of all {system.coordinate_rows} rows"
+        with_them = f"{system.nq}, with {counted(normalizations, 'normalisation')}"
+        with_them += f" and {counted(counts, 'count')} of turns" * (counts > 0)
+        with_them += f"; rank of all {counted(system.coordinate_rows, 'row')}"
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
     if system.nz:
         facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
     kind, frictions = lambda g: g.group.part.kind, system.frictions
+    rows = lambda g: f"{counted(g.rows, 'row')} each"
     plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
     gravity = [] if system.gravity is None else [("Gravity", system.gravity_name, "")]
     tables = {
         "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
-        "joints": [(kind(g), shorten(g.group.names), f"{g.rows} rows each" + note) for gs, note in joints for g in gs],
+        "joints": [(kind(g), shorten(g.group.names), rows(g) + note) for gs, note in joints for g in gs],
         "contacts": [
             *((kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)),
             *(
-                (
-                    kind(g),
-                    shorten(g.group.names),
-                    f"of {shorten(g.joints)}, where it sticks {g.rows} row{'s' * (g.rows > 1)} each",
-                )
+                (kind(g), shorten(g.group.names), f"of {shorten(g.joints)}, where it sticks {rows(g)}")
                 for g in frictions
             ),
         ],
@@ -65,12 +72,11 @@ def describe_scene(system: Any) -> Description:
         "frames": plainly(system.frames),
         "design variables": description_rows(system.design),
     }
-    specialised = specialised_constraints(system)
-    specialised += system.eliminations()
+    left_out = [*left_out_of_constraints(system), *system.left_out_by_elimination()]
     if not system.spatial:
-        specialised.append("planar: no Euler parameters, no gyroscopic moment")
+        left_out.append("Euler parameters and gyroscopic moments: the scene is planar")
     if not system.forces and not system.nonideal:
-        specialised.append("no force elements" + " besides gravity" * bool(gravity))
+        left_out.append("force elements" + " besides gravity" * bool(gravity) + ": there are none")
     redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
-    remarks = {"redundant rows": tuple(redundant), "specialised away": tuple(specialised)}
+    remarks = {NO_FREEDOM: held_in_place(system), "redundant rows": tuple(redundant), LEFT_OUT: tuple(left_out)}
     return Description(tuple(facts), {title: tuple(rows) for title, rows in tables.items()}, remarks)

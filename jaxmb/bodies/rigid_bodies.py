@@ -460,14 +460,14 @@ class RigidBodySystem(AbstractSystem):
     def describe(self):
         return describe_scene(self)
 
-    def eliminations(self) -> list[str]:
-        """Sentences on the matrices that are eliminated in blocks."""
+    def left_out_by_elimination(self) -> list[str]:
+        """The dense matrices that an elimination in blocks makes unnecessary."""
         order, out = self.elimination, []
         if order is not None:
-            out.append(f"no dense Jacobian and no charts with Adams: {order}")
+            out.append(f"the dense Jacobian and charts, with Adams: {order}")
         if self.implicit_in_blocks:
             joined = f"{self.layout.bodies} bodies" + " with the joints" * (order is not None)
-            out.append(f"no dense Newton matrix with Hermite: sparse elimination of {joined}")
+            out.append(f"the dense Newton matrix, with Hermite: sparse elimination of {joined}")
         return out
 
     # Views of a motion

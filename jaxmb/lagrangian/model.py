@@ -13,7 +13,17 @@ from .._types import Coordinates, Scalar, State, Velocities
 from ..parts.series import AbstractSignal
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
-from ..system.description import Description, count_independent, count_rows, shorten, specialised_constraints
+from ..system.description import (
+    LEFT_OUT,
+    NO_FREEDOM,
+    Description,
+    count_independent,
+    count_rows,
+    counted,
+    held_in_place,
+    left_out_of_constraints,
+    shorten,
+)
 from ..system.design_variables import DesignVariables, description_rows
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics, Parameters
@@ -248,7 +258,7 @@ class AbstractLagrangian(AbstractSystem):
     def describe(self) -> Description:
         kind = "rates of the coordinates" if self.kinematics.identity else f"of a {type(self.kinematics).__name__}"
         facts = [
-            ("system", f"of a Lagrangian, {self.nq} coordinates: {shorten(self.coordinates)}"),
+            ("system", f"of a Lagrangian, {counted(self.nq, 'coordinate')}: {shorten(self.coordinates)}"),
             ("velocities", f"{self.nu}, {kind}"),
             ("constraint rows", count_rows(self)),
             ("degrees of freedom", str(self.nu - self.velocity_rank)),
@@ -259,16 +269,16 @@ class AbstractLagrangian(AbstractSystem):
             facts.append(("parameters", shorten(self.parameters)))
         sizes = zip(self.constraints, self.sizes, strict=True)
         tables = {
-            "constraints": tuple((type(c).__name__, c.name, f"{n} row{'s' * (n > 1)}") for c, n in sizes),
+            "constraints": tuple((type(c).__name__, c.name, counted(n, "row")) for c, n in sizes),
             "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
             "design variables": tuple(description_rows(self.design)),
         }
-        specialised = specialised_constraints(self)
+        left_out = left_out_of_constraints(self)
         if self.diagonal:
-            specialised.append("diagonal mass matrix: no factorisation")
+            left_out.append("factorisation of the mass matrix: it is diagonal")
         if self.applied is None:
-            specialised.append("no forces besides those of the Lagrangian")
-        return Description(tuple(facts), tables, {"specialised away": tuple(specialised)})
+            left_out.append("forces besides those of the Lagrangian: there are none")
+        return Description(tuple(facts), tables, {NO_FREEDOM: held_in_place(self), LEFT_OUT: tuple(left_out)})
 
 
 class Projected(AbstractEquations):

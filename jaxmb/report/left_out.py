@@ -16,6 +16,7 @@ from ..mechanisms import Mechanism
 from ..simulate import simulate
 from ..solvers import Adams
 from ..system import AbstractSystem
+from ..system.description import LEFT_OUT
 from ..viz.figure import new_figure
 from .evaluations import evaluations
 from .subject import subject
@@ -140,7 +141,7 @@ def left_out(
         count = evaluations(Adams(), run().stats)
         assert count is not None
         cases.append(Measured(what, trace, seconds, min(seen), count, lines))
-    return LeftOut(mechanism.name, end, tuple(cases), own.describe().remarks["specialised away"], tuple(remarks))
+    return LeftOut(mechanism.name, end, tuple(cases), own.describe().remarks[LEFT_OUT], tuple(remarks))
 
 
 def _compiled(system, state, t1, options) -> tuple[Callable[..., Any], float, float, int]:

@@ -20,6 +20,7 @@ from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
 from ..solvers.closures import opened
+from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..system import AbstractSystem
 from ..system.inputs import Signals, input_break_times, with_inputs
@@ -190,6 +191,7 @@ def simulate(
     same steps with and without derivatives, and so does `diffrax.diffeqsolve` when it is called directly.
     """
     check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
+    check_precision("simulate", system)
     system = system if inputs is None else with_inputs(system, inputs)
     state = checked_state(system, state)
     # Numbers become arrays, so that other tolerances and times do not compile anew.

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._arguments import check_kind, real_array, real_shape, warn_of_degrees
+from .._compat import default_float
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import UnknownNameError, unknown
@@ -19,9 +20,22 @@ from ..system.quantities import rates_of
 
 
 def check_system(function: str, system: Any) -> None:
-    """Raise a `ValueError` for anything but a compiled scene or another system."""
+    """Raise a `ValueError` for anything but a compiled scene or another system, of the precision of JAX."""
     cure = "compile the scene first, scene.compile()" if hasattr(system, "compile") else "scene.compile() makes one"
     check_kind(f"{function}: system", system, AbstractSystem, "a compiled scene or another system", cure)
+    check_precision(function, system)
+
+
+def check_precision(function: str, system: AbstractSystem) -> None:
+    """Raise a `ValueError` for a system that was made before `jax_enable_x64` was switched: its numbers would keep the
+    other precision, and a motion be no better than they are.
+    """
+    own, now = system.guess.q.dtype, default_float()
+    if own != now:
+        raise ValueError(
+            f"{function}: the system has numbers of {own}, and JAX now makes {now}: jax_enable_x64 was switched after "
+            'the system was made. Set jax.config.update("jax_enable_x64", …) first, and make the system after it.'
+        )
 
 
 def check_no_states(function: str, system: AbstractSystem) -> None:

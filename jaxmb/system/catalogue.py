@@ -13,7 +13,17 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
 from ..parts.series import AbstractSignal
-from .description import Description, count_independent, count_rows, shorten, specialised_constraints
+from .description import (
+    LEFT_OUT,
+    NO_FREEDOM,
+    Description,
+    count_independent,
+    count_rows,
+    counted,
+    held_in_place,
+    left_out_of_constraints,
+    shorten,
+)
 from .design_variables import DesignVariables, description_rows, variables_in_range
 from .equation import AbstractEquation
 from .picture import Picture
@@ -238,15 +248,17 @@ class AbstractSystem(AbstractEquation):
 
     def describe(self) -> Description:
         """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
+        coordinates = f"{counted(self.nq, 'coordinate')}: {shorten(self.coordinate_names())}"
         facts = [
-            ("system", f"{type(self).__name__} of {self.nq} coordinates: {shorten(self.coordinate_names())}"),
+            ("system", f"{type(self).__name__} of {coordinates}"),
             ("velocities", str(self.nu)),
             ("constraint rows", count_rows(self)),
             ("degrees of freedom", str(self.nu - self.velocity_rank)),
             ("independent", count_independent(self)),
         ]
         tables = {"design variables": tuple(description_rows(self.design))}
-        return Description(tuple(facts), tables, {"specialised away": tuple(specialised_constraints(self))})
+        remarks = {NO_FREEDOM: held_in_place(self), LEFT_OUT: tuple(left_out_of_constraints(self))}
+        return Description(tuple(facts), tables, remarks)
 
     def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
         """The bodies and parts that a picture shows along a motion.

@@ -6,6 +6,10 @@ from collections.abc import Iterable
 
 from .equation import AbstractEquation
 
+# The titles of remarks that all systems have.
+LEFT_OUT = "left out of the computation, since nothing here needs it"
+NO_FREEDOM = "no degree of freedom"
+
 
 @dataclasses.dataclass(frozen=True)
 class Description:
@@ -13,7 +17,7 @@ class Description:
 
     **Fields:** `facts`: (name, value) pairs; `tables`: rows of (type, names or count, remark) by title, of bodies,
     joints, forces, or constraints; `remarks`: sentences by title, on redundant rows and on computations that are
-    specialised away.
+    left out.
     """
 
     facts: tuple[tuple[str, str], ...]
@@ -63,23 +67,38 @@ def count_independent(system: AbstractEquation) -> str:
     frictions = None if system.contacts is None else system.contacts.frictions
     modes = 0 if frictions is None else len(frictions.names)
     coordinates = system.nq - system.coordinate_rank - modes
-    return f"{coordinates} coordinates, {system.nu - system.velocity_rank} velocities"
+    velocities = system.nu - system.velocity_rank
+    return f"{counted(coordinates, 'coordinate')}, {counted(velocities, 'velocity', 'velocities')}"
 
 
-def specialised_constraints(system: AbstractEquation) -> list[str]:
-    """Sentences on the computations that this system's constraints, or their absence, make unnecessary."""
+def held_in_place(system: AbstractEquation) -> tuple[str, ...]:
+    """A sentence on a system that the constraints leave no degree of freedom."""
+    if system.nu > system.velocity_rank:
+        return ()
+    if system.drift_free:
+        return ("The constraints hold everything in place: nothing can move.",)
+    return ("The constraints prescribe every motion: forces have no effect on it.",)
+
+
+def left_out_of_constraints(system: AbstractEquation) -> list[str]:
+    """The computations that this system's constraints, or their absence, make unnecessary, and why."""
     if not system.acceleration_rows:
-        return ["no constraints: no elimination, no Newton iteration, no charts"]
+        return ["elimination, Newton iteration and charts: there are no constraints"]
     out = []
     if system.position_rows == system.acceleration_rows:
-        out.append("holonomic only: no rows between velocities, no chart of velocities besides that of coordinates")
+        out.append("equations of velocities besides those of coordinates: every constraint is one of positions")
     if not system.position_rows:
-        out.append("no constraints between positions: no Newton iteration")
+        out.append("Newton iteration for positions: no constraint is one of positions")
     if system.acceleration_rank == system.acceleration_rows:
-        out.append("no redundancy: no row is dropped")
+        out.append("choice of the rows that count: none is redundant")
     if system.drift_free:
-        out.append("scleronomic: no derivative with respect to time")
+        out.append("derivatives of constraints with respect to time: none changes with time")
     return out
+
+
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """A number of things, which are called `many`, by default `one` with an s, where they are not one."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 def shorten(names: Iterable[str]) -> str:

@@ -52,6 +52,10 @@ class BodyMotion(NamedTuple):
     orientation: Array | None
     angular_velocity: Array | None
 
+    def __repr__(self) -> str:
+        units = {"position": "m", "velocity": "m/s", "angle": "rad", "angular_velocity": "rad/s"}
+        return f"BodyMotion: {with_shapes(self._asdict(), units)}"
+
     def __dir__(self) -> list[str]:
         return list(self._fields)
 
@@ -71,6 +75,15 @@ class Reaction(NamedTuple):
     force: Float[Array, "*times d"]
     moment: Float[Array, "..."]
     multipliers: Float[Array, "*times rows"]
+
+    def __repr__(self) -> str:
+        return f"Reaction: {with_shapes(self._asdict(), {'force': 'N', 'moment': 'N m'})}"
+
+
+def with_shapes(values: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    """The names of arrays with their shapes and units, in one line for `print`, without those that are None."""
+    shapes = {name: getattr(value, "shape", value) for name, value in values.items() if value is not None}
+    return ", ".join(f"{name} {shape} {units.get(name, '')}".rstrip() for name, shape in shapes.items())
 
 
 def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:

@@ -161,10 +161,10 @@ def test_description(system, framed):
         "Holonomic        rod   1 row",
         "ServoConstraint  hold  1 row",
         "Viscous  rod",
-        "diagonal mass matrix",
+        "factorisation of the mass matrix: it is diagonal",
     ):
         assert words in text
-    assert "holonomic only" not in text
+    assert "every constraint is one of positions" not in text
     assert "<b>constraints</b>" in system._repr_html_()
     assert "2, of a QuasiVelocityFrame" in str(framed) and "no constraints" in str(framed)
 

@@ -251,6 +251,20 @@ def test_single_precision_warns(pendulum):
         assert sol.ys.q.dtype == jnp.float32 and np.all(np.isfinite(sol.ys.q))
 
 
+def test_precision_switched_after_the_scene_was_compiled(pendulum):
+    scene, state = mb.Scene([bar()], joints=[pin()]), mb.assemble(pendulum)
+    with single_precision():
+        early = scene.compile()
+        with pytest.raises(ValueError, match="numbers of float64, and JAX now makes float32"):
+            mb.assemble(pendulum)
+    for function, call in (
+        ("simulate", lambda: mb.simulate(early, state, t1=0.1)),
+        ("linearise", lambda: mb.linearise(early, state)),
+    ):
+        with pytest.raises(ValueError, match=f"{function}: .*float32, and JAX now makes float64.*jax_enable_x64"):
+            call()
+
+
 def steady_turn(t, p):
     return p["speed"] * t
 

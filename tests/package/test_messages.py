@@ -1,6 +1,7 @@
 """What a user reads after a slip: the nearest names, what an object has, and which values depend on each other."""
 
 import math
+import re
 from typing import Any
 
 import equinox as eqx
@@ -18,12 +19,13 @@ from jaxmb.parts import AbstractForce, fields
 def pendulum():
     rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0), angle=0.0)
     pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
-    return mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    forces = [mb.Gravity((0.0, -9.81)), planar.Torque("motor", "rod", torque=0.0)]
+    return mb.Scene([rod], joints=[pin], forces=forces).compile()
 
 
 @pytest.fixture(scope="module")
 def motion(pendulum):
-    return mb.simulate(pendulum, mb.assemble(pendulum), t1=0.01)
+    return mb.simulate(pendulum, mb.assemble(pendulum), t1=0.01, error=True)
 
 
 def test_an_unknown_coordinate_lists_those_of_the_body(pendulum):
@@ -100,6 +102,40 @@ def test_what_is_printed_of_a_joint_and_where_a_motion_is_saved(motion, tmp_path
     assert repr(motion["pin"]).startswith("Motion of 'pin': ") and "angle_rate" in repr(motion["pin"])
     with pytest.raises(ValueError, match=r"writes \.npz, got .*motion.csv"):
         motion.save(tmp_path / "motion.csv")
+
+
+def test_what_is_printed_of_a_motion_and_of_its_forces(pendulum, motion):
+    assert str(motion["rod"]).startswith("BodyMotion: position (1, 2) m, velocity (1, 2) m/s, angle (1,) rad, ")
+    assert "orientation" not in str(motion["rod"]) and str(motion.reactions["pin"]).startswith(
+        "Reaction: force (1, 2) N"
+    )
+    assert str(motion).endswith("Names: rod, pin\nForces, in motion.forces: motor")
+    for name, view in (("rod", "motion"), ("pin", "motion"), ("motor", "motion.forces")):
+        with pytest.raises(AttributeError, match=re.escape(f"{view}['{name}']")):
+            getattr(motion, name)
+    with pytest.raises(AttributeError, match="no attribute 'mass'"):
+        getattr(motion, "mass")  # noqa: B009
+    with pytest.raises(KeyError, match=r"motion\.forces\['motor'\]"):
+        motion["motor"]
+    largest, errors = float(motion.error.largest), motion.error.ys
+    unit = np.array([pendulum.length, pendulum.length, 1.0])
+    relative = lambda error, y: np.max(np.asarray(error) / unit) / np.max(np.abs(np.asarray(y)) / unit)
+    assert largest == pytest.approx(max(relative(errors.q, motion.ys.q), relative(errors.u, motion.ys.u)))
+    assert str(motion.error) == f"GlobalError: at most {largest:.2g} of the largest coordinate or velocity"
+    assert str(motion.constraint_violation).startswith("ConstraintViolation: at most ")
+
+
+@pytest.mark.parametrize("driven", [False, True])
+def test_a_scene_that_cannot_move_says_so(pendulum, driven):
+    rod = planar.Body("rod", mass=1.0, inertia=0.1)
+    turned = planar.Driver("hold", "ground", "rod", quantity="angle", motion=lambda t, p: 2.0 * t)
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    joints = [pin, turned] if driven else [planar.Fixed("weld", "ground", "rod", point=(0.0, 0.0))]
+    text = str(mb.Scene([rod], joints=joints).compile())
+    assert ("The constraints prescribe every motion" if driven else "nothing can move") in text
+    assert "planar, 1 body\n" in text and "0 coordinates, 0 velocities" in text
+    assert "can move" not in str(pendulum) and "1 coordinate, 1 velocity" in str(pendulum)
+    assert "left out of the computation, since nothing here needs it\n" in str(pendulum)
 
 
 def test_views_by_name_are_mappings(motion):

@@ -135,7 +135,7 @@ def test_what_a_pendulum_leaves_out(pendulum, tmp_path):
         assert case.trace > 0 and case.compile > 0 and case.run > 0
         assert what == "nothing" or case.lines > cases["nothing"].lines
         assert abs(case.evaluations - cases["nothing"].evaluations) <= 20
-    assert "not needed: scleronomic" in str(report) and "charts, a dense Jacobian: " in str(report)
+    assert "not needed: derivatives of constraints" in str(report) and "charts, a dense Jacobian: " in str(report)
     assert json.loads(json.dumps(report.to_dict()))["cases"][0]["what"] == "nothing"
     report.figure(tmp_path / "figure.png")
 

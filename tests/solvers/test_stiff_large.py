@@ -329,7 +329,7 @@ def test_size_decides():
     ):
         assert isinstance(default_manifold(system, hermite, None), implicit)
         assert isinstance(default_manifold(system, adams, None), explicit)
-        assert ("no dense Newton matrix with Hermite" in str(system)) == (implicit is Projection)
+        assert ("the dense Newton matrix, with Hermite" in str(system)) == (implicit is Projection)
 
 
 @pytest.mark.parametrize("n, most", [(100, 40), (1000, 40)])

@@ -41,6 +41,17 @@ class Fit:
     tol: float
     max_iterations: int
 
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def size_of_residuals(self) -> str:
+        """The number of residuals and their root mean square with its unit, in words."""
+        unit = "" if self.known_noise else " of the range"
+        return f"{self.residuals.size} residuals, rms {self.rms:.3g}{unit}"
+
     def whole_motions(self, what: str) -> None:
         """Raise a `ValueError` for what needs simulations from start to end, after multiple shooting."""
         if self.segments > 1:

@@ -89,7 +89,7 @@ class Identification:
     @property
     def rms(self) -> float:
         """Root mean square of the residuals."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
+        return self.fit.rms
 
     @property
     def held_out(self) -> dict[str, HeldOut]:
@@ -183,7 +183,7 @@ class Identification:
         lines.append(f"{'parameter':{width}}  {'start':>12}  {'estimate':>12}  {'deviation':>12}")
         for name, start, value, deviation in zip(self.components, *columns, strict=True):
             lines.append(f"{name:{width}}  {start:12.6g}  {value:12.6g}  {deviation:>12}")
-        lines.append(f"{self.residuals.size} residuals, rms {self.rms:.3g}, {self.iterations} iterations")
+        lines.append(f"{self.fit.size_of_residuals}, {self.iterations} iterations")
         return "\n".join(lines)
 
 

@@ -12,6 +12,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import ArrayLike
 
 from ...parts.names import unknown
+from ...system.quantities import with_shapes
 from .experiment import measured_times
 from .fit import Fit
 
@@ -32,6 +33,9 @@ class Prediction:
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
     level: float
+
+    def __repr__(self) -> str:
+        return f"Prediction: {with_shapes(self.values, {})}, with bands of {self.level:.0%}"
 
 
 def predict(

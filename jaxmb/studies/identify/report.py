@@ -49,7 +49,7 @@ def write_report(
             ("parameter", "start", "estimate", "standard deviation"),
             [(name, f"{a:.6g}", f"{b:.6g}", c) for name, a, b, c in rows],
         ),
-        f"<p>{fit.residuals.size} residuals, rms {np.sqrt(np.mean(fit.residuals**2)):.3g}</p>",
+        f"<p>{fit.size_of_residuals}</p>",
     ]
     for direction in combinations:
         text = ", ".join(f"{name} {100 * share:+.3g} %" for name, share in direction.items())

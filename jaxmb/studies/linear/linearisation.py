@@ -18,6 +18,8 @@ from .eigen import eigen
 
 # A column of A below this fraction of the largest, in units of the states' sizes, has no effect.
 _NO_EFFECT = 1e-10
+# This many units of rounding of A are no part of an eigenvalue that is printed.
+_ROUNDING = 10
 
 
 class Mode(eqx.Module):
@@ -51,6 +53,11 @@ class Mode(eqx.Module):
 
 class Linearisation(eqx.Module):
     """`ż = A z + B w`, `y = C z + D w`: small changes of states z, inputs w and outputs y. `print` shows its modes.
+
+    It shows the real or imaginary part of an eigenvalue as 0 where rounding explains it: ten units of rounding of A,
+    in units of the states' sizes, times the eigenvalue's condition. The condition is large for a coordinate that
+    nothing restores, whose two eigenvalues of zero are computed as about 1e-8 of the largest; more than ten times
+    that is never shown as 0. `eigenvalues` are as they are computed.
 
     ```python
     about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system), outputs=["bar.angle"])
@@ -176,14 +183,15 @@ class Linearisation(eqx.Module):
     def __str__(self) -> str:
         if is_traced(self.A) or self.A.ndim != 2:
             return repr(self)
-        values, vectors = map(np.asarray, _spectrum(self))
-        shares = np.abs(vectors) * np.asarray(_widths(self))[:, None]
+        values, shapes = _without_rounding(self)
+        shares = np.abs(shapes)
         lines = [f"{'mode':>4}  {'eigenvalue [1/s]':>24}  {'[rad/s]':>9}  {'damping':>8}  largest states"]
-        for k, (value, size, ratio) in enumerate(
-            zip(values, np.asarray(self.frequencies), np.asarray(self.damping_ratios), strict=True)
-        ):
+        for k, value in enumerate(values):
             if value.imag < 0:
                 continue
+            size = abs(value)
+            # From zero, so that no damping has no sign.
+            ratio = (0.0 - value.real) / size if size > 0 else 0.0
             text = f"{value.real:.5g}" + (f" ± {value.imag:.5g}i" if value.imag > 0 else "")
             # A change of speed alone, which nothing depends on, displaces nothing at first.
             displaced = np.any(shares[: self.coordinates, k])
@@ -191,6 +199,20 @@ class Linearisation(eqx.Module):
             largest = [self.states[j] for j in np.argsort(-own)[:3] if own[j] > 0.05 * own.max()]
             lines.append(f"{k:>4}  {text:>24}  {size:>9.5g}  {ratio:>8.4f}  {', '.join(largest)}")
         return "\n".join(lines)
+
+
+def _without_rounding(linear):
+    """Eigenvalues with zero for what rounding explains, and their vectors in units of the states' sizes."""
+    (values, vectors), widths = _spectrum(linear), np.asarray(_widths(linear))
+    shapes = np.asarray(vectors) * widths[:, None]
+    if not np.all(np.isfinite(shapes)):
+        return np.asarray(values), shapes
+    # The norms of the left eigenvectors w with wᵀ v = 1 and |v| = 1: a change dA moves λ by |w| |dA| at most.
+    conditions = np.linalg.norm(np.linalg.pinv(shapes / np.linalg.norm(shapes, axis=0)), axis=1)
+    largest, eps = np.linalg.norm(np.asarray(linear.A) * widths[:, None] / widths), np.finfo(widths.dtype).eps
+    least = _ROUNDING * largest * np.minimum(eps * conditions, np.sqrt(eps))
+    real, imaginary = (np.where(np.abs(x) > least, x, 0.0) for x in map(np.asarray, (values.real, values.imag)))
+    return real + 1j * imaginary, shapes
 
 
 def _widths(linear):

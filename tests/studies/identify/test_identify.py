@@ -98,6 +98,8 @@ def test_without_sigma_the_noise_is_estimated(system, motion):
     for name in TRUE:
         np.testing.assert_allclose(known.parameters[name], estimated.parameters[name], rtol=1e-5)
         assert 0.6 < estimated.deviations[name] / known.deviations[name] < 1.5
+    assert f"rms {estimated.rms:.3g} of the range, " in str(estimated) and f"rms {known.rms:.3g}, " in str(known)
+    assert str(known.predict("rod.angle")) == f"Prediction: rod.angle ({TS.size},), with bands of 95%"
 
 
 def test_names_what_the_data_do_not_determine(system, motion):

@@ -1,5 +1,6 @@
 """Linear equations about equilibria against closed forms and independent computations; derivatives; what has none."""
 
+import dataclasses
 import functools
 
 import jax
@@ -89,6 +90,23 @@ def test_other_programs_and_responses():
         linear.response(z0[:3], ts)
     with pytest.raises(ValueError, match="ts must be a vector of times"):
         linear.response(z0, 1.0)
+
+
+def test_what_rounding_explains_is_printed_as_zero():
+    def lines(stiffness, damping):
+        A = np.block([[np.zeros((2, 2)), np.eye(2)], [-stiffness, -damping]])
+        linear = dataclasses.replace(linear_pendulum(), A=jnp.asarray(A))
+        return linear, [line.split()[1:-1] for line in str(linear).splitlines()[1:]]
+
+    # Two masses with a spring between them, free together.
+    spring = np.outer([70.0, -30.0], [1.0, -1.0])
+    linear, shown = lines(spring, 0.01 * spring)
+    assert 0 < linear.frequencies[0] < 1e-6
+    assert [line[:3] for line in shown[:2]] == 2 * [["0", "0", "0.0000"]]
+    assert shown[2][:3] == ["-0.5", "±", "9.9875i"]
+    # Rounding explains no slow mode, and none of critical damping, whose condition is as large as that of a free one.
+    assert lines(np.diag([1e-6, 1e2]), np.zeros((2, 2)))[1][0][:5] == ["0", "±", "0.001i", "0.001", "0.0000"]
+    assert [line[:3] for line in lines(np.diag([1.0, 1e4]), np.diag([2.0, 0.0]))[1][:2]] == 2 * [["-1", "1", "1.0000"]]
 
 
 def test_a_mode_moves_on_the_constraints():
