@@ -1,6 +1,7 @@
 """`jaxmb help NAME` and `jaxmb reference FOLDER`: what the docstrings say, in the terminal and as HTML."""
 
 import argparse
+import functools
 import json
 import os
 import shutil
@@ -26,6 +27,7 @@ def add_to(commands: Any) -> None:
         nargs="*",
         help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar, or a module: planar, solvers",
     )
+    command.add_argument("--all", action="store_true", help="of parts also the methods, for parts of one's own")
     command.set_defaults(command=_help)
     command = commands.add_parser(
         "reference",
@@ -45,8 +47,9 @@ def add_to(commands: Any) -> None:
 def _help(arguments: argparse.Namespace) -> None:
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     styled = sys.stdout.isatty() and "NO_COLOR" not in os.environ
+    shown = functools.partial(reference.shown, width=width, styled=styled, every=arguments.all)
     if arguments.names:
-        print("\n\n".join(reference.shown(reference.find(name), width, styled) for name in arguments.names))
+        print("\n\n".join(shown(reference.find(name)) for name in arguments.names))
     else:
         print(reference.listed(width, styled))
 

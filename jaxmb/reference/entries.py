@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from types import ModuleType
 from typing import Any
 
+from ..parts.base import AbstractPart
 from ..parts.names import UnknownNameError, unknown
 
 PACKAGE = __name__.split(".")[0]
@@ -62,6 +63,11 @@ class Entry:
                 return "field"
             return "method" if callable(self.thing) else "property"
         return "module" if inspect.ismodule(self.thing) else "class" if inspect.isclass(self.thing) else "function"
+
+    @property
+    def is_part(self) -> bool:
+        """Whether it is a class of parts that a scene takes, and not one to derive such classes from."""
+        return self.kind == "class" and issubclass(self.thing, AbstractPart) and not self.short.startswith("Abstract")
 
     @property
     def short(self) -> str:

@@ -7,28 +7,39 @@ from collections.abc import Iterable
 from .entries import Entry, bases, further_fields, members, subjects
 from .signatures import signature
 
+_HOW = (
+    "`jaxmb help NAME` explains a name, as in `jaxmb help simulate`, and of a module all its names, as in "
+    "`jaxmb help planar`. All public names:"
+)
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _FENCE = re.compile(r"^( *)```")
 _ITEM = re.compile(r" *(- |\d+\. )")
 
 
-def shown(entry: Entry, width: int = 80, styled: bool = False) -> str:
+def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = False) -> str:
     """What is known of an entry: signature, docstring, and the first sentences of what it contains.
 
-    **Arguments:** `width`, of the terminal; `styled`: whether it shows bold and coloured text.
+    **Arguments:** `width`, of the terminal; `styled`: whether it shows bold and coloured text; `every`: whether also
+    the methods and further fields of parts, which systems use and their users do not.
     """
     parts = [_styled(_heading(entry, width), styled)]
     parts += [block if is_code else _styled(block, styled) for block, is_code in _filled(entry.text, width)]
-    if entry.kind in ("module", "class"):
+    if entry.is_part and not every:
+        parts.append(_styled(f"Its methods, which systems call: `jaxmb help --all {entry.name}`", styled))
+    elif entry.kind in ("module", "class"):
         contents = _of_module if entry.kind == "module" else _of_class
         parts += [_styled(part, styled) for part in contents(entry, width)]
     return "\n\n".join(parts)
 
 
 def listed(width: int = 80, styled: bool = False) -> str:
-    """All public names by subject, each with its first sentence."""
-    parts = [part for subject in subjects() for part in (f"**{subject.title}**", _table(subject.entries, width))]
-    return "\n\n".join(_styled(part, styled) for part in parts if part)
+    """How to go on, and all public names by subject, each with its first sentence."""
+    parts = [_hanging(_HOW, 0, 0, width)]
+    for subject in subjects():
+        # The names of some modules all belong to others.
+        if subject.entries:
+            parts += [f"**{subject.title}**", _table(subject.entries, width)]
+    return "\n\n".join(_styled(part, styled) for part in parts)
 
 
 def _heading(entry: Entry, width: int) -> str:

@@ -125,7 +125,18 @@ def test_help_on_a_name(capsys):
     assert both.startswith(out) and "jaxmb.Event(" in both
     assert main(["help"]) == 0
     out = capsys.readouterr().out
+    assert "jaxmb help planar" in out.split("\n\n")[0] and "jaxmb.studies" not in out
     assert "Scenes and their numbers" in out and "  mechanisms.four_bar  Crank, coupler and rocker" in out
+
+
+def test_help_on_a_part_has_its_methods_with_all(capsys):
+    assert main(["help", "JointSpring"]) == 0
+    short = capsys.readouterr().out
+    assert "with_numbers" not in short and short.endswith("jaxmb help --all JointSpring`\n")
+    assert main(["help", "--all", "JointSpring", "parts.AbstractForce"]) == 0
+    assert "  with_numbers  " in (out := capsys.readouterr().out) and "From parts.AbstractPart" in out
+    assert main(["help", "parts.AbstractForce"]) == 0
+    assert "From parts.AbstractPart" in capsys.readouterr().out
 
 
 def test_help_on_an_unknown_name(capsys):
@@ -167,4 +178,4 @@ def test_as_a_module():
     """It is no error if the program that reads the output ends before it has read all."""
     command = f"{sys.executable} -m jaxmb help | head -1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
-    assert done.stdout == "Scenes and their numbers\n" and done.stderr == ""
+    assert done.stdout.startswith("jaxmb help NAME") and done.stderr == ""
