@@ -8,7 +8,7 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import pytest
-from compiling import compile_quickly
+from compiling import compile_for_tests
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -71,7 +71,7 @@ def pytest_configure(config):
     A test that runs alone has the programs that users have.
     """
     if config.getoption("numprocesses", default=None):
-        compile_quickly()
+        compile_for_tests()
     programs = config.cache.mkdir("programs")
     if config.getoption("--record-durations") and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Stopwatch())

@@ -35,7 +35,7 @@ AS_USERS_DO = {
 }
 
 
-def compile_quickly():
+def compile_for_tests():
     """Let the processes that start from here compile quickly: unless told otherwise, or if this XLA has no such way."""
     options = os.environ | THREADS | {"XLA_FLAGS": QUICKLY}
     start = [sys.executable, "-c", "import jax; jax.devices()"]
