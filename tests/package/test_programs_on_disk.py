@@ -69,6 +69,14 @@ def test_options_of_the_compiler_are_set_before_jax_starts():
     assert late == "" and "JAX has computed something already" in said and said.count("UserWarning") == 2
 
 
+def test_python_looks_for_garbage_less_often():
+    code = "import gc\nbefore = gc.get_threshold()\nmb.compile_quickly()\nprint([before, gc.get_threshold()])"
+    before, after = process(code)[0]
+    assert after[0] > before[0] and after[1:] == before[1:]
+    for first in (0, 10**6):
+        assert process(f"import gc\ngc.set_threshold({first})\n" + code)[0][1][0] == first
+
+
 def test_what_is_compiled_quickly_is_kept(tmp_path):
     code = "mb.compile_quickly()\nmb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS="")[0] for _ in range(2))
