@@ -479,7 +479,7 @@ class GlobalError(NamedTuple):
     """The estimated global error of a motion: how far it is from the same one at a tenth of the tolerances.
 
     The error of the closer motion is smaller by about the same factor, so the distance is nearly the error itself.
-    Errors of the model, and rounding errors that both motions share, are not seen.
+    Errors of the model, and rounding errors that both motions share, are not seen. In derivatives it is a constant.
     """
 
     motion: Trajectory
@@ -532,11 +532,13 @@ def _largest_error(motion):
         error, size = (jnp.max(jnp.abs(x) / scale[None], initial=0.0) for x in (error, values))
         return error / jnp.where(size > 0, size, 1.0)
 
-    return jnp.max(jnp.stack(jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))))
+    found = jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))
+    return lax.stop_gradient(jnp.max(jnp.stack(found)))
 
 
 def _distance(a, b):
-    return jax.tree.map(lambda a, b: jnp.abs(a - b), a, b)
+    # The closer motion is computed without derivatives, so that of the difference would be that of the motion.
+    return lax.stop_gradient(jax.tree.map(lambda a, b: jnp.abs(a - b), a, b))
 
 
 @eqx.filter_jit

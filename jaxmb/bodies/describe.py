@@ -4,17 +4,7 @@ from typing import Any
 
 from ..parts.base import AbstractInertialConstraint
 from ..parts.unilateral import AbstractUnilateralConstraint
-from ..system.description import (
-    LEFT_OUT,
-    NO_FREEDOM,
-    Description,
-    count_independent,
-    count_rows,
-    counted,
-    held_in_place,
-    left_out_of_constraints,
-    shorten,
-)
+from ..system.description import Description, count_independent, count_rows, counted, remarks, shorten
 from ..system.design_variables import description_rows
 
 
@@ -72,11 +62,11 @@ def describe_scene(system: Any) -> Description:
         "frames": plainly(system.frames),
         "design variables": description_rows(system.design),
     }
-    left_out = [*left_out_of_constraints(system), *system.left_out_by_elimination()]
+    left_out = system.left_out_by_elimination()
     if not system.spatial:
         left_out.append("Euler parameters and gyroscopic moments: the scene is planar")
     if not system.forces and not system.nonideal:
         left_out.append("force elements" + " besides gravity" * bool(gravity) + ": there are none")
     redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
-    remarks = {NO_FREEDOM: held_in_place(system), "redundant rows": tuple(redundant), LEFT_OUT: tuple(left_out)}
-    return Description(tuple(facts), {title: tuple(rows) for title, rows in tables.items()}, remarks)
+    tables = {title: tuple(rows) for title, rows in tables.items()}
+    return Description(tuple(facts), tables, remarks(system, left_out, redundant))

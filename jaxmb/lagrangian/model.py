@@ -13,17 +13,7 @@ from .._types import Coordinates, Scalar, State, Velocities
 from ..parts.series import AbstractSignal
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
-from ..system.description import (
-    LEFT_OUT,
-    NO_FREEDOM,
-    Description,
-    count_independent,
-    count_rows,
-    counted,
-    held_in_place,
-    left_out_of_constraints,
-    shorten,
-)
+from ..system.description import Description, count_independent, count_rows, counted, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics, Parameters
@@ -273,12 +263,12 @@ class AbstractLagrangian(AbstractSystem):
             "non-ideal forces": tuple((type(law).__name__, law.constraint, "") for law in self.nonideal),
             "design variables": tuple(description_rows(self.design)),
         }
-        left_out = left_out_of_constraints(self)
+        left_out = []
         if self.diagonal:
             left_out.append("factorisation of the mass matrix: it is diagonal")
         if self.applied is None:
             left_out.append("forces besides those of the Lagrangian: there are none")
-        return Description(tuple(facts), tables, {NO_FREEDOM: held_in_place(self), LEFT_OUT: tuple(left_out)})
+        return Description(tuple(facts), tables, remarks(self, left_out))
 
 
 class Projected(AbstractEquations):

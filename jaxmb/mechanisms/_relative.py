@@ -19,7 +19,7 @@ from .._types import State
 from ..planar import DraftGear
 from ..system import AbstractInertia, AbstractSystem, DenseInertia
 from ..system.catalogue import ParameterPath
-from ..system.description import LEFT_OUT, Description, count_independent, left_out_of_constraints, shorten
+from ..system.description import Description, count_independent, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
 
 
@@ -85,7 +85,7 @@ class RelativeTrain(AbstractSystem):
             ("independent", count_independent(self)),
         )
         tables = {"design variables": tuple(description_rows(self.design))}
-        return Description(facts, tables, {LEFT_OUT: tuple(left_out_of_constraints(self))})
+        return Description(facts, tables, remarks(self))
 
     @property
     def nq(self) -> int:

@@ -13,17 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
 from ..parts.series import AbstractSignal
-from .description import (
-    LEFT_OUT,
-    NO_FREEDOM,
-    Description,
-    count_independent,
-    count_rows,
-    counted,
-    held_in_place,
-    left_out_of_constraints,
-    shorten,
-)
+from .description import Description, count_independent, count_rows, counted, remarks, shorten
 from .design_variables import DesignVariables, description_rows, variables_in_range
 from .equation import AbstractEquation
 from .picture import Picture
@@ -257,8 +247,7 @@ class AbstractSystem(AbstractEquation):
             ("independent", count_independent(self)),
         ]
         tables = {"design variables": tuple(description_rows(self.design))}
-        remarks = {NO_FREEDOM: held_in_place(self), LEFT_OUT: tuple(left_out_of_constraints(self))}
-        return Description(tuple(facts), tables, remarks)
+        return Description(tuple(facts), tables, remarks(self))
 
     def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
         """The bodies and parts that a picture shows along a motion.

@@ -6,9 +6,8 @@ from collections.abc import Iterable
 
 from .equation import AbstractEquation
 
-# The titles of remarks that all systems have.
+# The title of remarks on what is left out.
 LEFT_OUT = "left out of the computation, since nothing here needs it"
-NO_FREEDOM = "no degree of freedom"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,20 @@ def count_independent(system: AbstractEquation) -> str:
     return f"{counted(coordinates, 'coordinate')}, {counted(velocities, 'velocity', 'velocities')}"
 
 
-def held_in_place(system: AbstractEquation) -> tuple[str, ...]:
+def remarks(
+    system: AbstractEquation, left_out: Iterable[str] = (), redundant: Iterable[str] = ()
+) -> dict[str, tuple[str, ...]]:
+    """The remarks of a description: on freedom, on `redundant` rows, and on what is left out, by the constraints and
+    besides.
+    """
+    return {
+        "no degree of freedom": _held_in_place(system),
+        "redundant rows": tuple(redundant),
+        LEFT_OUT: (*_left_out_of_constraints(system), *left_out),
+    }
+
+
+def _held_in_place(system: AbstractEquation) -> tuple[str, ...]:
     """A sentence on a system that the constraints leave no degree of freedom."""
     if system.nu > system.velocity_rank:
         return ()
@@ -80,7 +92,7 @@ def held_in_place(system: AbstractEquation) -> tuple[str, ...]:
     return ("The constraints prescribe every motion: forces have no effect on it.",)
 
 
-def left_out_of_constraints(system: AbstractEquation) -> list[str]:
+def _left_out_of_constraints(system: AbstractEquation) -> list[str]:
     """The computations that this system's constraints, or their absence, make unnecessary, and why."""
     if not system.acceleration_rows:
         return ["elimination, Newton iteration and charts: there are no constraints"]

@@ -56,10 +56,17 @@ def test_quantities_batches_and_derivatives():
     angle = lambda u, **options: mb.simulate(
         system, mb.State(mechanism.state.q, mechanism.state.u + u), t1=0.2, **options
     )
-    known = system.guess.u * 0
-    with_estimate = jax.jvp(lambda u: angle(u, error=True, throw=False).error.motion.ys.q, (known,), (known,))
-    plain = jax.jvp(lambda u: angle(u, throw=False).ys.q, (known,), (known,))
-    np.testing.assert_array_equal(with_estimate[1], plain[1])
+    at, along = jnp.zeros_like(system.guess.u), mechanism.state.u + system.guess.u + 1.0
+
+    def estimated(u):
+        motion = angle(u, error=True, throw=False)
+        return motion.ys.q, motion.error.ys, motion.error.largest, motion.error.quantity(name)
+
+    (with_estimate, *of_estimate) = jax.jvp(estimated, (at,), (along,))[1]
+    plain = jax.jvp(lambda u: angle(u, throw=False).ys.q, (at,), (along,))[1]
+    assert np.any(plain != 0)
+    np.testing.assert_array_equal(with_estimate, plain)
+    assert not any(np.any(tangent) for tangent in jax.tree.leaves(of_estimate))
 
 
 def test_without_an_estimate_errors_say_what_to_do():

@@ -185,6 +185,16 @@ def _check_sigma(system, experiments, sensors, sigma) -> None:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
 
 
+def _assembled(experiment, system, guess, **prescribed):
+    """The initial state of an experiment, which the error names if it cannot be assembled."""
+    try:
+        return assemble(system, guess, **prescribed)
+    except ValueError as error:
+        if not experiment:
+            raise
+        raise ValueError(f"Experiment {experiment!r}: {error}") from error
+
+
 def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[ExperimentModel, tuple[str, ...]]:
     """One experiment, whose unknowns are added to those that are found."""
     ts, places = times_of(experiment)
@@ -227,7 +237,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     initial = tuple((f"initial.{name}", initial_unknown(system, name)) for name in experiment.free_initial)
     same = with_parameters(system, known)
     if initial:
-        state = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0)
+        state = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
         sizes = system.coordinate_scale(), system.velocity_scale()
         for (name, what), chosen in zip(initial, experiment.free_initial.values(), strict=True):
             index = (known_rates if what.is_rate else system.coordinate_names())[what.name]
@@ -240,7 +250,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
         # What is the same for all values is found, and differentiated, once.
-        guess = assemble(same, guess, fix=fix, rates=rates, t=experiment.t0)
+        guess = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():
             first = found.setdefault(source, what)

@@ -70,8 +70,9 @@ class Trials:
         return self.last
 
     def ended(self, z: np.ndarray) -> None:
-        """Take the end of a run that converged for the best trial if that gains by breaking constraints, though by no
-        more than `HOLDS`.
+        """Take the end of a run that converged as the best trial where that one breaks constraints by more.
+
+        A trial may be better for no other reason, by no more than `HOLDS`.
         """
         end = self(z)
         if end.good and self.violation(end) < self.violation(self.best):
