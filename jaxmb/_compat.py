@@ -194,12 +194,12 @@ def codes_of(item: Any) -> np.ndarray:
     return np.asarray(item._value)
 
 
-def with_values(module: T, values: Mapping[str, Any]) -> T:
-    """A module of the same class with these values of all fields, as they are: without `__init__`, converters, checks.
+def with_values(kind: type[T], values: Mapping[str, Any]) -> T:
+    """A module of a class with these values of all fields, as they are: without `__init__`, converters, checks.
 
     (Modules are frozen dataclasses whose instances `object.__new__` makes and `object.__setattr__` fills, 0.13.)
     """
-    out = object.__new__(type(module))
+    out = object.__new__(kind)
     for name, value in values.items():
         object.__setattr__(out, name, value)
     return out

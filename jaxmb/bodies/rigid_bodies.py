@@ -449,8 +449,10 @@ class RigidBodySystem(AbstractSystem):
     @property
     def _groups(self):
         kinds = ("bodies", "constraints", "velocity_constraints", "servos", "forces", "nonideal", "frames", "tendons")
-        return {kind: getattr(self, kind) for kind in (*kinds, "free_joints")}
+        fields = vars(self)
+        return {kind: fields[kind] for kind in (*kinds, "free_joints")}
 
+    @property
     def signals(self):
         return signals_of(self._groups)
 

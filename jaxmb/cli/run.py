@@ -28,6 +28,8 @@ from .subject import mechanism_of
 # first part of the motion, with noise, from a start that is off.
 _TIMES = 401
 _FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
+# The relative change of a parameter that tells how much it matters.
+_CHANGE = 1e-3
 
 
 def add_to(commands: Any) -> None:
@@ -157,16 +159,16 @@ def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
         return None
 
     @eqx.filter_jit
-    def sensitivities(system, state):
-        def positions(scale):
-            values = {name: value * factor for (name, value), factor in zip(known.items(), scale, strict=True)}
-            changed = with_parameters(system, values)
-            start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
-            motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-6, throw=False)
-            return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
+    def positions(system, state, factors):
+        values = {name: value * factor for (name, value), factor in zip(known.items(), factors, strict=True)}
+        changed = with_parameters(system, values)
+        start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
+        motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-8, throw=False)
+        return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
 
-        return jax.jacfwd(positions)(jnp.ones(len(known)))
-
-    moved = np.linalg.norm(sensitivities(mechanism.system, mechanism.state), axis=0)
+    # For a choice differences do, whose program compiles in a third of the time of one of derivatives.
+    factors = 1 + _CHANGE * np.eye(len(known) + 1, len(known), -1)
+    first, *others = np.asarray(jax.vmap(positions, in_axes=(None, None, 0))(mechanism.system, mechanism.state, factors))
+    moved = np.linalg.norm(np.stack(others) - first, axis=1) / _CHANGE
     size = float(mechanism.system.length)
-    return list(known)[int(np.argmax(moved))] if np.max(moved) > 1e-6 * size else None
+    return list(known)[int(np.nanargmax(moved))] if np.nanmax(moved, initial=0.0) > 1e-4 * size else None

@@ -133,6 +133,7 @@ class AbstractLagrangian(AbstractSystem):
         at = lambda name: jnp.asarray(self.inputs[name].signal(t), self.parameters[name].dtype)
         return self.parameters | {name: at(name) for name in self.inputs}
 
+    @property
     def signals(self):
         return {name: (own.signal, own.binds) for name, own in self.inputs.items()}
 

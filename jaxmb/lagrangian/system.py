@@ -129,7 +129,7 @@ class LagrangianSystem(AbstractLagrangian):
         inputs = self.inputs | _inputs_of(self, signals)
         drift_free = self.drift_free and not any(own.binds for own in inputs.values())
         same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return with_values(self, same | {"inputs": inputs, "drift_free": drift_free})
+        return with_values(type(self), same | {"inputs": inputs, "drift_free": drift_free})
 
 
 def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]) -> dict[str, DrivenParameter]:

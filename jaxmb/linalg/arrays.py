@@ -30,6 +30,27 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def is_differentiated(tree: Any) -> bool:
+    """Whether a derivative by any leaf of a pytree is being taken, as far as that is known: not inside of a `jax.jit`
+    that is differentiated as a whole.
+    """
+    rules = []
+
+    @jax.custom_jvp
+    def probe(*leaves):
+        return leaves[0]
+
+    @probe.defjvp
+    def _(primals, tangents):
+        rules.append(probe)
+        return primals[0], tangents[0]
+
+    leaves = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
+    if leaves:
+        probe(*leaves)
+    return bool(rules)
+
+
 def as_array(value: Any, dtype: Any) -> Any:
     """A new NumPy array, or a JAX array if any entry is traced.
 

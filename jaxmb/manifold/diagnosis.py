@@ -18,6 +18,8 @@ from ..system import AbstractEquation
 # Result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a run
 # only where no error estimate shortens the step.
 NOT_PROJECTED: Any = diffrax.RESULTS.nonlinear_max_steps_reached
+# The same among the results of a motion.
+_NOT_PROJECTED: Any = RESULTS.nonlinear_max_steps_reached
 # A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
 _SINGULAR_PIVOT = 1e-3
 # The same for the coupling of friction with its own reactions, which it is this close to a singular one.
@@ -50,7 +52,7 @@ def diagnose(
 
 def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
     """Tell failures of Newton's method from others; arguments as in `diagnose`."""
-    unsolved = (result == RESULTS.dt_min_reached) | (result == RESULTS.promote(NOT_PROJECTED))
+    unsolved = (result == RESULTS.dt_min_reached) | (result == _NOT_PROJECTED)
     return RESULTS.where(failed & unsolved, RESULTS.newton_failed, result)
 
 

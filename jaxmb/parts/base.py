@@ -124,7 +124,7 @@ class AbstractPart(eqx.Module):
 
     def with_fields(self, **values: Any) -> Self:
         """A copy with some fields replaced."""
-        return with_values(self, fields.values_of(self) | values)
+        return with_values(type(self), fields.values_of(self) | values)
 
 
 @functools.cache

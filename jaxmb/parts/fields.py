@@ -595,7 +595,7 @@ def anonymous(part: Any) -> Any:
         elif kind == "parts":
             value = {key: anonymous(own) for key, own in value.items()}
         out[field] = value
-    return with_values(part, out)
+    return with_values(type(part), out)
 
 
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

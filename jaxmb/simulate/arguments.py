@@ -15,7 +15,7 @@ from .._arguments import check_kind, real_array
 from .._compat import default_float
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import as_array, is_traced
+from ..linalg.arrays import ARRAYS, as_array, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
 from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
@@ -109,12 +109,12 @@ def named_solver(name: str, state: State) -> Adams:
 def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     """`rtol`, and `atol` or None."""
     dtype = state.q.dtype
-    least = 10 * float(jnp.finfo(dtype).eps)
+    least = 10 * float(np.finfo(dtype).eps)
     relative = real_array("rtol", rtol, dtype)
     size = sum(x.size for x in jax.tree.leaves(state))
     absolute = None if atol is None else real_array("atol", atol, dtype, ((), (size,)))
     for name, value in (("rtol", relative), ("atol", absolute)):
-        if value is not None and not is_traced(value) and (np.any(value < 0) or np.any(value >= 1)):
+        if value is not None and not is_traced(value) and not (value.min(initial=0.0) >= 0 and value.max(initial=0.0) < 1):
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
     if not is_traced(relative) and relative < least:
         if dtype != jnp.float32:
@@ -215,18 +215,19 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
     cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u) or, with internal states, State(q, u, z)"
     # A concrete class: a state is nothing but its fields.
     check_kind("state", state, State, "a jaxmb.State", cure)
-    if (state.z is None) != (system.nz == 0):
-        has = f"has {system.nz} internal states" if system.nz else "has no internal states"
+    nq, nu, nz = system.nq, system.nu, system.nz
+    if (state.z is None) != (nz == 0):
+        has = f"has {nz} internal states" if nz else "has no internal states"
         raise ValueError(f"The system {has} and the state {'none' if state.z is None else 'some, in z'}; {cure}.")
-    of_states = [] if state.z is None else [("z", state.z, system.nz)]
-    for name, value, size in (("q", state.q, system.nq), ("u", state.u, system.nu), *of_states):
-        kind = value.dtype if isinstance(value, jax.Array | np.ndarray | np.generic) else type(value)
+    of_states = [] if state.z is None else [("z", state.z, nz)]
+    for name, value, size in (("q", state.q, nq), ("u", state.u, nu), *of_states):
+        kind = value.dtype if isinstance(value, ARRAYS) else type(value)
         if np.result_type(kind).kind not in "fiub":
             raise ValueError(f"state.{name} must be an array of real numbers, got {value!r}; {cure}.")
         if np.shape(value) != (size,):
             raise ValueError(
-                f"The state must have {system.nq} coordinates and {system.nu} velocities"
-                f"{f' and {system.nz} internal states' if system.nz else ''}, got state.{name} of shape "
+                f"The state must have {nq} coordinates and {nu} velocities"
+                f"{f' and {nz} internal states' if nz else ''}, got state.{name} of shape "
                 f"{np.shape(value)}."
             )
     dtype = default_float()

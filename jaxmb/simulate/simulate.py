@@ -15,7 +15,7 @@ from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import is_traced
+from ..linalg.arrays import is_differentiated, is_traced
 from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
@@ -234,10 +234,13 @@ def simulate(
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
+        differentiated=traced and is_differentiated((system, state)),
         # As they were given: under a trace the times of a SaveAt that is made here are traced as well.
         moving=(may_move(times["t0"]), may_move((times["t1"], saveat))),
     )
-    problem.check_impulses()
+    backward = not is_traced((times["t0"], times["t1"])) and times["t1"] < times["t0"]
+    if backward and system.contacts is not None:
+        raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {t0} and {t1}.")
 
     def run(problem):
         if traced:
@@ -271,7 +274,7 @@ def simulate(
             result, coupling = made_precise(problem, trajectory.result, outcome)
             trajectory = eqx.tree_at(lambda trajectory: trajectory.result, trajectory, result)
             outcome = outcome._replace(coupling=coupling)
-        if system.acceleration_rows > 0 and not system.drift_free:
+        if not system.drift_free and system.acceleration_rows > 0:
             warn_of_jumps(system, outcome, times, restarts, jumps)
         if failed and throw is not False:
             # Other runs of the same motion.

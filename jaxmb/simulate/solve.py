@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
 from ..contact_events import FoundEvents
@@ -57,8 +58,9 @@ class Problem(NamedTuple):
     dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and
     `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
     `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with changes whose tangent is
-    watched, by name; whether states are `interpolated`; whether anything is `traced`; whether the start, and the
-    end or a saved time, are `moving`.
+    watched, by name; whether states are `interpolated`; whether anything is `traced`; whether derivatives by
+    the system or the state are known to be taken (`differentiated`); whether the start, and the end or a saved time,
+    are `moving`.
     """
 
     system: AbstractSystem
@@ -81,6 +83,7 @@ class Problem(NamedTuple):
     changes: dict[str, tuple[Any, Any]]
     interpolated: bool
     traced: bool
+    differentiated: bool
     moving: tuple[bool, bool]
 
     @property
@@ -95,7 +98,7 @@ class Problem(NamedTuple):
 
     def check_impulses(self) -> None:
         """Raise a `ValueError` where the velocities after an impulse would not be known."""
-        system, policy, t0, t1 = self.system, self.policy, self.times["t0"], self.times["t1"]
+        system, policy = self.system, self.policy
         jumps = self.restarts is not None and system.velocity_rows > 0
         if not jumps and system.contacts is None:
             return
@@ -105,8 +108,6 @@ class Problem(NamedTuple):
                 f"With {what} needs manifold=Partition() or Projection(), and a mass matrix that has an inverse; got "
                 f"{type(policy).__name__}() and positive_definite_mass = {system.positive_definite_mass}."
             )
-        if system.contacts is not None and not is_traced((t0, t1)) and t1 < t0:
-            raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {t0} and {t1}.")
 
     def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for it."""
@@ -134,13 +135,15 @@ class Problem(NamedTuple):
 def solved(problem: Problem) -> tuple[Trajectory, Outcome]:
     """The motion, and how it ended; where anything is traced, a motion that failed is NaN."""
     motion, outcome = _solved(problem)
-    return Trajectory(problem.system, problem.method, *motion), outcome
+    # Without its checks, which would take as long as those of all arguments.
+    return with_values(Trajectory, {"system": problem.system, "closer": None} | motion), outcome
 
 
 @jitted
-def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
+def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     """What the program returns: fields of the `Trajectory` but the system, which comes in already."""
     tracing_begins()
+    problem.check_impulses()
     system, policy, times = problem.system, problem.policy, problem.times
     valid = system.parameters_in_range() if problem.traced else True
     term, solver = problem.assembled(system)
@@ -172,7 +175,9 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
             after = after_jumps(saved_at, jumps, options["t0"], options["t1"])
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
     control = _tangent_control(system, options, direction)
-    solution: Any = _solve_on_mesh((term, solver, options), control, problem.adjoint, problem.limit)
+    # Where it is known which of the two a run is, the other is not traced.
+    solve = _solve_with_tangents if problem.differentiated else _solve_on_mesh
+    solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit)
     ts, saved = solution.ts[0], solution.ys[0]
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
@@ -228,7 +233,17 @@ def _solved(problem: Problem) -> tuple[tuple[Any, ...], Outcome]:
         motion = nan_where(failed, motion, inputs)
     flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts))])
     outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)
-    return (ts, motion[0], stats, result, motion[1], solution.event_mask, found), outcome
+    fields = {
+        "formulation": problem.method,
+        "ts": ts,
+        "ys": motion[0],
+        "stats": stats,
+        "result": result,
+        "interpolation": motion[1],
+        "event_mask": solution.event_mask,
+        "found_events": found,
+    }
+    return fields, outcome
 
 
 @eqx.filter_jit

@@ -337,7 +337,8 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         steps, own = steps_of(solver, options["stepsize_controller"])
         fixed = freeze((solver, saveat, options, steps, limit))
         jumps = jump_times(options["stepsize_controller"])
-        final, *_ = _recorded((terms, args, own), jumps, init_state, fixed, max_steps, self.most)
+        found = _recorded(*freeze((terms, args, init_state)), fixed, max_steps, self.most)
+        final, *_ = _with_derivatives(found, (terms, args, own), jumps, init_state, fixed, max_steps)
         given = lambda *_, **__: final
         # The time of an event depends on its function, after the steps are taken.
         ended = *freeze((solver, saveat)), freeze(options) | {"event": options["event"]}
@@ -359,17 +360,11 @@ def _run(outer, terms, args, init_state, fixed, max_steps):
     )
 
 
-@eqx.filter_custom_jvp
-def _recorded(equations, jumps, init_state, fixed, max_steps, most):
+def _recorded(terms, args, init_state, fixed, max_steps, most):
     """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
     each has `most`; the starts of all segments and the choices of all steps, None where there is one segment only. All
     but the first are packed.
-
-    **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
-    step size controller knows as well, and the solver stand here for their tangents.
     """
-    del jumps
-    terms, args, _ = equations
     size = min(most, max_steps)
     segments = -(-max_steps // size)
     *_, steps, limit = fixed
@@ -430,11 +425,23 @@ def _layouts_again(steps, old, new):
     )
 
 
-@_recorded.def_jvp
-def _recorded_jvp(primals, tangents):
-    equations, jumps, init_state, fixed, max_steps, _ = primals
-    dequations, djumps, dinit, *_ = tangents
-    out = _recorded(*primals)
+@eqx.filter_custom_jvp
+def _with_derivatives(found, equations, jumps, init_state, fixed, max_steps):
+    """What was `_recorded` without derivatives, with those by the rest.
+
+    **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
+    step size controller knows as well, and the solver stand here for their tangents.
+    """
+    del equations, jumps, init_state, fixed, max_steps
+    return found
+
+
+@_with_derivatives.def_jvp
+def _with_derivatives_jvp(primals, tangents):
+    _, equations, jumps, init_state, fixed, max_steps = primals
+    _, dequations, djumps, dinit, *_ = tangents
+    # Second derivatives see those of the rows.
+    out = _with_derivatives(*primals)
     final, first, rows, again = out
     _, saveat, options, steps, _ = fixed
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))

@@ -132,6 +132,8 @@ def split_coordinates(
 
     **Raises:** `ValueError` for a rate, and as `split_names`.
     """
+    if values is None:
+        return {}, {}
     if isinstance(values, Mapping):
         coordinates, rates = system.coordinate_names(), rates_of(system.rate_names())
         for name in values:
@@ -160,14 +162,16 @@ def split_rates(
     """
     if values is None:
         return {}, {}
-    joints = system.joint_coordinates()
+    own = rates_of(system.rate_names())
     if isinstance(values, Mapping):
         twice = [name for name in values if f"{name}_rate" in values]
         if twice:
             raise ValueError(f"{twice[0]!r} and '{twice[0]}_rate' are the same rate; prescribe one of them.")
-        of_joints = {f"{name}_rate": name for name in joints}
-        values = {of_joints.get(name, name): value for name, value in values.items()}
-    return split_names("rate", system, rates_of(system.rate_names()), values)
+        # Coordinates of joints are found by a trace of each, which most calls do not need.
+        if any(name not in own for name in values):
+            of_joints = {f"{name}_rate": name for name in system.joint_coordinates()}
+            values = {of_joints.get(name, name): value for name, value in values.items()}
+    return split_names("rate", system, own, values)
 
 
 def split_internal_states(
@@ -177,9 +181,9 @@ def split_internal_states(
 
     **Raises:** `ValueError` for values of the wrong shape and for those that are not finite.
     """
-    names = system.state_names()
     if z is None or not isinstance(values, Mapping):
         return z, values
+    names = system.state_names()
     own = {name: value for name, value in values.items() if name in names}
     z, _ = prescribe("internal state", names, own, z)
     if not is_traced(z) and not np.all(np.isfinite(z)):

@@ -92,7 +92,7 @@ def assemble(
     z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_coordinates(system, fix)
     rates, rates_of_joints = split_rates(system, rates)
-    u, fixed_rates = prescribe("rate", rates_of(system.rate_names()), rates, guess.u)
+    u, fixed_rates = prescribe("rate", rates_of(system.rate_names()) if rates else {}, rates, guess.u)
     if not is_traced(u):
         _check_finite(u, "rates")
     raises = throw is not False
@@ -150,14 +150,13 @@ def configuration(
     """The first half of `assemble`: the coordinates, a mask of those that were prescribed, and whether the constraints
     hold; an error if not, with `throw` and outside `jit`.
     """
-    names = system.coordinate_names()
-    q, fixed = prescribe("coordinate", names, {} if fix is None else fix, guess)
+    q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
     if system.contacts is not None:
         # A contact that is open determines its own mode.
         fixed[np.array(system.contacts.modes, int)] = False
     if not is_traced(q):
         _check_finite(q, "coordinates")
-    q, whole = system.normalize_fixed(q, fixed)
+    q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     # The poses that a system was compiled at are often their own closest configuration; then nothing is compiled.
     if guess is system.guess.q and not fixed.any() and not is_traced((system, q, t)):
         met = _is_met(system, t, q)
@@ -166,7 +165,7 @@ def configuration(
             return q, fixed, jnp.array(True)
     q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if throw and not is_traced(ok) and not ok:
-        raise ValueError(_cannot_assemble(system, t, q, fixed, names))
+        raise ValueError(_cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
 
 
@@ -191,7 +190,8 @@ def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: fl
     return listed(system, residual >= least * float(system.length), residual)
 
 
-def _cannot_assemble(system, t, q, fixed, names):
+def _cannot_assemble(system, t, q, fixed):
+    names = system.coordinate_names()
     text = "The mechanism cannot be assembled"
     of_bodies = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
     # Coordinates of joints that are held are rows of their names.

@@ -28,6 +28,7 @@ from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
+from ..linalg.jitted import jitted
 from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
@@ -170,7 +171,7 @@ def _in_blocks(system, given):
     return suits if given is None else given
 
 
-@eqx.filter_jit
+@jitted
 def closest_configuration(
     system: AbstractEquation,
     t: Scalar,
@@ -233,7 +234,7 @@ def _refine(residual, x):
     return newton(correct, lambda _, size: size > _REFINED, x, most=_REFINEMENTS, dtype=x.dtype)[0]
 
 
-@eqx.filter_jit
+@jitted
 def closest_velocities(
     system: AbstractEquation,
     t: Scalar,

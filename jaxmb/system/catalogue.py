@@ -134,6 +134,7 @@ class AbstractSystem(AbstractEquation):
         del before
         return self
 
+    @property
     def signals(self) -> dict[str, tuple[AbstractSignal, bool]]:
         """The parameters that are functions of time, by name; and whether constraints depend on them."""
         return {}

@@ -62,7 +62,7 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
 
     **Raises:** `ValueError` that names an input which is not known from `t0` to `t1`.
     """
-    signals = system.signals()
+    signals = system.signals
     for name, (signal, _) in signals.items():
         signal.check_interval(name, t0, t1)
     own = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]

@@ -96,7 +96,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
             given |= own.parameters()
         design.insert(0, own)
     for name, value in given.items():
-        if name in system.signals():
+        if name in system.signals:
             raise ValueError(
                 f"{name!r} is an input of this system, a function of time, which its value would not change; give "
                 "another input instead."
