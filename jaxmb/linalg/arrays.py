@@ -30,25 +30,26 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def is_differentiated(tree: Any) -> bool:
-    """Whether a derivative by any leaf of a pytree is being taken, as far as that is known: not inside of a `jax.jit`
-    that is differentiated as a whole.
+def derivative_order(tree: Any) -> int:
+    """Of what order derivatives by the leaves of a pytree are being taken, as far as that is known: a `jax.jit` that is
+    differentiated as a whole does not know it.
     """
-    rules = []
+    leaves = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
+    orders = [0]
 
+    # JAX calls the rule where it takes a derivative, with values by which outer ones are taken.
     @jax.custom_jvp
     def probe(*leaves):
         return leaves[0]
 
     @probe.defjvp
     def _(primals, tangents):
-        rules.append(probe)
+        orders.append(1 + derivative_order(primals))
         return primals[0], tangents[0]
 
-    leaves = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
     if leaves:
         probe(*leaves)
-    return bool(rules)
+    return max(orders)
 
 
 def as_array(value: Any, dtype: Any) -> Any:

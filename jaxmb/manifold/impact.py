@@ -51,6 +51,10 @@ from .constraints import dense, push
 from .contact_forces import contact_forces, friction_coefficients, largest_force, stick_reserve
 from .impact_event import NEAR, Event, Phase, find_event
 
+NO_SECOND_DERIVATIVES = (
+    "Second derivatives through impacts are not supported: their times and states have first derivatives only."
+)
+
 
 class Impact(NamedTuple):
     """An event of contacts.
@@ -343,6 +347,4 @@ def _without_second_derivative(x):
 
 @_without_second_derivative.def_jvp
 def _without_jvp(primals, tangents):
-    raise ValueError(
-        "Second derivatives through impacts are not supported: their times and states have first derivatives only."
-    )
+    raise ValueError(NO_SECOND_DERIVATIVES)

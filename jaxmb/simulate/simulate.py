@@ -15,8 +15,9 @@ from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import is_differentiated, is_traced
+from ..linalg.arrays import derivative_order, is_traced
 from ..manifold import AbstractManifold
+from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
 from ..solvers.closures import opened
@@ -224,6 +225,9 @@ def simulate(
     traced = is_traced(numbers)
     if not traced and adjoint is None:
         numbers["saveat"] = padded(saved, times["t0"], times["t1"])
+    order = derivative_order((system, state)) if traced else 0
+    if order > 1 and system.contacts is not None:
+        raise ValueError(NO_SECOND_DERIVATIVES)
     room = max_steps if adjoint is not None else room_for(max_steps, saved, state, traced)
     problem = Problem(
         **numbers,
@@ -234,7 +238,7 @@ def simulate(
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
-        differentiated=traced and is_differentiated((system, state)),
+        differentiated=order > 0,
         # As they were given: under a trace the times of a SaveAt that is made here are traced as well.
         moving=(may_move(times["t0"]), may_move((times["t1"], saveat))),
     )

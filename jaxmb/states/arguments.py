@@ -128,7 +128,7 @@ def split_names(
 def split_coordinates(
     system: AbstractSystem, values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
-    """As `split_names` of coordinates; of a body's angle of more than a full turn it is warned, as of one in degrees.
+    """As `split_names` of coordinates; of an angle of more than a full turn it is warned, as of one in degrees.
 
     **Raises:** `ValueError` for a rate, and as `split_names`.
     """
@@ -144,8 +144,9 @@ def split_coordinates(
                 )
     own, of_joints = split_names("coordinate", system, system.coordinate_names(), values)
     if isinstance(own, Mapping):
-        for name, value in own.items():
-            if name.endswith(".angle") and real_shape(f"Coordinate {name!r}", value) == ():
+        for name, value in (*own.items(), *of_joints.items()):
+            is_angle = name.rpartition(".")[2].startswith("angle")
+            if is_angle and real_shape(f"Coordinate {name!r}", value) == ():
                 # The user calls `assemble` and its like, which call this function.
                 warn_of_degrees(f"fix={{{name!r}: …}}", value, stacklevel=4)
     return own, of_joints

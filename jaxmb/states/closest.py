@@ -38,7 +38,7 @@ _MANY_ROWS = 300
 
 # Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
 # this share.
-_ITERATIONS = 100
+_ITERATIONS = 400
 _PROGRESS = 0.999
 # Implied rows get this share of the largest entry of the diagonal as a pivot.
 _SHIFT = 1e-13

@@ -88,6 +88,9 @@ def test_a_fixed_angle_in_degrees_is_warned_of(pendulum):
     with pytest.warns(UserWarning, match=r"fix=\{'rod\.angle': …\}: the angle 90 rad is more than a full") as caught:
         mb.assemble(pendulum, fix={"rod.angle": 90.0})
     assert caught[0].filename == __file__
+    with pytest.warns(UserWarning, match=r"fix=\{'pin\.angle': …\}: the angle 45 rad is more than a full") as caught:
+        mb.assemble(pendulum, fix={"pin.angle": 45.0})
+    assert caught[0].filename == __file__
 
 
 def test_views_list_what_they_have(motion):

@@ -144,3 +144,17 @@ def test_poses_that_close_are_kept():
     opened = mb.assemble(system, mb.State(system.guess.q.at[0].add(1e-9), system.guess.u))
     np.testing.assert_allclose(system.position_residual(0.0, opened.q), 0.0, rtol=0, atol=1e-14)
     assert 0 < np.max(np.abs(opened.q - system.guess.q)) <= 1e-9
+
+
+@pytest.mark.parametrize("distance", [50.0, 150.0])
+def test_a_body_that_is_far_from_where_it_belongs(distance):
+    """A bar of a metre, put many lengths from its pin: the closest place on the circle around it is found."""
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(distance, 0.2), angle=0.3)
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    system = mb.Scene([bar], joints=[pin]).compile()
+    x, y, angle = mb.assemble(system).q
+    np.testing.assert_allclose((x, y), (0.5 * np.cos(angle), 0.5 * np.sin(angle)), atol=1e-12)
+    # The gradient of the sum of squares along the circle, in units of the system's size and of radians.
+    size = system.coordinate_scale()
+    gradient = (x - distance) * -y / size[0] ** 2 + (y - 0.2) * x / size[1] ** 2 + (angle - 0.3) / size[2] ** 2
+    np.testing.assert_allclose(gradient * size[0] ** 2 / distance, 0.0, atol=1e-10)
