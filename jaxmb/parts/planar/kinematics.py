@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from ...linalg.arrays import namespace
 from ..space import AbstractSpace
@@ -23,8 +24,7 @@ class PlanarSpace(AbstractSpace):
         return pose[:2] + _turned(pose, s)
 
     def point_velocity(self, pose, velocity, s):
-        arm = _turned(pose, s)
-        return velocity[:2] + velocity[2] * jnp.stack([-arm[1], arm[0]])
+        return velocity[:2] + velocity[2:3] * _quarter_turn(_turned(pose, s))
 
     def point_force(self, pose, s, force_W):
         arm = _turned(pose, s)
@@ -73,18 +73,26 @@ def _prepared(pose):
 
 
 def _cos_sin(pose):
-    xp = namespace(pose)
-    return (pose[3], pose[4]) if _prepared(pose) else (xp.cos(pose[2]), xp.sin(pose[2]))
+    """Each as an array of one, which spares a reshape."""
+    if _prepared(pose):
+        return pose[3:4], pose[4:5]
+    xp, angle = namespace(pose), pose[2:3]
+    return xp.cos(angle), xp.sin(angle)
 
 
 def _turned(pose, v):
     c, s = _cos_sin(pose)
-    return namespace(pose, v).stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+    return c * v + s * _quarter_turn(v)
 
 
 def _turned_back(pose, v):
     c, s = _cos_sin(pose)
-    return namespace(pose, v).stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
+    return c * v - s * _quarter_turn(v)
+
+
+def _quarter_turn(v):
+    """Counter-clockwise."""
+    return v[::-1] * np.array([-1.0, 1.0], v.dtype)
 
 
 PLANE = PlanarSpace()
