@@ -55,6 +55,28 @@ def test_twenty_calls_of_a_user(programs):
         np.testing.assert_allclose(motion.ys.q[-1], motions[0].ys.q[-1], rtol=0, atol=1e-9)
 
 
+def test_a_run_that_is_differentiated_is_traced_once(monkeypatch):
+    """A derivative that is known to be taken needs no program of the run without one."""
+    traced, states = [], solve._solve_states
+
+    def counted(*arguments):
+        traced.append(arguments[-1] is not None)
+        return states(*arguments)
+
+    monkeypatch.setattr(solve, "_solve_states", counted)
+    machine = mb.mechanisms.pendulum(length=1.25)
+
+    def end(mass):
+        system = mb.with_parameters(machine.system, {"bob.mass": mass})
+        return mb.simulate(system, machine.state, t1=0.1, rtol=1e-4).ys.q[-1, 0]
+
+    jax.grad(end)(2.0)
+    assert traced == [True]
+    # Here JAX traces the run first, and learns of the derivative afterwards.
+    jax.grad(jax.jit(end))(2.0)
+    assert traced == [True, False, True]
+
+
 @pytest.mark.parametrize("end", [0.3, -0.3])
 def test_saved_states_are_those_of_diffrax(end):
     """Whatever is saved beside the times."""
