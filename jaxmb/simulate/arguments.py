@@ -114,7 +114,7 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
     size = sum(x.size for x in jax.tree.leaves(state))
     absolute = None if atol is None else real_array("atol", atol, dtype, ((), (size,)))
     for name, value in (("rtol", relative), ("atol", absolute)):
-        if value is not None and not is_traced(value) and not (value.min(initial=0.0) >= 0 and value.max(initial=0.0) < 1):
+        if value is not None and not is_traced(value) and not ((value >= 0) & (value < 1)).all():
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
     if not is_traced(relative) and relative < least:
         if dtype != jnp.float32:

@@ -14,7 +14,6 @@ from .._results import RESULTS
 from .._types import State
 from ..contact_events import FoundEvents
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..manifold import (

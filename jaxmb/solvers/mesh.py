@@ -337,7 +337,7 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         steps, own = steps_of(solver, options["stepsize_controller"])
         fixed = freeze((solver, saveat, options, steps, limit))
         jumps = jump_times(options["stepsize_controller"])
-        found = _recorded(*freeze((terms, args, init_state)), fixed, max_steps, self.most)
+        found = _recorded(freeze(terms), freeze(args), freeze(init_state), fixed, max_steps, self.most)
         final, *_ = _with_derivatives(found, (terms, args, own), jumps, init_state, fixed, max_steps)
         given = lambda *_, **__: final
         # The time of an event depends on its function, after the steps are taken.

@@ -128,7 +128,8 @@ def split_names(
 def split_coordinates(
     system: AbstractSystem, values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
-    """As `split_names` of coordinates; of an angle of more than a full turn it is warned, as of one in degrees.
+    """As `split_names` of coordinates; of an angle of more than a full turn it is warned, as of one in degrees. Joints
+    may count turns: of theirs only where it is a multiple of five.
 
     **Raises:** `ValueError` for a rate, and as `split_names`.
     """
@@ -146,7 +147,9 @@ def split_coordinates(
     if isinstance(own, Mapping):
         for name, value in (*own.items(), *of_joints.items()):
             is_angle = name.rpartition(".")[2].startswith("angle")
-            if is_angle and real_shape(f"Coordinate {name!r}", value) == ():
+            if not is_angle or is_traced(value) or real_shape(f"Coordinate {name!r}", value) != ():
+                continue
+            if name in own or float(np.asarray(value)) % 5 == 0:
                 # The user calls `assemble` and its like, which call this function.
                 warn_of_degrees(f"fix={{{name!r}: …}}", value, stacklevel=4)
     return own, of_joints
