@@ -87,9 +87,14 @@ class Jump(eqx.Module):
 
 
 class StartRow(NamedTuple):
-    """What is stored of the start of a run: whether a step was `made`; the field there; what is `kept` of its chart."""
+    """What is stored of the start of a run.
 
-    made: Any
+    **Fields:** whether the memory is `asked` for the field there, and not given; its time, and the field `f`; what is
+    `kept` of its chart.
+    """
+
+    asked: Any
+    time: Any
     f: Float[Array, " n"]
     kept: Any
 
@@ -141,25 +146,25 @@ class AdamsSteps(AbstractSteps):
         differences = after.solver_state.history.differences
         # After one step from a start these are the derivative at its end, and how far it is from that at the start.
         f = differences[0] - differences[1]
-        return StartRow(jnp.array(True), f, kept_of_chart(terms, after.solver_state.chart, at_start=True))
+        # A run that begins with a jump has no field before it.
+        asked = (before.solver_state.history.known == 0) & ~jnp.asarray(before.made_jump)
+        kept = kept_of_chart(terms, after.solver_state.chart, at_start=True)
+        return StartRow(asked, before.tprev, f, kept)
 
-    def memory_at_start(self, equations, first, row, along):
-        like, given = first.y, along[2]
+    def memory_at_start(self, of, terms, like, row, along):
+        *inward, given = along
 
-        def field(equations, flat):
-            terms, args, _ = equations
-            return at_solution(terms, first.tprev, flat, row.f, like, row.kept, args)[1]
-
-        # In a run without steps the row is none, and a run that begins with a jump has no field before it: of zeros
-        # nothing that is not finite comes, in either mode.
-        asked = row.made & (first.solver_state.history.known == 0) & ~jnp.asarray(first.made_jump)
+        def field(terms, flat):
+            own, args, _ = of(terms)
+            return at_solution(own, row.time, flat, row.f, like, row.kept, args)[1]
 
         def found():
-            within = jax.tree.map(lambda x: jnp.where(asked, x, jnp.zeros((), x.dtype)), along[:2])
-            _, f = eqx.filter_jvp(field, (equations, ravel(like)), within)
-            return jnp.where(asked, given.at[0].set(f), given)
+            # Of zeros nothing that is not finite comes, in either mode.
+            within = jax.tree.map(lambda x: jnp.where(row.asked, x, jnp.zeros((), x.dtype)), tuple(inward))
+            _, f = jax.jvp(field, (terms, ravel(like)), within)
+            return jnp.where(row.asked, given.at[0].set(f), given)
 
-        return lax.cond(any_of_batch(asked), found, lambda: given)
+        return lax.cond(any_of_batch(row.asked), found, lambda: given)
 
     def linearised(self, of, moved, like, row):
         def at(of_terms, flat):

@@ -72,16 +72,16 @@ class Tangents(NamedTuple):
 class Mesh(eqx.Module):
     """The steps of a run.
 
-    **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and
-    the solver;
-    `steps`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the `saved` series; `like`: a state;
-    `memory` of the solver at the start; `dense`: of how many steps dense output is kept; whether the run ends at an
-    `event`; its `segments`, None where there is one only.
+    **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and the solver;
+    `steps`; what is stored of the `start`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the
+    `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: of how many steps dense output is
+    kept; whether the run ends at an `event`; its `segments`, None where there is one only.
     """
 
     moved: Moving
     still: PyTree
     steps: AbstractSteps
+    start: PyTree
     rows: list[Array]
     layout: Layout = eqx.field(static=True)
     count: Any
@@ -105,7 +105,8 @@ class Mesh(eqx.Module):
 
     def blank(self) -> Tangents:
         """Zeros."""
-        n, memory, step = ravel(self.like), self.memory, self._shapes()
+        n, memory = ravel(self.like), self.memory
+        step = self._shapes() if self.dense or self.event else None
         table = lambda x: jnp.zeros((self.dense, *x.shape), x.dtype)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step)
         return Tangents(
@@ -128,6 +129,7 @@ class Mesh(eqx.Module):
         zeros unless they are `used`.
         """
         blank, (w, memory) = self.blank(), x[1]
+        memory = self._memory_at_start(x[0].terms, w, memory)
         first = self._first(w, memory, blank if any(used.rows) else blank._replace(rows=[]))
         if self.segments is None:
             return self._out(self._pushed(x[0], first, self.rows, self.count), blank)
@@ -214,14 +216,21 @@ class Mesh(eqx.Module):
             kept = lambda carry: carry[2]
             _, carry, _ = while_loop(lambda c: c[0] >= 0, body, carry, max_steps=None, buffers=kept, kind="lax")
         _, lw, lmemory, places, total = carry
+        nothing = jax.tree.map(jnp.zeros_like, (self.moved.terms, lw, lmemory))
+        dterms, more, lmemory = jax.linear_transpose(self._memory_at_start, *nothing)(lmemory)
+        lw, total = lw + more, total._replace(terms=jax.tree.map(jnp.add, total.terms, dterms))
         for series, table in zip(self.saved, cotangents.saved, strict=True):
             if series.start and table is not None:
                 lw = lw + table[0]
         return total, (lw, lmemory)
 
+    def _memory_at_start(self, dterms, w, memory):
+        """The tangent of the memory that the first step begins with."""
+        of = lambda terms: eqx.combine(terms, self.still)
+        return self.steps.memory_at_start(of, self.moved.terms, self.like, self.start, (dterms, w, memory))
+
     def _pulled(self, cotangents: Tangents, carry, rows, first):
         """The carry of the loop over steps before the step `first`."""
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes())
         nothing = jax.tree.map(jnp.zeros_like, self.moved)
 
         def body(carry):
@@ -229,7 +238,8 @@ class Mesh(eqx.Module):
             k = k - 1
             row = self.row(rows, k)
             step = self.linearised(row)
-            ldense = zeros
+            shapes = eqx.filter_eval_shape(step.push, nothing, lw, lmemory)[2]
+            ldense = zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
             if cotangents.dense is not None:
                 ldense = jax.tree.map(lambda z, c: z if c is None else z + c[k], zeros, cotangents.dense)
             if cotangents.last is not None:
@@ -448,7 +458,6 @@ def _with_derivatives_jvp(primals, tangents):
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
     w, given = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
     at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
-    given = steps.memory_at_start(equations, init_state, at_start, (dequations, w, given))
     x = Moving(dequations, djumps), (w, given)
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
@@ -466,6 +475,7 @@ def _with_derivatives_jvp(primals, tangents):
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
+        start=at_start,
         rows=rows,
         layout=layout,
         count=final.num_accepted_steps,

@@ -72,15 +72,15 @@ class AbstractSteps(eqx.Module):
         return None
 
     def memory_at_start(
-        self, equations: PyTree, first: Any, row: PyTree[Array], along: tuple[PyTree, Array, PyTree]
+        self, of: Callable, terms: PyTree, like: PyTree[Array], row: PyTree[Array], along: tuple[PyTree, Array, PyTree]
     ) -> PyTree[Array]:
         """The tangent of the memory that the first step of a run begins with; by default the one that it is given.
 
-        **Arguments:** `equations`: the terms, their arguments and the solver; `first`: the first state of diffrax's
-        loop; `row`: what is stored of the start, zeros in a run without steps; `along`: the tangents of the
-        equations, of the raveled state and of the memory in `first`.
+        **Arguments:** `of(terms)`: the terms, their arguments and the solver; `like`: the first state; `row`: what is
+        stored of the start, zeros in a run without steps; `along`: the tangents of the terms, of the raveled state and
+        of the memory, in which the result is linear.
         """
-        del equations, first, row
+        del of, terms, like, row
         return along[2]
 
     @abc.abstractmethod
