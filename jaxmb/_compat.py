@@ -102,6 +102,16 @@ def define_bilinear(
     return own.bind
 
 
+def used_inputs(function: Callable[[Any], Any], x: Any) -> Any:
+    """Which arrays of the pytree x a function is computed from, as a pytree of truth values; nothing is compiled.
+
+    (jax.interpreters.partial_eval.dce_jaxpr, 0.7 to 0.10.)
+    """
+    traced = jax.make_jaxpr(function)(x).jaxpr
+    _, used = partial_eval.dce_jaxpr(traced, [True] * len(traced.outvars))
+    return jax.tree.unflatten(jax.tree.structure(x), used)
+
+
 # equinox
 
 

@@ -84,7 +84,7 @@ def _along(system, coordinate, order, ts, ys, solved):
     value, rate = jax.vmap(with_rate)(ts, ys.q, ys.u)
     if order == 1:
         return rate
-    return _continued(ts, value, rate) if coordinate.periodic else value
+    return _continued(ts, value, rate) if coordinate.periodic and ts.size > 1 else value
 
 
 def _continued(ts, angles, rates):

@@ -133,6 +133,17 @@ def test_programs_can_be_read(compat):
     assert any(isinstance(x, kinds) for x in inner), "branches of `cond` are no programs in the parameters of `cond`"
 
 
+def test_inputs_that_a_function_is_computed_from(compat):
+    length = jax.jit(lambda x: jnp.sqrt(jnp.vdot(x, x)))
+
+    def function(x):
+        jnp.sin(x["unused"])
+        return length(x["used"]) + jnp.zeros(2) @ x["without effect"]
+
+    found = compat.used_inputs(function, {name: jnp.zeros(2) for name in ("unused", "used", "without effect")})
+    assert found == {"unused": False, "used": True, "without effect": True}
+
+
 def test_bilinear_operations(compat):
     outer = compat.define_bilinear(
         "outer_of_test",

@@ -16,8 +16,8 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._compat import used_inputs
 from ..._types import Scalar, State
-from ...linalg.arrays import is_traced
 from ...linalg.elimination import PivotSearch, eliminate, full_pivot
 from ...parts.names import unknown
 from ...system import AbstractSystem
@@ -123,8 +123,8 @@ def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, nam
         return lambda state: state.q[known[name][0]]
     displacements = [] if at is None else displacement_names(system)
     if at is not None and name in displacements:
-        row = _displacements(system, t, at)[displacements.index(name)]
-        return lambda state: row @ (state.q - at.q)
+        place = displacements.index(name)
+        return lambda state: _displacements(system, t, at)[place] @ (state.q - at.q)
     return _quantity(system, t, name, "coordinate", [*(k for k, v in known.items() if len(v) == 1), *displacements])
 
 
@@ -247,9 +247,8 @@ def _quantity(system, t, name, kind, others):
 
 
 def _depends_on_velocities(function, state):
-    """Whether a function of the state has a derivative by velocities; numbers that are traced are not looked at."""
-    gradient = jax.grad(function)(state).u
-    return not is_traced(gradient) and bool(np.any(np.asarray(gradient)))
+    """Whether a function of the state is computed from velocities."""
+    return used_inputs(function, state).u
 
 
 def _displacements(system, t, state):
