@@ -18,6 +18,8 @@ from ..parts.names import names_arguments
 
 # What the loops of the members of a block may carry [bytes], and the most members of a block.
 _CARRIED, _MOST = 2**20, 64
+# Rows from which an array of several axes is a table that a step writes one row of.
+_LONG = 1024
 
 
 @names_arguments
@@ -122,9 +124,14 @@ def _carried(program: Any) -> Iterator[int]:
     for equation in getattr(program, "jaxpr", program).eqns:
         inner = [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
         if equation.primitive.name in ("while", "scan"):
-            yield sum(math.prod(x.aval.shape) * x.aval.dtype.itemsize for x in equation.outvars)
+            yield sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in equation.outvars)
         for own in inner:
             yield from _carried(own)
+
+
+def _touched(shape: tuple[int, ...]) -> int:
+    """How many numbers of an array a step touches: of a long table, such as the rows of all steps, those of one row."""
+    return math.prod(shape[1:] if len(shape) > 1 and shape[0] >= _LONG else shape)
 
 
 def _is_program(x: Any) -> bool:
