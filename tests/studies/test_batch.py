@@ -90,6 +90,18 @@ def test_a_last_member_that_fails_leaves_the_others():
     np.testing.assert_allclose(slope[:4], 0.5 / np.sqrt(x[:4]))
 
 
+def test_tables_of_which_a_step_writes_a_row_do_not_make_blocks_small():
+    """So those of a gradient, which keeps a row of every step, are not of single members."""
+    machine = mb.mechanisms.pendulum(length=1.25)
+
+    def end(mass):
+        system = mb.with_parameters(machine.system, {"bob.mass": mass})
+        return mb.simulate(system, machine.state, t1=0.1, rtol=1e-4).ys.q[-1, 0]
+
+    sizes = [Member(function, np.asarray(2.0)).block_size(1000) for function in (end, jax.grad(end))]
+    assert sizes == [64, 32]
+
+
 def test_the_size_of_a_block_is_that_of_what_loops_carry():
     """Twice as much to carry halves a block, a power of two; without a loop a block is the whole batch."""
 
