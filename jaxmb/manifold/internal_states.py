@@ -118,8 +118,8 @@ class StatefulTerm(AbstractManifoldTerm):
     def after_step(self, t, y, chart, args):
         return _at(self.term, y).after_step(t, _mechanical(y), chart, args)
 
-    def refuses(self, chart):
-        return self.term.refuses(chart)
+    def refuses(self, chart, before):
+        return self.term.refuses(chart, before)
 
 
 def _with_states(system, t, z, out):

@@ -17,9 +17,9 @@ def n_four_bar(
 
     One degree of freedom, θ from upright: `I θ̈ = P g sin θ / l` with `I = (n + 1)/3 + n`, `P = (n + 1)/2 + n`. Where
     all bars lie in one line, at odd multiples of π/2, the rows lose rank and other motions branch off. Steps pass over
-    these positions and stay on their branch, because the prediction is much closer to it than to any other. A step that
-    ends too close to such a position is rejected, since round-off, divided by the cube of the distance, exceeds the
-    tolerance. Below rtol 1e-9 this may happen repeatedly, until the motion ends there with a result that reports it.
+    these positions and stay on their branch, because the prediction is much closer to it than to any other. Steps end
+    at a distance from them, since round-off is divided by its cube. At rtol 1e-11 and below no distance that a step can
+    cross is far enough: steps become tiny, and the motion ends there with a result that reports it.
 
     Source: problem A02 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics (1 m, 1 kg,
     1 m/s, 10 s). The reference values, for n = 2, come from the equation above.

@@ -83,10 +83,10 @@ def chart_after_step(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, a
     return None if manifold is None else freeze(manifold.after_step(t * direction_of(term), y, chart, args))
 
 
-def refused(term: Any, chart: Chart | None) -> Any:
-    """Whether the step that ended with a chart must be retried with a smaller one."""
+def refused(term: Any, chart: Chart | None, before: Chart | None) -> Any:
+    """Whether the step from a chart `before` to this one must be retried with a smaller one."""
     manifold = _manifold(term)
-    return False if manifold is None else manifold.refuses(chart)
+    return False if manifold is None else manifold.refuses(chart, before)
 
 
 def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:

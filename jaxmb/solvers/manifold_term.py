@@ -206,9 +206,9 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         del t, y, args
         return chart
 
-    def refuses(self, chart: Chart) -> Bool[Array, ""] | bool:
-        """Whether the state at the end of a step is none of the manifold; the step is then retried, shorter."""
-        del chart
+    def refuses(self, chart: Chart, before: Chart) -> Bool[Array, ""] | bool:
+        """Whether a step that began with the chart `before` must not end with this one; it is then retried, shorter."""
+        del chart, before
         return False
 
 

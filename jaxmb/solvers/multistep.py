@@ -137,10 +137,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | Crossing | None, dict[str, Any], Any, diffrax.RESULTS]:
         y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
+        before = state.chart
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
         chart = chart_after_step(terms, t1, y1, state.chart, args)
         state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
-        off = refused(terms, chart)
+        off = refused(terms, chart, before)
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
         estimate = None if self.tolerances.fixed else estimate

@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 # 10-20%.
 # Weights of the steps of the lower and of the higher order relative to that of the present order.
 LOWER, _UPPER = 0.98, 0.95
+# After a step that is refused, the step changes by this factor, times the controller's safety.
+_REFUSED = 0.75
 # The fraction of the deviation from the target that the next step corrects.
 GAIN = 0.85
 
@@ -43,7 +45,7 @@ class StepEstimate(eqx.Module):
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
     """The estimate of a step that must not be accepted, where `off`."""
-    values = ((estimate.error, jnp.inf), (estimate.growth, 0.0), (estimate.retry, 0.0))
+    values = ((estimate.error, jnp.inf), (estimate.growth, 0.0), (estimate.retry, _REFUSED ** (1 / estimate.response)))
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
     return eqx.tree_at(lambda e: (e.error, e.growth, e.retry), estimate, changed)
 

@@ -160,6 +160,24 @@ def test_steady_precession():
         np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
 
 
+def test_linkages_lie_flat_in_passing_at_every_speed():
+    """They keep their energy, and the level bars stay level: no step ends where round-off is larger than its error."""
+    linkages = library("n_four_bar")
+    system, start = linkages.system, linkages.state
+
+    @jax.jit
+    def run(factor):
+        state, times = mb.State(start.q, factor * start.u), np.linspace(0.0, 10.0, 11)
+        motion = mb.simulate(system, state, t1=10.0, rtol=1e-10, saveat=times, max_steps=3000, throw=False)
+        return motion.energy / motion.energy[0] - 1.0, motion["level1"].angle, motion.stats["num_accepted_steps"]
+
+    for factor in np.linspace(0.5, 3.0, 20):
+        energy, level, steps = run(factor)
+        assert steps < 1500
+        np.testing.assert_allclose(energy, 0.0, atol=1e-8)
+        np.testing.assert_allclose(level, 0.0, atol=1e-8)
+
+
 def test_values_of_the_train_are_those_of_an_independent_model():
     references = library("train").references
     q, u, forces = trains.Train(4).motion(references.times)
