@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 # Types of arrays.
@@ -30,26 +31,29 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def derivative_order(tree: Any) -> int:
-    """Of what order derivatives by the leaves of a pytree are being taken, as far as that is known: a `jax.jit` that is
+def derivative_orders(tree: Any) -> tuple[int, ...]:
+    """Of what order derivatives by each leaf of a pytree are being taken, as far as that is known: a `jax.jit` that is
     differentiated as a whole does not know it.
     """
-    leaves = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
-    orders = [0]
+    leaves = jax.tree.leaves(tree)
+    traced = [k for k, x in enumerate(leaves) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
+    orders = [0] * len(leaves)
 
     # JAX calls the rule where it takes a derivative, with values by which outer ones are taken.
     @jax.custom_jvp
     def probe(*leaves):
         return leaves[0]
 
-    @probe.defjvp
-    def _(primals, tangents):
-        orders.append(1 + derivative_order(primals))
-        return primals[0], tangents[0]
+    def rule(primals, tangents):
+        for k, outer, tangent in zip(traced, derivative_orders(primals), tangents, strict=True):
+            orders[k] = outer + (not isinstance(tangent, SymbolicZero))
+        first = tangents[0]
+        return primals[0], jnp.zeros_like(primals[0]) if isinstance(first, SymbolicZero) else first
 
-    if leaves:
-        probe(*leaves)
-    return max(orders)
+    probe.defjvp(rule, symbolic_zeros=True)
+    if traced:
+        probe(*(leaves[k] for k in traced))
+    return tuple(orders)
 
 
 def as_array(value: Any, dtype: Any) -> Any:

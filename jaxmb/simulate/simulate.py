@@ -15,7 +15,7 @@ from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import derivative_order, is_traced
+from ..linalg.arrays import derivative_orders, is_traced
 from ..manifold import AbstractManifold
 from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..parts.names import names_arguments
@@ -152,7 +152,7 @@ def simulate(
         `equinox.filter_jit` the message stands alone; `jax.jit` adds a page of JAX's own.
     - `max_events`: the largest number of impacts and other events of contacts (`Stop`, `RigidContact`, …), whose times
         and states are kept: a motion that has more of them fails.
-    - `event`, `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
+    - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
         some more steps are simulated; not under `jit`, `vmap` or a derivative.
 
@@ -182,14 +182,17 @@ def simulate(
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
 
     A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
-    step to step. So a run that is differentiated also controls the error of a tangent of the state, from a start that
-    excites all modes, at ten times `rtol`; its values differ within the tolerance from those of the same run without
-    derivatives. A parameter that excites a mode late, after the tangent has died away, needs its `direction`:
-    `{"kick.strength": 1.0}` adds the effect of this change to the tangent. Where a force sets in almost at once, as in
-    an impact, derivatives are less accurate than the motion: for a ball on a stiff floor their error is about
-    5000 `rtol`. Compare them with those of a tolerance that is a hundred times tighter. A controller of the user's is
-    treated in the same way if it is, or wraps, a `MultistepController` or a `diffrax.PIDController`; others choose the
-    same steps with and without derivatives, and so does `diffrax.diffeqsolve` when it is called directly.
+    step to step, and a force whose strength is zero, as a control at the start of an optimisation, is seen by its
+    derivative only. So a run that is differentiated also controls, at five times `rtol`, the errors of tangents of the
+    state: where it is differentiated by the state, of one from a start that excites all modes; where by parameters, of
+    the one that they cause together, each changed by its own size, or by one where it is zero. Its values differ within
+    the tolerance from those of the same run without derivatives. An effect that is much smaller than that of other
+    parameters is resolved relative to theirs; `direction={"kick.strength": 1.0}` watches that of this change instead.
+    Where a force sets in almost at once, as in an impact, derivatives are less accurate than the motion: for a ball on
+    a stiff floor their error is about 5000 `rtol`. Compare them with those of a tolerance that is a hundred times
+    tighter. A controller of the user's is treated in the same way if it is, or wraps, a `MultistepController` or a
+    `diffrax.PIDController`; others choose the same steps with and without derivatives, and so does
+    `diffrax.diffeqsolve` when it is called directly.
     """
     check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
     check_precision("simulate", system)
@@ -225,8 +228,8 @@ def simulate(
     traced = is_traced(numbers)
     if not traced and adjoint is None:
         numbers["saveat"] = padded(saved, times["t0"], times["t1"])
-    order = derivative_order((system, state)) if traced else 0
-    if order > 1 and system.contacts is not None:
+    orders = derivative_orders((system, state)) if traced else ()
+    if max(orders, default=0) > 1 and system.contacts is not None:
         raise ValueError(NO_SECOND_DERIVATIVES)
     room = max_steps if adjoint is not None else room_for(max_steps, saved, state, traced)
     problem = Problem(
@@ -238,7 +241,7 @@ def simulate(
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
-        differentiated=order > 0,
+        differentiated=tuple(order > 0 for order in orders) if any(orders) else (),
         # As they were given: under a trace the times of a SaveAt that is made here are traced as well.
         moving=(may_move(times["t0"]), may_move((times["t1"], saveat))),
     )

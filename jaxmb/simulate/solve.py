@@ -1,5 +1,6 @@
 """The integration of a motion as one compiled program, whose mesh resolves derivatives where they are taken."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .._compat import with_values
@@ -57,9 +59,9 @@ class Problem(NamedTuple):
     dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and
     `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
     `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with changes whose tangent is
-    watched, by name; whether states are `interpolated`; whether anything is `traced`; whether derivatives by
-    the system or the state are known to be taken (`differentiated`); whether the start, and the end or a saved time,
-    are `moving`.
+    watched, by name; whether states are `interpolated`; whether anything is `traced`; by which leaves of the system
+    and the state derivatives are taken (`differentiated`), empty where that is not known; whether the start, and the
+    end or a saved time, are `moving`.
     """
 
     system: AbstractSystem
@@ -82,7 +84,7 @@ class Problem(NamedTuple):
     changes: dict[str, tuple[Any, Any]]
     interpolated: bool
     traced: bool
-    differentiated: bool
+    differentiated: tuple[bool, ...]
     moving: tuple[bool, bool]
 
     @property
@@ -154,6 +156,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if problem.changes:
         moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in problem.changes.items()})
         direction = eqx.filter_jvp(lambda step: problem.assembled(moved(step))[0], (0.0,), (1.0,))[1]
+    elif problem.differentiated:
+        leaves, structure = jax.tree.flatten(system)
+        along = jax.tree.unflatten(structure, problem.differentiated[: len(leaves)])
+        direction = _pushed(lambda system: problem.assembled(system)[0], system, along)
     finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(start)]) & valid
 
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
@@ -165,6 +171,13 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if problem.moving[0]:
         options["y0"] = start = at_frozen_start(term, times["t0"], start)
     at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
+    outside: Any = False
+    if problem.traced and saved_at is not None:
+        ends = jnp.sort(jnp.stack([options["t0"], options["t1"]]))
+        inside = jnp.clip(saved_at, *ends)
+        # A time that is computed as t1 is may differ from it by rounding errors.
+        rounding = 8 * jnp.finfo(ends.dtype).eps * jnp.max(jnp.abs(ends))
+        outside, saved_at = ~jnp.all(jnp.abs(inside - saved_at) <= rounding), inside
     options["t1"] = at_once(options["t1"])
     controller, after = options["stepsize_controller"], saved_at
     jumps = controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
@@ -174,6 +187,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
             after = after_jumps(saved_at, jumps, options["t0"], options["t1"])
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
     control = _tangent_control(system, options, direction)
+    if problem.differentiated and not problem.changes:
+        excites = any(problem.differentiated[len(jax.tree.leaves(system)) :])
+        control = dataclasses.replace(control, excites=excites)
     # Where it is known which of the two a run is, the other is not traced.
     solve = _solve_with_tangents if problem.differentiated else _solve_on_mesh
     solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit)
@@ -214,6 +230,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
     if lost is not None:
         result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
+    if outside is not False:
+        result = RESULTS.where(outside & ~has_failed(result), RESULTS.saved_outside, result)
     stats = dict(solution.stats) | {"max_steps": problem.limit}
     linearised = False
     if isinstance(solver, AbstractMultistep):
@@ -273,8 +291,14 @@ def _solve_on_mesh(arguments, control, adjoint, limit):
 
 @_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
-    arguments, *fixed = primals
-    return eqx.filter_jvp(lambda arguments: _solve_with_tangents(arguments, *fixed), (arguments,), (tangents[0],))
+    arguments, control, *fixed = primals
+    if control.direction is None:
+        used = jax.tree.map(lambda x: x is not None, tangents[0][0], is_leaf=lambda x: x is None)
+        direction = _pushed(lambda term: term, lax.stop_gradient(arguments[0]), used)
+        excites = bool(jax.tree.leaves(tangents[0][2]["y0"]))
+        control = dataclasses.replace(control, direction=direction, excites=excites)
+    solve = lambda arguments: _solve_with_tangents(arguments, control, *fixed)
+    return eqx.filter_jvp(solve, (arguments,), (tangents[0],))
 
 
 def _solve_with_tangents(arguments, control, adjoint, limit):
@@ -324,6 +348,27 @@ def _tangent_control(system, options, direction) -> TangentControl:
     units = natural_units(system, velocities * rate, state.q.dtype)
     sizes = tuple(block.size for block in state_blocks(system, rate))
     return lax.stop_gradient(TangentControl(units, sizes, direction))
+
+
+def _pushed(function, at, used):
+    """The tangent of a function along a change of all the leaves that are `used`, of each by its own size, or by one
+    where it is zero, and with random signs, always the same ones; None where none is used.
+    """
+    random = np.random.default_rng(0)
+
+    def change(x, is_used):
+        if not (is_used and eqx.is_inexact_array(x)):
+            return None
+        signs = random.choice([-1.0, 1.0], x.shape) * random.uniform(0.5, 1.0, x.shape)
+        # A bound may be infinite.
+        finite = jnp.isfinite(x)
+        size = jnp.max(jnp.where(finite, jnp.abs(x), 0.0), initial=0.0)
+        return jnp.where(finite, jnp.where(size > 0, size, 1.0) * jnp.asarray(signs, x.dtype), 0.0)
+
+    along = jax.tree.map(change, at, used, is_leaf=lambda x: x is None)
+    if not jax.tree.leaves(along):
+        return None
+    return lax.stop_gradient(eqx.filter_jvp(function, (at,), (along,))[1])
 
 
 def running_scales(system, state, options) -> RunningScales:

@@ -3,7 +3,9 @@
 Steps that follow a motion may lie far outside the stability region of a mode that is not excited. The motion does not
 show it, but its derivatives do: they grow from step to step without bound. A solve that is differentiated therefore
 carries a tangent w of the state along, `w' = J(t, y) w`, from a start that excites every mode, and keeps its local
-error small as well. Tangents that are carried along have no derivatives themselves.
+error small as well. Nor does a motion show a force of strength zero, whose derivative by the strength is none the less
+a function of time that steps have to resolve: where derivatives by parameters are taken, a tangent that these cause is
+watched, `d' = J d + f_p`. Tangents that are carried along have no derivatives themselves.
 
 They are those of the numerical solution: each step is differentiated along the tangents of the state and of the
 solver's memory. The derivative of the error estimate is then the error estimate of the tangent.
@@ -22,7 +24,11 @@ from .evaluation import freeze
 from .scales import ends_of
 
 # The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
-_LOOSER, _FLOOR = 10.0, 0.01
+_LOOSER, _FLOOR = 5.0, 0.01
+# The start of a tangent that parameters cause, which would be zero, in units of the other start. So steps do not begin
+# at no length, and a mode that is excited late has been followed until then. It may be the larger one only where the
+# effect of the parameters is fainter still.
+_FAINT = 1e-12
 
 
 class TangentControl(eqx.Module):
@@ -32,27 +38,32 @@ class TangentControl(eqx.Module):
 
     - `units`: the natural sizes of the components of the raveled state.
     - `blocks`: sizes of the blocks of components that are measured by the largest one among them.
-    - `direction`: a tangent of the term, None where derivatives are not along a known direction. The tangent of the
-        state that it causes, `d' = J d + f_p`, is carried along in addition.
+    - `direction`: a tangent of the term, None where derivatives by its numbers are not taken. The tangent of the state
+        that it causes is carried along.
+    - `excites`: whether the tangent from a start that excites every mode is, beside that.
     """
 
     units: Float[Array, " n"]
     blocks: tuple[int, ...] = eqx.field(static=True)
     direction: PyTree = None
+    excites: bool = eqx.field(static=True, default=True)
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
-        """A tangent with entries of random signs, between one half and one unit, always the same one; and zeros."""
+        """A start with entries of random signs, between one half and one unit, always the same one; and a faint one."""
         random = np.random.default_rng(0)
         entries = random.choice([-1.0, 1.0], self.units.size) * random.uniform(0.5, 1.0, self.units.size)
         excited = self.units * jnp.asarray(entries, self.units.dtype)
-        return (excited,) if self.direction is None else (excited, jnp.zeros_like(excited))
+        if self.direction is None:
+            return (excited,)
+        return (excited, _FAINT * excited) if self.excites else (_FAINT * excited,)
 
     def of_terms(self, terms: PyTree) -> tuple[PyTree, ...]:
         """The tangents of a solver's terms, which diffrax has wrapped."""
         none = jax.tree.map(lambda _: None, terms)
         if self.direction is None:
             return (none,)
-        return none, with_inner(terms, self.direction, None)
+        along = with_inner(terms, self.direction, None)
+        return (none, along) if self.excites else (along,)
 
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""
@@ -97,8 +108,13 @@ def pushed_only(function: Any, at: PyTree, along: PyTree) -> PyTree:
 
 
 def _filled(tangent, out):
-    """A tangent with zeros where it has no entries, as constants have none."""
-    fill = lambda t, x: jnp.zeros_like(x) if t is None and eqx.is_inexact_array(x) else t
+    """A tangent with zeros where it has no entries, as constants have none, and where a derivative is no number."""
+
+    def fill(t, x):
+        if t is None:
+            return jnp.zeros_like(x) if eqx.is_inexact_array(x) else None
+        return jnp.where(jnp.isnan(t), jnp.zeros_like(t), t) if eqx.is_inexact_array(t) else t
+
     return freeze(jax.tree.map(fill, tangent, out, is_leaf=_is_none))
 
 

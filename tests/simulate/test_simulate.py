@@ -155,6 +155,25 @@ def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
     assert np.all(np.isnan(gradient(jnp.array([1.0, 2.0]), 5)))
 
 
+@pytest.mark.parametrize("end", [0.3, -0.3])
+def test_times_that_are_traced_are_inside_the_interval(rod, end):
+    state = mb.assemble(rod)
+
+    @jax.jit
+    def run(times):
+        motion = mb.simulate(rod, state, t1=end, saveat=times)
+        return motion["rod"].angle, motion.result._value
+
+    _, ended = run(end * jnp.array([0.5, 1.0]))
+    assert ended == mb.RESULTS.successful._value
+    # As the end is computed in another way.
+    angles, ended = run(jnp.array([0.5 * end, np.sign(end) * 0.1 * 3]))
+    assert ended == mb.RESULTS.successful._value and np.all(np.isfinite(angles))
+    for times in ([0.5, 1.1], [-0.1, 0.5], [0.5, np.nan]):
+        angles, ended = run(end * jnp.array(times))
+        assert ended == mb.RESULTS.saved_outside._value and np.all(np.isnan(angles))
+
+
 def test_trajectory_outside_its_use_is_an_error(rod):
     with pytest.raises(ValueError, match="saveat must be a vector"):
         mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=jnp.zeros((2, 2)))
