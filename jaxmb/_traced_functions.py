@@ -1,10 +1,10 @@
-"""Functions of the user that JAX traces: a message about the line that needs a number where there is none."""
+"""Functions of the user that JAX traces: a message about the line that needs a number or a name that is not there."""
 
 import contextlib
 import functools
 import sysconfig
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -36,15 +36,29 @@ def traced_by_jax(what: str, argument: str) -> Iterator[None]:
     **Arguments:** `what` is traced, such as "the function of a sweep", and what it has no number of, such as "a
     parameter".
 
-    **Raises:** `ValueError` that says which line of the user's needs a number, and what to write instead.
+    **Raises:** `ValueError` that says which line of the user's needs a number, and what to write instead; or which one
+    asks a dictionary for a name, and what names are in it.
     """
     try:
         yield
+    except KeyError as error:
+        if isinstance(error, ValueError):
+            # It says more: an unknown name of a system.
+            raise
+        frames = [own for own, _ in traceback.walk_tb(error.__traceback__) if not is_installed(own.f_code.co_filename)]
+        near = frames[-1].f_locals if frames else {}
+        there = {name: own for name, own in near.items() if isinstance(own, Mapping)}
+        listed = [f"; {name} has {', '.join(map(repr, own)) or 'no names'}" for name, own in there.items()]
+        raise ValueError(f"{_line(error)} asks for {error}, which {what} does not get{''.join(listed)}.") from error
     except NEED_NUMBERS as error:
-        lines = [own for own in traceback.extract_tb(error.__traceback__) if not is_installed(own.filename)]
-        where = f"{lines[-1].filename}:{lines[-1].lineno}: `{lines[-1].line}`" if lines else "The function"
         raise ValueError(
-            f"{where} needs {argument} as a number, and {what} is traced by JAX: there is no `if`, `while`, `float()`, "
-            f"`int()`, or function of NumPy or `math` of what depends on {argument}. Use jnp.where or jax.lax.cond for "
-            "`if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy and `math`."
+            f"{_line(error)} needs {argument} as a number, and {what} is traced by JAX: there is no `if`, `while`, "
+            f"`float()`, `int()`, or function of NumPy or `math` of what depends on {argument}. Use jnp.where or "
+            "jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy and `math`."
         ) from error
+
+
+def _line(error: Exception) -> str:
+    """The last line of the user's on the way to an error."""
+    lines = [own for own in traceback.extract_tb(error.__traceback__) if not is_installed(own.filename)]
+    return f"{lines[-1].filename}:{lines[-1].lineno}: `{lines[-1].line}`" if lines else "The function"

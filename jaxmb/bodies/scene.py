@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .._traced_functions import traced_by_jax
 from .._types import State
@@ -37,6 +38,7 @@ from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
 from ..parts.spatial.kinematics import SPACE
+from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.description import Description
 from ..system.equation import Ranks
 from .groups import (
@@ -306,6 +308,8 @@ def _check_names(scene: Scene):
         for part in scene.joints
         if isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not part.sources)
     )
+    # Those of coordinates, as a stop is.
+    stops = {own.name: own for own in scene.joints if isinstance(own, AbstractUnilateralConstraint) and own.sources}
     places = [*joints, *(name for name in known if name != GROUND)]
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractActor) and part.sources:
@@ -315,6 +319,10 @@ def _check_names(scene: Scene):
                     raise ValueError(
                         f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
                         f"{', '.join(map(repr, joints)) or 'none'}."
+                    )
+                if isinstance(part, AbstractNonIdeal | AbstractDryFriction) and name in stops:
+                    raise ValueError(
+                        f"{part.label}: {stops[name].label} has no point at which bodies touch, and no friction."
                     )
                 if name not in allowed or name == part.name:
                     raise unknown(what, name, allowed, part.label)
@@ -334,19 +342,41 @@ def _check_rotation(part, components, own, layout, poses):
     space = layout.space
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
-            strength = np.asarray(_strength(anonymous(component), space, poses))
-        if np.any(strength[points, space.dimension :] > 0):
+            turned = np.asarray(_turned(anonymous(_loaded(component)), space, poses))
+        if np.any(turned[points]):
             raise ValueError(
                 f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "
                 "or use a Body."
             )
 
 
+def _loaded(part):
+    """The part with ones in place of forces and moments that are zero, as those of inputs may be."""
+    values = values_of(part)
+    loads = [name for name, own in declarations(type(part)).items() if own.unit in ("N", "N m")]
+    ones = {name: np.ones_like(values[name]) for name in loads if values[name] is not None and not np.any(values[name])}
+    return _call(part, "with_fields", **ones) if ones else part
+
+
 @eqx.filter_jit
-def _strength(part, space, poses):
+def _turned(part, space, poses):
+    """Which bodies a part turns, at the given poses or at others, where springs are stretched and contacts closed."""
+    d, k = space.dimension, poses.shape[0]
+    varied = lambda size: jnp.asarray(1 + 0.4 * np.cos(np.arange(k * size)), poses.dtype).reshape(k, size)
+
+    def turned(poses):
+        strength = _strength(part, space, poses, varied(space.velocity_size))
+        # An arm that is due to rounding.
+        least = 100 * float(np.finfo(poses.dtype).eps) * jnp.max(jnp.abs(poses[:, :d]))
+        return jnp.any(strength[:, d:] > least * jnp.max(strength[:, :d]), axis=1)
+
+    others = jax.vmap(space.normalize)(poses + varied(space.pose_size))
+    return jnp.any(lax.map(turned, jnp.stack([poses, others])), axis=0)
+
+
+def _strength(part, space, poses, velocities):
     """The size of a part's wrenches, or of its Jacobian, for each velocity of its bodies."""
     if isinstance(part, AbstractForce):
-        velocities = jnp.ones((poses.shape[0], space.velocity_size), poses.dtype)
         wrenches = part.wrenches(space, *part.seen(space, poses, velocities), jnp.zeros((), poses.dtype))
         return jnp.abs(part.wrenches_on_bodies(space, poses, wrenches))
     rows = rows_of(part, space, poses)

@@ -386,9 +386,10 @@ class _Builder:
                 )
 
     def _middle(self, name):
-        """The middle of a joint's range, about which its angle counts; zero where it may turn as it likes."""
-        limits = _range(self.of_name[name])
-        return 0.0 if limits is None else 0.5 * (limits[0] + limits[1])
+        """The middle of a hinge's range, about which its angle counts; zero where it may turn as it likes."""
+        joint = self.of_name[name]
+        limits = _range(joint)
+        return 0.0 if limits is None or joint.kind != "hinge" else 0.5 * (limits[0] + limits[1])
 
     def _seen_up_to_half_a_turn(self, name, of, zero=0.0):
         """Note that something sees the angle of a joint up to half a turn from a zero, if it may leave this range."""

@@ -116,7 +116,7 @@ class Pfaffian(AbstractCoordinateConstraint):
 
     def value(self, t, q, v, a, parameters):
         out = jnp.atleast_2d(self.matrix(t, q, parameters)) @ v
-        return out if self.drift is None else out + jnp.ravel(self.drift(t, q, parameters))
+        return out if self.drift is None else out + _of_rows(self.name, "drift", out, self.drift(t, q, parameters))
 
     def is_drift_free(self, q, parameters):
         return self.drift is None
@@ -144,8 +144,8 @@ class AccelerationConstraint(AbstractCoordinateConstraint):
     level: ClassVar[int] = 2
 
     def value(self, t, q, v, a, parameters):
-        matrix = jnp.atleast_2d(self.matrix(t, q, v, parameters))
-        return matrix @ a - jnp.ravel(self.right(t, q, v, parameters))
+        out = jnp.atleast_2d(self.matrix(t, q, v, parameters)) @ a
+        return out - _of_rows(self.name, "right", out, self.right(t, q, v, parameters))
 
 
 class ServoConstraint(AbstractCoordinateConstraint):
@@ -187,7 +187,14 @@ class ServoConstraint(AbstractCoordinateConstraint):
         return second + self.damping * rate + self.stiffness * phi(t, q)
 
 
-def check_names(constraints: tuple[Any, ...]) -> None:
+def _of_rows(constraint: str, what: str, rows: Float[Array, "rows"], value: Any) -> Float[Array, "rows"]:
+    value = jnp.ravel(value)
+    if value.shape != rows.shape:
+        raise ValueError(f"{constraint}: {what} must have shape {rows.shape}, as matrix has rows; got {value.shape}.")
+    return value
+
+
+def check_names(constraints: tuple[Any, ...], coordinates: tuple[str, ...]) -> None:
     """Raise a `ValueError` unless every entry is a constraint, with a name of its own."""
     for constraint in constraints:
         if not isinstance(constraint, AbstractCoordinateConstraint):
@@ -199,3 +206,6 @@ def check_names(constraints: tuple[Any, ...]) -> None:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise ValueError(f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs its own.")
+    for name in names:
+        if name in coordinates:
+            raise ValueError(f"{name!r} is a constraint as well as a coordinate; rename one of them.")

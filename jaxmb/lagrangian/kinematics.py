@@ -100,11 +100,13 @@ class QuasiVelocityFrame(AbstractKinematics):
 
     def columns_of(self, t: Scalar, q: Coordinates, parameters: Parameters) -> Float[Array, "nq columns"]:
         """N."""
-        return jnp.asarray(self.matrix(t, q, parameters))
+        return _of_shape("The matrix of a frame", (q.size, self.columns), self.matrix(t, q, parameters))
 
     def rates(self, t, q, u, parameters):
         v = self.columns_of(t, q, parameters) @ u
-        return v if self.drift is None else v + self.drift(t, q, parameters)
+        if self.drift is not None:
+            v = v + _of_shape("The drift of a frame", q.shape, self.drift(t, q, parameters))
+        return v
 
 
 class Connection(AbstractKinematics):
@@ -145,7 +147,16 @@ class Connection(AbstractKinematics):
         return len(self.base)
 
     def rates(self, t, q, u, parameters):
-        s = -jnp.asarray(self.matrix(t, q, parameters)) @ u
+        label = f"of the Connection of base {self.base} and fibre {self.fibre}"
+        rows, columns = len(self.fibre), len(self.base)
+        s = -_of_shape(f"The matrix {label}", (rows, columns), self.matrix(t, q, parameters)) @ u
         if self.drift is not None:
-            s = s - self.drift(t, q, parameters)
+            s = s - _of_shape(f"The drift {label}", (rows,), self.drift(t, q, parameters))
         return jnp.zeros_like(q).at[jnp.array(self.base)].set(u).at[jnp.array(self.fibre)].set(s)
+
+
+def _of_shape(what: str, shape: tuple[int, ...], value: Any) -> Array:
+    value = jnp.asarray(value)
+    if value.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}, got {value.shape}.")
+    return value

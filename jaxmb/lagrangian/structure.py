@@ -1,7 +1,7 @@
 """The structure of a Lagrangian system: shapes, ranks, and whether its mass matrix is diagonal."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -37,7 +37,7 @@ class Unanalysed(AbstractLagrangian):
 
 
 def constraint_sizes(
-    lagrangian: Callable[..., Array],
+    energies: Mapping[str, Callable[..., Array] | None],
     applied: Callable[..., Array] | None,
     constraints: tuple[AbstractCoordinateConstraint, ...],
     kinematics: AbstractKinematics,
@@ -46,12 +46,19 @@ def constraint_sizes(
 ) -> tuple[int, ...]:
     """The number of rows of each constraint, from shapes alone.
 
+    **Arguments:** `energies`: those that are given of `lagrangian`, `kinetic` and `potential`, by these names.
+
     **Raises:** `ValueError` for functions of the wrong shape.
     """
     q, p = guess.q, parameters
     t = jnp.zeros((), q.dtype)
     _shape("kinematics", (q.size,), kinematics.rates, t, q, guess.u, p)
-    _shape("lagrangian", (), lagrangian, t, q, q, p)
+    for name, energy in energies.items():
+        if energy is None:
+            continue
+        found = _shape(name, None, energy, t, q, *(() if name == "potential" else (q,)), p)
+        if math.prod(found) != 1:
+            raise ValueError(f"{name} must be a scalar, got shape {found}.")
     if applied is not None:
         _shape("force", (q.size,), applied, t, q, q, p)
     return tuple(math.prod(_shape(c.name, None, c.value, t, q, q, q, p)) for c in constraints)

@@ -99,14 +99,16 @@ class LagrangianSystem(AbstractLagrangian):
         length: VectorLike = 1.0,
     ):
         kinematics = Rates() if kinematics is None else kinematics
-        check_names(tuple(constraints))
         guess = _guess(q, u, kinematics)
-        functions = _lagrangian(lagrangian, kinetic, potential), force
+        names = _names(coordinates, guess.q.size)
+        check_names(tuple(constraints), names)
+        difference = _lagrangian(lagrangian, kinetic, potential)
+        energies = {"lagrangian": lagrangian, "kinetic": kinetic, "potential": potential}
         # Φ, then the rest of ψ, then rows that bind accelerations only.
         constraints = tuple(sorted(constraints, key=lambda c: c.level))
         numbers = {name: _number(name, value) for name, value in (parameters or {}).items()}
         model = Unanalysed(
-            lagrangian=functions[0],
+            lagrangian=difference,
             applied=force,
             constraints=constraints,
             nonideal=tuple(nonideal),
@@ -115,8 +117,8 @@ class LagrangianSystem(AbstractLagrangian):
             parameters=numbers,
             guess=guess,
             length=as_jax(length),
-            coordinates=_names(coordinates, guess.q.size),
-            sizes=constraint_sizes(*functions, constraints, kinematics, guess, numbers),
+            coordinates=names,
+            sizes=constraint_sizes(energies, force, constraints, kinematics, guess, numbers),
             inputs={},
         )
         for field in dataclasses.fields(model):

@@ -35,14 +35,15 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
 
     **Arguments:** `coordinate`, such as `"hip.angle"`; `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or
     [rad, m]; as an input of `simulate`, `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force
-    over the command's unit and over a speed; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default none; `force`
-    [N m, N], its initial value. Positive forces increase the coordinate, with the reaction on the joint's other body.
+    over the command's unit and over a speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit`
+    [N m, N] > 0 of the demand, default none; `force` [N m, N], its initial value. Positive forces increase the
+    coordinate, with the reaction on the joint's other body.
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
     command: fields.Number = fields.parameter(shape=None, unit="N m, rad/s, rad or N, m/s, m")
     lag: fields.Number = fields.parameter(unit="s", sign="positive")
-    gain: fields.Number = fields.parameter(sign="non-negative", default=0.0)
+    gain: fields.Number = fields.parameter(sign="non-negative", optional=True)
     damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
     limit: fields.Number = fields.parameter(unit="N m or N", sign="positive", optional=True)
     force: fields.Number = fields.internal_state(shape=None, unit="N m or N")
@@ -50,12 +51,17 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):
             raise ValueError(f"{self.label}: gain and damping belong to the modes 'speed' and 'position'.")
+        if self.mode != "force" and self.gain is None:
+            raise ValueError(
+                f"{self.label}: without a gain its command does nothing in the mode {self.mode!r}; give gain."
+            )
         if self.mode == "speed" and np.any(self.damping):
             raise ValueError(f"{self.label}: damping belongs to the mode 'position'; with 'speed' use gain.")
 
     def with_numbers(self, given):
         self._check_shape("command", given)
-        return self.with_fields(force=fields.as_parameter(np.broadcast_to(self.force, given.shape)))
+        part = self.filled(gain=0.0)
+        return part.with_fields(force=fields.as_parameter(np.broadcast_to(self.force, given.shape)))
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: self.force.reshape(-1)
@@ -94,10 +100,11 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
     `lag · d(activation)/dt = control − activation`. Of a `Motor` it is the force that follows.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`, of which x counts in (−π, π] about `middle`; `control`, default
-    zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`;
-    `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by default they are not;
-    `lag` [s] > 0, default none; `activation`, its initial value, default zero.
+    **Arguments:** `coordinate`, such as `"hip.angle"`; an angle in space counts in (−π, π] about `middle` [rad],
+    default zero, and other coordinates have no middle; `control`, default zero, as an input of `simulate`,
+    `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`; `control_range` and `force_range`,
+    shape (2,): the control and f are clipped to them, by default they are not; `lag` [s] > 0, default none;
+    `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)
@@ -120,6 +127,8 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
 
     def with_numbers(self, given):
         part = super().with_numbers(given)
+        if np.any(self.middle):
+            self._check_middle()
         return part if self.lag is None else part.filled(activation=0.0)
 
     def force(self, length, rate):

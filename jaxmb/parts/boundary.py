@@ -98,6 +98,8 @@ def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[A
         except NEED_NUMBERS:
             raise
         except Exception as error:
+            if isinstance(error, KeyError) and not isinstance(error, ValueError):
+                raise
             if of_numbers is None:
                 cause = str(error).strip().splitlines()[0]
                 raise ValueError(f"{label}: {name} cannot be evaluated: {cause}") from error

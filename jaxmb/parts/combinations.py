@@ -16,6 +16,9 @@ from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
 from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns
 
+# Points of a tendon coincide if they are no farther apart than this share of its length.
+_APART = 1e-9
+
 
 class AbstractCombination(AbstractOfJoints):
     """A part that acts on several coordinates of joints or tendons, each a number.
@@ -235,7 +238,7 @@ class Tendon(AbstractTendon):
     ```
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`. Neighbouring points must not
-    coincide.
+    coincide, neither at the given poses nor later.
 
     **Arguments:** `path`: pairs (body, point), at least two; points [m] are body-fixed. A body may occur several times.
 
@@ -257,6 +260,19 @@ class Tendon(AbstractTendon):
         if len(self.owners) < 2 or self.points.ndim != 2:
             raise ValueError(f"{self.label}: path must hold at least 2 pairs (body, point), got {len(self.owners)}.")
 
+    def complete(self, space, poses):
+        distances = self._distances(space, poses)
+        k = int(jnp.argmin(distances))
+        if distances[k] <= _APART * jnp.sum(distances):
+            raise ValueError(
+                f"{self.label}: the neighbours path[{k}] and path[{k + 1}] coincide at the given poses; move one or "
+                "leave it out."
+            )
+        return self
+
     def length(self, space, poses):
+        return jnp.sum(self._distances(space, poses))
+
+    def _distances(self, space, poses):
         points = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
-        return jnp.sum(norm(points[1:] - points[:-1]))
+        return norm(points[1:] - points[:-1])

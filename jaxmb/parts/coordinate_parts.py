@@ -140,6 +140,12 @@ class AbstractCoordinatePart(AbstractOfJoints):
                 f"{self.label}: {field} must have the shape of {self.coordinate!r}, {given.shape}, got {shape}."
             )
 
+    def _check_middle(self) -> None:
+        if self.within not in self.joint.periodic:
+            raise ValueError(
+                f"{self.label}: middle is that of an angle in space, which {self.coordinate!r} is not; leave it out."
+            )
+
 
 def is_length(within: str) -> bool:
     """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
@@ -179,6 +185,8 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
         part = self.filled(free=given)
         for field in ("free",) if part.middle is None else ("free", "middle"):
             part._check_shape(field, given)
+        if part.middle is not None:
+            part._check_middle()
         return part
 
     def _stretch(self, value):
@@ -267,8 +275,8 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     value − upper. The stop has the potential `½ stiffness δ²` and the dissipation `damping δ̇²`.
 
     **Arguments:** `coordinate`, such as `"hip.angle"`; `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0;
-    `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends. The range of an angle must be
-    less than a full turn.
+    `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends. In space the range of an
+    angle must be less than a full turn.
     """
 
     lower: fields.Number = fields.parameter(unit="rad or m")
@@ -284,7 +292,8 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     def with_numbers(self, given):
         if self.within in self.joint.periodic and self.upper - self.lower >= 2 * np.pi:
             raise ValueError(
-                f"{self.label}: the range of an angle must be less than a full turn, got {self.lower} to {self.upper}."
+                f"{self.label}: the range of an angle in space must be less than a full turn, got {self.lower} to "
+                f"{self.upper}."
             )
         return super().with_numbers(given)
 

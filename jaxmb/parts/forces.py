@@ -50,7 +50,8 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     ```
 
     At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero
-    free length is linear there.
+    free length is linear there. The damping is against the velocity there, as it is in the limit along every motion
+    that comes to zero length.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
     given poses; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
@@ -72,8 +73,8 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
         apart = square > 0
         length = jnp.sqrt(jnp.where(apart, square, 1.0))
         pretension = jnp.where(apart, self.stiffness * self.free_length / length, 0.0)
-        damping = jnp.where(apart, self.damping * jnp.dot(d, rate) / length**2, 0.0)
-        return force_pair(space, self, poses, -(self.stiffness - pretension + damping) * d)
+        along = jnp.where(apart, jnp.dot(d, rate) / length**2 * d, rate)
+        return force_pair(space, self, poses, -(self.stiffness - pretension) * d - self.damping * along)
 
     def energy(self, space, poses, t):
         d = separation(space, self, poses)

@@ -52,8 +52,8 @@ class Series(AbstractSignal):
     - `interpolation`: `"linear"`; `"cubic"`, the not-a-knot spline, whose first two derivatives are continuous;
         `"held"`, each value until the next time.
 
-    Before the first and after the last time the value stays what it is there. `ts` and `values` may be traced:
-    motions can be differentiated with respect to values.
+    A call before the first or after the last time returns the value there; as an input of a motion a series must last
+    as long as that. `ts` and `values` may be traced: motions can be differentiated with respect to values.
 
     **Raises:** `ValueError` for times that do not ascend, and for numbers that are not finite or of the wrong shape.
 

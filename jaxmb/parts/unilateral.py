@@ -82,15 +82,15 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
 
     **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
     which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before;
-    `impact_law`, `"newton"` (default) or `"poisson"`. The range of an angle must be less than a full turn. `JointStop`
-    is a compliant one.
+    `impact_law`, `"newton"` (default) or `"poisson"`. In space the range of an angle must be less than a full turn, and
+    has both ends. `JointStop` is a compliant one.
     """
 
     lower: fields.Number = fields.parameter(unit="rad or m", optional=True)
     upper: fields.Number = fields.parameter(unit="rad or m", optional=True)
 
     def validate(self):
-        AbstractUnilateralConstraint.validate(self)
+        super().validate()
         if self.lower is None and self.upper is None:
             raise ValueError(f"{self.label}: give lower, upper or both.")
         if self.lower is not None and self.upper is not None and not self.lower < self.upper:
@@ -104,7 +104,7 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
                 )
             if self.upper - self.lower >= 2 * np.pi:
                 raise ValueError(
-                    f"{self.label}: the range of an angle must be less than a full turn, got {self.lower} to "
+                    f"{self.label}: the range of an angle in space must be less than a full turn, got {self.lower} to "
                     f"{self.upper}."
                 )
         return super().with_numbers(given)
@@ -236,6 +236,11 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
     radius_b: fields.Number = fields.length(sign="non-negative")
     point_a: fields.Number = fields.point(body=0, default="origin")
     point_b: fields.Number = fields.point(body=1, default="origin")
+
+    def validate(self):
+        super().validate()
+        if not self.radius_a + self.radius_b > 0:
+            raise ValueError(f"{self.label}: of radius_a and radius_b only one may be zero; give the other one.")
 
     def gap(self, space, poses):
         return norm(separation(space, self, poses)) - self.radius_a - self.radius_b

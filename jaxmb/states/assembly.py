@@ -19,6 +19,7 @@ from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.gaps import CLOSED, OPEN
 from ..system.quantities import directions, rates_of
 from .arguments import (
     check_system,
@@ -152,6 +153,8 @@ def configuration(
     """
     q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
     if system.contacts is not None:
+        if not is_traced(q):
+            _check_modes(system, q, fixed)
         # A contact that is open determines its own mode.
         fixed[np.array(system.contacts.modes, int)] = False
     if not is_traced(q):
@@ -167,6 +170,12 @@ def configuration(
     if throw and not is_traced(ok) and not ok:
         raise ValueError(_cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
+
+
+def _check_modes(system, q, fixed):
+    for name, k in zip(system.contacts.names, system.contacts.modes, strict=True):
+        if fixed[k] and q[k] not in (OPEN, CLOSED):
+            raise ValueError(f"Coordinate '{name}.mode' is 1 to close the contact, or 0 to open it; got {q[k]:g}.")
 
 
 @jitted
@@ -204,7 +213,7 @@ def _cannot_assemble(system, t, q, fixed):
     units = " [m, rad]" if system.body_names else ""
     remain = f"residuals{units} remain in {violated}"
     if dependent:
-        return f"{text}: {dependent}{f'; {remain}' if violated else ''}. Fix fewer of them, or give values that agree."
+        return f"{text}: {dependent}{f'; {remain}' if violated else ''}. Fix fewer of them."
     if violated:
         return f"{text}: {remain}. Check lengths, points and axes, or give a better guess."
     if held:

@@ -41,7 +41,8 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
         depths = -np.asarray(gaps(system, t, state.q))[overlaps]
         listing = ", ".join(f"{name} by {depth:.3g}" for name, depth in zip(names, depths, strict=True))
         raise ValueError(
-            f"The bodies of contacts are inside each other at t0 = {float(t):g}: {listing}. Give another state, or "
+            "The state is beyond contacts, with bodies inside each other, joints beyond their stops or ropes too long, "
+            f"at t0 = {float(t):g}: {listing}. Give another state, or "
             f'close the contact: state = jaxmb.assemble(system, state, fix={{"{names[0]}.mode": 1}}).'
         )
     cure = (

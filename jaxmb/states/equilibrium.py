@@ -24,6 +24,7 @@ from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.gaps import are_open, contacts_of, gaps
 from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
@@ -86,10 +87,15 @@ def equilibrium(
 
     **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
 
+    Contacts (`Stop`, `RigidContact`, `Slack`, …) stay as they are in the guess, open or closed; `fix` closes one,
+    `{"floor.mode": 1}`, or opens it, 0. A state in which an open one is overlapped or a closed one would have to pull
+    is none, and the error says so.
+
     **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
-    internal states change, if there is no equilibrium, or only one that is not stable; the message names the
-    coordinates that are unbalanced, or along which the equilibrium falls. With `throw=True` under `jit`, a run-time
-    error without the names.
+    internal states change, if there is no equilibrium, or only one that is not stable, or not one of the contacts; the
+    message names the coordinates that are unbalanced, or along which the equilibrium falls. Also for a system with dry
+    friction, other constraints that are not ideal, or servos. With `throw=True` under `jit`, a run-time error without
+    the names.
     """
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
@@ -111,15 +117,17 @@ def equilibrium(
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    q, unbalanced, falling, ok = _balanced(system, time, start, held, bool(stable))
+    q, unbalanced, falling, ok, overlaps, pulls = _balanced(system, time, start, held, bool(stable))
     if concrete and raises and not bool(ok):
-        raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, unbalanced))
+        raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
+    if concrete and raises and np.any(overlaps | pulls):
+        raise ValueError(_not_of_contacts(system, np.asarray(overlaps), np.asarray(pulls)))
     steady = True if z is None else _steady(system, time, q, u)
     if concrete and raises and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
     if raises and concrete:
         return State(q, u, z)
-    ok = ok & still & assembled & jnp.all(jnp.asarray(steady))
+    ok = ok & still & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
     if throw:
         q = eqx.error_if(
             q,
@@ -271,9 +279,16 @@ def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
 @eqx.filter_jit
 def _balanced(
     system: AbstractSystem, t: Array, start: Coordinates, held: tuple[int, ...], stable: bool
-) -> tuple[Float[Array, "nq"], Float[Array, "nu"], Float[Array, "nu"], Bool[Array, ""]]:
+) -> tuple[
+    Float[Array, "nq"],
+    Float[Array, "nu"],
+    Float[Array, "nu"],
+    Bool[Array, ""],
+    Bool[Array, "contacts"],
+    Bool[Array, "contacts"],
+]:
     """The equilibrium, the residual forces there, the displacement along which one that was left falls, zero if none
-    was, and whether the equilibrium was found.
+    was, and whether the equilibrium was found; which open contacts are overlapped there, and which closed ones pull.
     """
     balance = _Balance(system, t, start[np.array(held, int)], held)
     found = _settled if stable else _nearest
@@ -296,7 +311,24 @@ def _balanced(
 
     known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
     solved = root(equations, known, lambda _, x: x)
-    return balance.moved(q, solved[:n]), local.force / system.velocity_scale(), falling, ok
+    q = balance.moved(q, solved[:n])
+    overlaps, pulls = _contacts(*lax.stop_gradient((system, t, q, solved[n:], jnp.diag(local.implied))))
+    return q, local.force / system.velocity_scale(), falling, ok, overlaps, pulls
+
+
+def _contacts(system, t, q, multipliers, implied):
+    """Which open contacts are overlapped in a configuration, and which closed ones pull."""
+    is_open = are_open(system, q)
+    if not is_open.size:
+        return is_open, is_open
+    rows, tol = np.array(contacts_of(system).rows, int), tolerance(q.dtype) ** 0.5
+    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(
+        jnp.abs(system.force(t, q, jnp.zeros_like(multipliers, shape=system.nu)))
+    )
+    # Of contacts that imply each other only the sum of the forces is known.
+    alone = implied[rows] <= tol
+    overlaps = is_open & (gaps(system, t, q) < -tol * system.length)
+    return overlaps, ~is_open & alone & (multipliers[rows] < -tol * largest)
 
 
 def _nearest(balance: _Balance, start: Coordinates):
@@ -397,9 +429,30 @@ def _only_unstable(system, falling):
     )
 
 
-def _not_found(system, unbalanced):
+def _not_found(system, q, unbalanced):
     listed = _largest(system, unbalanced, 1e-6)
+    opens = [name for name, is_open in zip(_contact_names(system), are_open(system, q), strict=True) if is_open]
+    closing = f", or close a contact, such as fix={{'{opens[0]}.mode': 1}}" if opens else ""
     return (
         f"No static equilibrium was found: residual forces along {listed or 'nothing'}, in N and N m. Hold such a "
-        "coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium."
+        f"coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium{closing}."
     )
+
+
+def _not_of_contacts(system, overlaps, pulls):
+    names = np.array(_contact_names(system))
+    texts = []
+    if np.any(overlaps):
+        own = names[overlaps]
+        texts.append(f"{', '.join(own)} {'is' if own.size == 1 else 'are'} open and overlapped: close with mode 1")
+    if np.any(pulls):
+        texts.append(f"{', '.join(names[pulls])} would have to pull: open with mode 0")
+    first = f"{names[overlaps | pulls][0]}.mode"
+    return (
+        f"The forces balance only where contacts do not hold: {'; '.join(texts)}. For example "
+        f"jaxmb.equilibrium(system, fix={{{first!r}: {int(overlaps[overlaps | pulls][0])}}})."
+    )
+
+
+def _contact_names(system):
+    return () if system.contacts is None else contacts_of(system).names

@@ -306,6 +306,8 @@ def range_of(
     if bounds is None:
         bounds = (0.0, None) if positive else (None, None)
     low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
+    if np.any(low >= high):
+        raise ValueError(f"The bounds of {name!r} must be (low, high) with low < high, got {bounds}.")
     if np.any(value <= low) or np.any(value >= high):
         raise ValueError(f"The start of {name!r} must lie strictly between {low} and {high}, got {np.asarray(value)}.")
     if scale is not None:

@@ -561,6 +561,14 @@ REFUSED = {
         lambda: motor_on_four_bar(mode="force"),
         "Motor 'motor': gain and damping belong to the modes 'speed' and 'position'",
     ),
+    "no gain of a speed": (
+        lambda: motor_on_four_bar(gain=None),
+        "Motor 'motor': without a gain its command does nothing in the mode 'speed'; give gain",
+    ),
+    "no gain of a position": (
+        lambda: motor_on_four_bar(mode="position", gain=None, damping=1.0),
+        "Motor 'motor': without a gain its command does nothing in the mode 'position'",
+    ),
     "shape of a command": (
         lambda: motor_on_four_bar(command=[1.0, 2.0]),
         r"command must have the shape of 'A.angle', \(\), got \(2,\)",

@@ -1,9 +1,9 @@
-"""Scenes that are made of others."""
+"""Scenes that are made of others, and parts that cannot act on a point mass."""
 
 import pytest
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import contact, parts, planar, spatial, terrain
 
 
 def test_a_scene_is_extended():
@@ -19,3 +19,56 @@ def test_a_scene_is_extended():
         scene.extended(without=["E"])
     with pytest.raises(ValueError, match="motor"):
         more.extended(forces=[motor])
+
+
+FLAT = (planar.Body("bar", mass=1.0, inertia=0.1, position=(1.0, 0.5), angle=0.3), planar.PointMass("mass", mass=1.0))
+DEEP = (
+    spatial.Body("bar", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0.5, 0.2)),
+    spatial.PointMass("mass", mass=1.0, position=(0.3, 0.2, 0.1)),
+)
+PAIR = ("part", "bar", "mass")
+BOTH = {"stiffness": 10.0, "damping": 1.0}
+SOFT = {"normal": contact.Linear(1e4), "radius": 0.1}
+
+
+def compiled(bodies, part):
+    joints, forces = ((), [part]) if isinstance(part, parts.AbstractForce) else ([part], ())
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+@pytest.mark.parametrize(
+    ("bodies", "part"),
+    [
+        (FLAT, planar.TorsionalSpringDamper("part", "ground", "mass", **BOTH)),
+        (FLAT, planar.TorsionalSpringDamper(*PAIR, stiffness=0.0, damping=1.0)),
+        (DEEP, spatial.TorsionalSpringDamper(*PAIR, stiffness=10.0, axis=(0.0, 0.0, 1.0))),
+        (DEEP, spatial.RotationalDamper("part", "ground", "mass", damping=1.0)),
+        (FLAT, planar.Bushing(*PAIR, stiffness=(1.0, 1.0, 1.0), point=(0.0, 0.0))),
+        (DEEP, spatial.Bushing(*PAIR, stiffness=(1.0,) * 6, point=(0.3, 0.2, 0.1))),
+        (FLAT, planar.SpringDamper("part", "ground", "mass", **BOTH, point_b=(0.0, 1.0))),
+        (FLAT, planar.PointForce("part", "mass", force=(0.0, 0.0), point=(1.0, 0.0))),
+        (DEEP, spatial.PointForce("part", "mass", force=(0.0, 0.0, 0.0), point=(1.0, 0.0, 0.0))),
+        (FLAT, planar.Torque("part", "mass", torque=0.0)),
+        (DEEP, spatial.Torque("part", "mass", torque=(0.0, 0.0, 0.0))),
+        (FLAT, mb.RigidContact("part", "mass", terrain=terrain.Flat(), centre=(0.1, 0.0))),
+    ],
+)
+def test_what_would_turn_a_point_mass_is_refused(bodies, part):
+    """Also what has no moment at the given poses: a spring at rest, an open contact, an input that is zero."""
+    with pytest.raises(ValueError, match="'part' acts on the rotation of a PointMass, which has none"):
+        compiled(bodies, part)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "part"),
+    [
+        (FLAT, planar.Bushing(*PAIR, stiffness=(1.0, 1.0, 0.0), damping=(1.0, 1.0, 0.0), point=(0.0, 0.0))),
+        (DEEP, spatial.Bushing(*PAIR, stiffness=(1.0,) * 3 + (0.0,) * 3, point=(0.3, 0.2, 0.1))),
+        (FLAT, planar.SpringDamper(*PAIR, **BOTH, point_a=(0.1, 0.1))),
+        (DEEP, spatial.PointForce("part", "mass", force=(0.0, 0.0, 0.0), frame="body")),
+        (FLAT, planar.DiscContact(*PAIR[:1], PAIR[1:], radii=0.1, **SOFT)),
+        (FLAT, planar.Revolute(*PAIR, point=(0.0, 0.0))),
+    ],
+)
+def test_forces_through_the_centre_of_a_point_mass(bodies, part):
+    compiled(bodies, part)

@@ -279,6 +279,38 @@ BAD = {
     "no frame": ({"equations": Hamel()}, "kinematics=QuasiVelocityFrame"),
     "no connection": ({"equations": Voronets()}, "kinematics=Connection"),
     "base and fibre": ({"kinematics": Connection((0,), (0,), lambda t, q, p: jnp.ones((1, 1)))}, "each of them once"),
+    "connection of too many rows": (
+        {"kinematics": Connection((0,), (1,), lambda t, q, p: jnp.zeros((2, 1)))},
+        r"matrix of the Connection of base \(0,\) and fibre \(1,\) must have shape \(1, 1\), got \(2, 1\)",
+    ),
+    "number as a connection": (
+        {"kinematics": Connection((0,), (1,), lambda t, q, p: 1.0)},
+        r"must have shape \(1, 1\), got \(\)",
+    ),
+    "drift of a connection": (
+        {"kinematics": Connection((0,), (1,), lambda t, q, p: jnp.zeros((1, 1)), lambda t, q, p: q)},
+        r"drift of the Connection .* must have shape \(1,\), got \(2,\)",
+    ),
+    "number as a frame": (
+        {"kinematics": QuasiVelocityFrame(lambda t, q, p: 1.0, 1)},
+        r"matrix of a frame must have shape \(2, 1\), got \(\)",
+    ),
+    "right sides of more rows": (
+        {"constraints": [AccelerationConstraint("a", lambda t, q, v, p: jnp.ones((1, 2)), lambda t, q, v, p: q)]},
+        r"a: right must have shape \(1,\), as matrix has rows; got \(2,\)",
+    ),
+    "right sides of fewer rows": (
+        {"constraints": [AccelerationConstraint("a", lambda t, q, v, p: jnp.eye(2), lambda t, q, v, p: q[:1])]},
+        r"a: right must have shape \(2,\), as matrix has rows; got \(1,\)",
+    ),
+    "drift of more rows": (
+        {"constraints": [Pfaffian("belt", lambda t, q, p: jnp.ones((1, 2)), lambda t, q, p: q)]},
+        r"belt: drift must have shape \(1,\), as matrix has rows; got \(2,\)",
+    ),
+    "a constraint called like a coordinate": (
+        {"constraints": [ONE], "coordinates": ("ring", "s")},
+        "'ring' is a constraint as well as a coordinate",
+    ),
     "not invertible": (
         {"kinematics": QuasiVelocities(lambda t, q, v, p: v[0] * jnp.ones(2), (1.0, 1.0))},
         "not invertible",

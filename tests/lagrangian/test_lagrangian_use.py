@@ -87,7 +87,8 @@ def test_equal_functions_make_equal_structures(system):
     [
         ({"coordinates": ("t", "y", "z")}, "'t' is something else"),
         ({"coordinates": ("x", "y")}, "need as many names"),
-        ({"kinetic": lambda t, q, v, p: v}, r"lagrangian must have shape|does not fit"),
+        ({"kinetic": lambda t, q, v, p: v}, r"^kinetic must be a scalar, got shape \(3,\)"),
+        ({"potential": lambda t, q, p: q}, r"^potential must be a scalar, got shape \(3,\)"),
         ({"kinetic": lambda t, q, v, p: v[0]}, "finite second derivatives"),
         ({"force": lambda t, q, v, p: v[:1]}, r"force must have shape \(3,\), got \(1,\)"),
         ({"constraints": [Pfaffian("rod", lambda t, q, p: jnp.ones((1, 2)))]}, "rod does not fit the system"),

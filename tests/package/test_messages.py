@@ -78,6 +78,44 @@ def test_numbers_that_functions_of_the_user_do_not_get(pendulum, use, message):
         use(pendulum)
 
 
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (
+            lambda: mb.optimise(lambda v: v["y"], {"x": 3.0}),
+            "asks for 'y', which the function of optimise does not get; v has 'x'",
+        ),
+        (
+            lambda: mb.lagrangian.LagrangianSystem(
+                kinetic=lambda t, q, v, p: v @ v,
+                potential=lambda t, q, p: p["g"] * q[0],
+                q=[1.0],
+                parameters={"G": 9.81},
+            ),
+            "asks for 'g', which potential does not get; p has 'G'",
+        ),
+        (
+            lambda: mb.Scene(
+                [planar.Body("bob", mass=1.0, inertia=0.1)],
+                joints=[planar.Driver("d", "ground", "bob", quantity="angle", motion=lambda t, p: p["w"] * t)],
+            ).compile(),
+            "asks for 'w', which residual of Driver 'd' does not get; p has no names",
+        ),
+        (
+            lambda: mb.Scene(
+                [planar.PointMass("bob", mass=1.0)],
+                forces=[mb.Force("wind", "bob", lambda x, v, t, p: -p["c"] * v, parameters={"d": 1.0})],
+            ).compile(),
+            "asks for 'c', which Force 'wind' does not get; p has 'd'",
+        ),
+    ],
+    ids=["optimise", "LagrangianSystem", "Driver", "Force on a point"],
+)
+def test_names_that_functions_of_the_user_do_not_get(use, message):
+    with pytest.raises(ValueError, match=rf"test_messages\.py:\d+: `.*` {message}"):
+        use()
+
+
 def test_an_angle_in_degrees_is_warned_of():
     scene = mb.Scene([mb.planar.Body("rod", mass=1.0, inertia=0.1, angle=90.0)])
     with pytest.warns(UserWarning, match=r"'rod': the angle 90 rad is more than .*; .*np.deg2rad\(90\) is 1.571"):

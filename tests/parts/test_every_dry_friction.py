@@ -149,6 +149,12 @@ BAD = {
         "slip has one direction, and speed must have shape (), got (2,)",
     ),
     "a rope": (BODY, [mb.Slack("joint", "ground", "a", length=2.0)], {"coefficient": 0.3}, "has no point at which"),
+    "a stop": (
+        BODY,
+        [PIN.named("pin"), mb.Stop("joint", "pin.angle", lower=-1.0)],
+        {"coefficient": 0.3},
+        "Stop 'joint' has no point at which",
+    ),
     "no such joint": (BODY, [PIN.named("other")], {"coefficient": 0.3}, "joint"),
     "a redundant joint": (
         BODY,

@@ -139,11 +139,38 @@ def test_derivatives_by_all_numbers_of_parts_of_joints():
         (mb.JointSpring("s", "hip.angle", stiffness=-1.0), "stiffness must be non-negative"),
         (mb.JointForce("s", "hip.angle", force=[1.0, 2.0]), r"force must have the shape of 'hip.angle', \(\)"),
         (mb.JointForce("s", "hip", force=1.0), "Unknown coordinate 'hip'"),
+        (
+            mb.JointSpring("s", "hip.angle", stiffness=1.0, middle=1.0),
+            "'s': middle is that of an angle in space, which 'hip.angle' is not; leave it out",
+        ),
+        (mb.Actuator("s", "hip.angle", middle=1.0), "'s': middle is that of an angle in space.* leave it out"),
     ],
 )
 def test_parts_of_joints_that_cannot_be(part, message):
     with pytest.raises(ValueError, match=message):
         pendulums(part)
+
+
+def test_a_middle_is_that_of_an_angle_in_space():
+    spring = lambda coordinate: mb.JointSpring("s", coordinate, stiffness=1.0, middle=0.5)
+    hinged(spring("hip.angle"))
+    with pytest.raises(ValueError, match=r"which 'slide\.displacement' is not; leave it out"):
+        hinged(spring("slide.displacement"))
+    with pytest.raises(ValueError, match=r"which 'slide\.displacement' is not; leave it out"):
+        hinged(mb.Actuator("s", "slide.displacement", middle=0.5))
+
+
+@pytest.mark.parametrize(
+    ("path", "pair"),
+    [
+        ([("thigh", (0.2, 0.0)), ("thigh", (0.2, 0.0)), ("shank", (0.0, 0.1))], r"path\[0\] and path\[1\]"),
+        ([("ground", (0.0, 1.0)), ("thigh", (0.5, 0.1)), ("shank", (-0.5, 0.1))], r"path\[1\] and path\[2\]"),
+    ],
+    ids=["one point", "two points at one place"],
+)
+def test_neighbouring_points_of_a_tendon_that_coincide(path, pair):
+    with pytest.raises(ValueError, match=f"Tendon 'cord': the neighbours {pair} coincide at the given poses"):
+        pendulums(joints=[mb.Tendon("cord", path)])
 
 
 def test_a_joint_without_a_coordinate_of_its_own():

@@ -357,8 +357,10 @@ def test_motions_that_start_in_contact():
 def test_refusals():
     state = mb.assemble(BALL)
     inside = mb.assemble(BALL, fix={"ball.y": -0.1})
-    with pytest.raises(ValueError, match=r"inside each other at t0 = 0: floor by 0\.1"):
+    with pytest.raises(ValueError, match=r"beyond contacts, .* at t0 = 0: floor by 0\.1"):
         mb.simulate(BALL, inside, t1=1.0)
+    with pytest.raises(ValueError, match=r"'floor\.mode' is 1 to close the contact, or 0 to open it; got 3"):
+        mb.assemble(BALL, fix={"floor.mode": 3})
     with pytest.raises(ValueError, match="Impacts cannot be undone"):
         mb.simulate(BALL, state, t1=-1.0)
     with pytest.raises(ValueError, match="max_events must be an integer of at least 1"):

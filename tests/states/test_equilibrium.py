@@ -207,3 +207,41 @@ def test_what_cannot_rest_is_refused():
         mb.equilibrium(cart(), fix={"cart.z": 1.0})
     with pytest.raises(ValueError, match="ideal"):
         mb.equilibrium(mechanisms.get("rough_ring").system)
+
+
+def hung_on_a_floor(*forces, stiffness=5.0):
+    """A ball of radius 0.1 above a floor, on a spring to a point 1 m above it."""
+    ball = planar.Body("ball", mass=1.0, inertia=0.1, position=(0.0, 1.0))
+    floor = mb.RigidContact("floor", "ball", terrain=mb.terrain.Flat(), radius=0.1)
+    spring = planar.SpringDamper("spring", "ground", "ball", stiffness=stiffness, free_length=0.0, point_a=(0.0, 1.0))
+    return mb.Scene([ball], joints=[floor], forces=[spring, *forces]).compile()
+
+
+def test_contacts_hold_in_an_equilibrium():
+    heavy = hung_on_a_floor(mb.Gravity((0.0, -G)))
+    with pytest.raises(ValueError, match=r"floor is open and overlapped: .*fix=\{'floor.mode': 1\}"):
+        mb.equilibrium(heavy)
+    rests = mb.equilibrium(heavy, fix={"floor.mode": 1})
+    np.testing.assert_allclose(rests.q[:3], [0.0, 0.1, 0.0], atol=1e-12)
+    assert np.all(np.isnan(jax.jit(lambda: mb.equilibrium(heavy).q)()))
+    # Hung high enough it does not touch.
+    np.testing.assert_allclose(mb.equilibrium(hung_on_a_floor(mb.Gravity((0.0, -G)), stiffness=20.0)).q[1], 1 - G / 20)
+    light = hung_on_a_floor()
+    with pytest.raises(ValueError, match=r"floor would have to pull: .*fix=\{'floor.mode': 0\}"):
+        mb.equilibrium(light, fix={"floor.mode": 1})
+    np.testing.assert_allclose(mb.equilibrium(light, fix={"floor.mode": 0}).q[:3], [0.0, 1.0, 0.0], atol=1e-12)
+    with pytest.raises(ValueError, match=r"'floor\.mode' is 1 to close the contact, or 0 to open it; got 0\.5"):
+        mb.equilibrium(light, fix={"floor.mode": 0.5})
+
+
+def test_legs_that_share_a_weight_do_not_pull():
+    """Of four legs only the sum of the forces is known."""
+    top = spatial.Body("top", mass=4.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, 0.5))
+    places = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)]
+    legs = [
+        mb.RigidContact(f"leg{k}", "top", terrain=mb.terrain.Flat(), radius=0.0, centre=(*place, -0.5))
+        for k, place in enumerate(places)
+    ]
+    table = mb.Scene([top], joints=legs, forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+    rests = mb.equilibrium(table, fix={f"leg{k}.mode": 1 for k in range(4)})
+    np.testing.assert_allclose(rests.q[2], 0.5, atol=1e-9)

@@ -175,7 +175,8 @@ class PlateContact(AbstractBodyContact):
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
     - `edge` [m] > 0, at most half as long as a plate.
-    - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least.
+    - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least. Their ends
+        meet at the given poses, within `edge`.
     - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
     - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
@@ -196,6 +197,20 @@ class PlateContact(AbstractBodyContact):
                 f"{self.label}: edge must be at most half as long as a plate, got {float(self.edge):g} m, with "
                 f"{shortest:g} m from start to end."
             )
+
+    def complete(self, space, poses):
+        if self.chain:
+            starts, ends = (jax.vmap(space.point)(poses[1:], own) for own in self.surfaces())
+            apart = norm(jnp.roll(starts, -1, axis=0) - ends)
+            k = int(jnp.argmax(apart))
+            if apart[k] > self.edge:
+                before, after = self.bodies[1 + k], [*self.bodies[1:], self.bodies[1]][k + 1]
+                raise ValueError(
+                    f"{self.label}: in a chain each plate must begin where the one before it ends, within edge, but "
+                    f"that of {after!r} begins {float(apart[k]):g} m from the end of that of {before!r}; join them, or "
+                    "leave chain out."
+                )
+        return self
 
     def surfaces(self):
         return self._rows(self.start, (2,)), self._rows(self.end, (2,))

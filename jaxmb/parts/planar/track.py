@@ -87,6 +87,10 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
             distance, more = norm(self._lines(space, poses)), jnp.roll(self.radii, -1) - self.radii
             if jnp.any(distance <= jnp.abs(more)):
                 raise ValueError(f"{self.label}: a circle lies in its neighbour; remove it or make it smaller.")
+            _, _, turn = self._tangents(self._lines(space, poses))
+            # Where a turn is next to the ends of its range, rounding decides whether all add up to one.
+            if jnp.abs(jnp.sum(turn) - 2 * np.pi) > 1.0 or jnp.any(jnp.abs(turn - 0.5 * np.pi) > np.pi - 1e-6):
+                raise ValueError(f"{self.label}: a path with radii must be counter-clockwise; reverse its order.")
         return self.filled(free_length=self.length(space, poses))
 
     def _lines(self, space, poses):

@@ -42,7 +42,7 @@ class Experiment:
     **Arguments:**
 
     - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
-        `Measurements`, files and tables have their own `ts`.
+        `Measurements`, files and tables have their own `ts`; `sigma` replaces that of `identify` and of sensors.
     - `inputs`: as of `simulate`.
     - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
@@ -116,7 +116,7 @@ class ExperimentModel(eqx.Module):
     def named(self, flat: Float[Array, "values"]) -> dict[str, Array]:
         """Unknowns by name, from all of them one after the other."""
         ends = np.cumsum([int(np.prod(shape)) for _, shape in self.unknowns])
-        parts = jnp.split(flat, ends[:-1])
+        parts = jnp.split(flat, ends)[:-1]
         return {name: part.reshape(shape) for (name, shape), part in zip(self.unknowns, parts, strict=True)}
 
     def changed_system(self, system: AbstractSystem, theta: Mapping[str, Array]) -> AbstractSystem:

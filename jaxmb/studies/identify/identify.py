@@ -203,7 +203,8 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]
         given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
         if given:
-            raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, ts=…, {given[0]}=…).")
+            arguments = ", ".join(f"{name}=…" for name in dict.fromkeys(("ts", given[0])))
+            raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, {arguments}).")
         experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
     named = sensors_by_name(system, sensors)
     free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma, loss)

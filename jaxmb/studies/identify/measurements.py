@@ -92,18 +92,19 @@ def read_measurements(
 def _of_file(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         text = file.read()
-    lines = [line for line in csv.reader(text.splitlines(), _dialect(text)) if any(cell.strip() for cell in line)]
+    reader = csv.reader(text.splitlines(), _dialect(text))
+    lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     if not lines:
         raise ValueError(f"{path} is empty.")
-    header = [cell.strip() for cell in lines[0]]
+    header = [cell.strip() for cell in lines[0][1]]
     repeated = sorted({name for name in header if header.count(name) > 1})
     if repeated:
         raise ValueError(f"{path} has more than one column {repeated[0]!r}.")
-    for number, line in enumerate(lines[1:], 1):
-        if len(line) != len(header):
-            raise ValueError(f"{path} has {len(line)} cells in row {number}, and {len(header)} columns.")
+    for number, cells in lines[1:]:
+        if len(cells) != len(header):
+            raise ValueError(f"{path} has {len(cells)} cells in line {number}, and {len(header)} columns.")
     return {
-        name: np.array([_number(path, name, row, line[k]) for row, line in enumerate(lines[1:], 1)], float)
+        name: np.array([_number(path, name, number, cells[k]) for number, cells in lines[1:]], float)
         for k, name in enumerate(header)
     }
 
@@ -114,14 +115,14 @@ def _dialect(text: str) -> Any:
     return type("_Dialect", (csv.excel,), {"delimiter": delimiter})
 
 
-def _number(path, column, row, cell) -> float:
+def _number(path, column, line, cell) -> float:
     cell = cell.strip()
     if cell.lower() in _MISSING:
         return np.nan
     try:
         return float(cell)
     except ValueError:
-        raise ValueError(f"{path} has no number in row {row} of column {column!r}, but {cell!r}.") from None
+        raise ValueError(f"{path} has no number in line {line} of column {column!r}, but {cell!r}.") from None
 
 
 def _of_frame(frame: Any) -> dict[str, np.ndarray]:

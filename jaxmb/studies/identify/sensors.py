@@ -32,7 +32,7 @@ class Sensor:
     - `bias`, in the unit of the readings, and `gain`: numbers, or one for each component of the quantity.
     - `delay` [s]: how late the reading shows the motion.
     - `sigma`: standard deviation of the noise in the unit of the readings, a number or one for each component; None if
-        it is not known.
+        it is not known. That of an `Experiment` replaces it there.
     """
 
     quantity: str

@@ -120,7 +120,7 @@ def unknowns(
         trial, own = _trial(system, name, experiment, sensors, given, sigma, loss, found)
         trials.append(trial)
         sources.append(own)
-    _check_sigma(system, experiments, sensors, sigma)
+    _check_measured(system, experiments, sensors, sigma)
     for name in given:
         if name not in found:
             raise ValueError(f"{name!r} is unknown to every experiment that is fitted; leave it out of free.")
@@ -175,14 +175,21 @@ def _check_names(system, experiments, sensors, given) -> None:
             raise unknown("parameter", name, known)
 
 
-def _check_sigma(system, experiments, sensors, sigma) -> None:
+def _check_measured(system, experiments, sensors, sigma) -> None:
+    """Refuse sensors and noise levels of what is not measured, and noise levels that are given twice."""
     known = dict.fromkeys((*sensors, *system.quantities()))
-    measured = {name for own in experiments.values() for name in (own.measured or {})}
+    measured = dict.fromkeys(name for own in experiments.values() for name in (own.measured or {}))
     for name in sigma or {}:
         if name not in known:
             raise unknown("quantity", name, known)
         if name not in measured:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
+        if name in sensors and sensors[name].sigma is not None:
+            raise ValueError(f"sigma of {name!r} is given twice, by sigma= and by its Sensor; leave one of them out.")
+    for name in sensors:
+        if name not in measured:
+            there = ", ".join(map(repr, measured)) or "nothing"
+            raise ValueError(f"The data of sensor {name!r} are missing: measured by name is {there}.")
 
 
 def _assembled(experiment, system, guess, **prescribed):

@@ -18,6 +18,7 @@ from part_checks import (
     rank,
 )
 
+import jaxmb as mb
 from jaxmb import planar
 from jaxmb.linalg.rotations import rotate_2d
 from jaxmb.parts import contact, terrain
@@ -406,6 +407,26 @@ def test_spring_of_zero_length(free_length):
     np.testing.assert_allclose(jax.grad(lambda q: part.energy(PLANE, q, 0.0))(poses), 0.0, atol=1e-15)
     jacobian = jax.jit(jax.jacfwd(law))(poses)
     np.testing.assert_allclose(jacobian[1, :2, 1, :2], -30.0 * np.eye(2), rtol=0, atol=1e-13)
+    by_velocity = jax.jacfwd(lambda v: part.wrenches(PLANE, poses, v, 0.0))(velocities)
+    np.testing.assert_allclose(by_velocity[1, :2, 1, :2], -2.0 * np.eye(2), rtol=0, atol=1e-13)
+
+
+def test_motions_about_a_spring_of_zero_length_are_damped():
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    slide = planar.Prismatic("slide", "ground", "body", point=(0.0, 0.0), axis=(1.0, 0.0))
+    spring = planar.SpringDamper("spring", "ground", "body", stiffness=4.0, damping=0.5, free_length=0.0)
+    system = mb.Scene([body], joints=[slide], forces=[spring]).compile()
+    state = mb.assemble(system)
+    found = mb.linearise(system, state).eigenvalues
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(np.roots([1.0, 0.5, 4.0])), rtol=1e-12)
+
+    def end(rate):
+        start = mb.State(state.q, rate * jnp.array([1.0, 0.0, 0.0]))
+        return mb.simulate(system, start, t1=0.7, rtol=1e-10)["slide"].displacement[-1]
+
+    damped = np.sqrt(4.0 - 0.25**2)
+    exact = np.exp(-0.25 * 0.7) * np.sin(damped * 0.7) / damped
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(0.0), exact, rtol=1e-8)
 
 
 def test_springs_rest_at_the_given_poses():

@@ -107,6 +107,8 @@ def test_points_that_coincide():
         ({"path": [(body, (*point, 0.0)) for body, point in PATH]}, r"points of shape \(2,\)"),
         ({"radii": (0.1, 0.2)}, r"radii must have shape \(4,\)"),
         ({"radii": (0.1, 0.2, 0.1, 3.0)}, "a circle lies in its neighbour"),
+        ({"path": PATH[::-1], "radii": RADII}, "counter-clockwise; reverse its order"),
+        ({"path": [("hull", at) for at in ((0, 0), (0, 1), (2, 1), (2, 0))], "radii": np.full(4, 0.2)}, "reverse its"),
         ({"stiffness": -1.0}, "stiffness must be non-negative"),
     ],
 )

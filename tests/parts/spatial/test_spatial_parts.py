@@ -613,6 +613,8 @@ def test_spring_of_zero_length(free_length):
     np.testing.assert_allclose(jax.grad(lambda q: part.energy(SPACE, q, 0.0))(poses), 0.0, atol=1e-15)
     jacobian = jax.jit(jax.jacfwd(law))(poses)
     np.testing.assert_allclose(jacobian[1, :3, 1, :3], -30.0 * np.eye(3), rtol=0, atol=1e-13)
+    by_velocity = jax.jacfwd(lambda v: part.wrenches(SPACE, poses, v, 0.0))(velocities)
+    np.testing.assert_allclose(by_velocity[1, :3, 1, :3], -2.0 * np.eye(3), rtol=0, atol=1e-13)
 
 
 def test_torsional_spring_moment():

@@ -1,5 +1,7 @@
 """Several experiments, sensors, priors, profiles, densities, shooting, predictions and reports of identification."""
 
+import dataclasses
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -570,8 +572,9 @@ def test_measurements_from_files_and_tables(tmp_path):
     [
         ("t,phi\n0,1\n1,2\n", {"rod.angle": "ph"}, "did you mean 'phi'"),
         ("time,phi\n0,1\n1,2\n", None, "column of time 't'"),
-        ("t,phi\n0,1\n1,two\n", None, "no number in row 2 of column 'phi', but 'two'"),
-        ("t,phi\n0,1\n1\n", None, "1 cells in row 2"),
+        ("t,phi\n0,1\n1,two\n", None, "no number in line 3 of column 'phi', but 'two'"),
+        ("t,phi\n\n0,1\n\n1,two\n", None, "no number in line 5 of column 'phi'"),
+        ("t,phi\n0,1\n1\n", None, "1 cells in line 3"),
         ("t,phi,phi\n0,1,1\n1,1,2\n", None, "more than one column 'phi'"),
         ("t,phi\n0,1\n0,2\n", None, "must increase, but 0 in row 2 follows 0"),
         ("t,phi\n0,1\n,2\n", None, "no number in row 2"),
@@ -593,7 +596,8 @@ ANGLE = {"rod.angle": np.linspace(0.0, 1.0, 30)}
 @pytest.mark.parametrize(
     "measured, change, message",
     [
-        ([mb.Experiment(ANGLE, ts=TS)], {"ts": TS}, "ts belongs to each experiment"),
+        ([mb.Experiment(ANGLE, ts=TS)], {"ts": TS}, r"ts belongs to each .*\(measured, ts=…\)"),
+        ([mb.Experiment(ANGLE, ts=TS)], {"fix": {}}, r"fix belongs to each experiment: .*, ts=…, fix=…\)"),
         ([mb.Experiment(ANGLE, ts=TS), ANGLE], {}, "a jaxmb.Experiment"),
         ([mb.Experiment(ANGLE, ts=TS, held_out=True)], {}, "no experiment to fit"),
         ([mb.Experiment(ANGLE, ts=TS, name="a"), mb.Experiment(ANGLE, ts=TS, name="a")], {}, "'a' of an experiment"),
@@ -629,6 +633,18 @@ ANGLE = {"rod.angle": np.linspace(0.0, 1.0, 30)}
 def test_messages(system, measured, change, message):
     with pytest.raises(ValueError, match=message):
         mb.identify(system, measured, **({"free": ["rod.mass"]} | change))
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_an_experiment_without_unknowns(system, held_out):
+    """Its own parameters are all that is free; it is predicted all the same."""
+    motion = mb.simulate(system, system.guess, t1=TS[-1], saveat=TS, solver=TSIT5)
+    own = mb.Experiment({"rod.angle": motion["rod"].angle}, ts=TS)
+    known = dataclasses.replace(own, parameters={"spring.stiffness": 6.0}, held_out=held_out)
+    fit = mb.identify(system, [known, own], free={"spring.stiffness": 8.0}, solver=TSIT5)
+    np.testing.assert_allclose(fit.parameters["spring.stiffness"], 6.0, rtol=1e-6)
+    assert len(fit.held_out) == held_out
+    np.testing.assert_allclose(fit.predict("rod.angle", experiment="exp1").values["rod.angle"], motion["rod"].angle)
 
 
 def test_orientations_cannot_be_free():
