@@ -363,8 +363,8 @@ class Trajectory(eqx.Module):
         finite = np.isfinite(np.asarray(self.ts))
         if finite.all():
             return self
-        # By NumPy, since each number of times would be a program.
-        kept = lambda x: jax.device_put(np.asarray(x)[finite])
+        # By NumPy, since each number of times would be a program; but not what is differentiated.
+        kept = lambda x: x[finite] if isinstance(x, Tracer) else jax.device_put(np.asarray(x)[finite])
         return eqx.tree_at(lambda t: (t.ts, t.ys), self, jax.tree.map(kept, (self.ts, self.ys)))
 
     def to_dict(self) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._compat import with_values
+from .._compat import used_inputs, with_values
 from .._results import RESULTS
 from .._types import State
 from ..contact_events import FoundEvents
@@ -49,6 +49,8 @@ from .outcome import Outcome, has_failed
 
 # Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
 _MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
+# The least change of a parameter whose effect is watched, of one that is next to zero, in its unit.
+_LEAST_CHANGE = 1e-4
 
 
 class Problem(NamedTuple):
@@ -110,6 +112,11 @@ class Problem(NamedTuple):
                 f"{type(policy).__name__}() and positive_definite_mass = {system.positive_definite_mass}."
             )
 
+    @property
+    def projects_steps(self) -> bool:
+        """Whether states return to constraints after the steps of a method that does not know of them."""
+        return self.system.velocity_rows > 0 and not isinstance(self.solver, AbstractMultistep)
+
     def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for it."""
         term, prepared = self.policy.prepare(system, self.method, self.solver, self.rtol)
@@ -158,8 +165,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         direction = eqx.filter_jvp(lambda step: problem.assembled(moved(step))[0], (0.0,), (1.0,))[1]
     elif problem.differentiated:
         leaves, structure = jax.tree.flatten(system)
-        along = jax.tree.unflatten(structure, problem.differentiated[: len(leaves)])
-        direction = _pushed(lambda system: problem.assembled(system)[0], system, along)
+        used = problem.differentiated[: len(leaves)]
+        if problem.projects_steps:
+            used = _free(used, leaves, structure, times["t0"], problem.state)
+        direction = _pushed(lambda system: problem.assembled(system)[0], system, jax.tree.unflatten(structure, used))
     finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(start)]) & valid
 
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
@@ -192,7 +201,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         control = dataclasses.replace(control, excites=excites)
     # Where it is known which of the two a run is, the other is not traced.
     solve = _solve_with_tangents if problem.differentiated else _solve_on_mesh
-    solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit)
+    solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit, problem.projects_steps)
     ts, saved = solution.ts[0], solution.ys[0]
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
@@ -282,26 +291,28 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
 
 
 @eqx.filter_custom_jvp
-def _solve_on_mesh(arguments, control, adjoint, limit):
-    """The solution, whose mesh resolves the motion; where it is differentiated, a tangent as well."""
-    del control
+def _solve_on_mesh(arguments, control, adjoint, limit, projects_steps):
+    """The solution, whose mesh resolves the motion; where it is differentiated, tangents as well."""
+    del control, projects_steps
     term, solver, options = arguments
     return _solve_states(term, solver, options, adjoint, limit, None)
 
 
 @_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
-    arguments, control, *fixed = primals
-    if control.direction is None:
+    arguments, control, adjoint, limit, projects_steps = primals
+    # Here it is not known which numbers are those of constraints.
+    if control.direction is None and not projects_steps:
         used = jax.tree.map(lambda x: x is not None, tangents[0][0], is_leaf=lambda x: x is None)
         direction = _pushed(lambda term: term, lax.stop_gradient(arguments[0]), used)
         excites = bool(jax.tree.leaves(tangents[0][2]["y0"]))
         control = dataclasses.replace(control, direction=direction, excites=excites)
-    solve = lambda arguments: _solve_with_tangents(arguments, control, *fixed)
+    solve = lambda arguments: _solve_with_tangents(arguments, control, adjoint, limit, projects_steps)
     return eqx.filter_jvp(solve, (arguments,), (tangents[0],))
 
 
-def _solve_with_tangents(arguments, control, adjoint, limit):
+def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
+    del projects_steps
     term, solver, options = arguments
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
@@ -351,8 +362,8 @@ def _tangent_control(system, options, direction) -> TangentControl:
 
 
 def _pushed(function, at, used):
-    """The tangent of a function along a change of all the leaves that are `used`, of each by its own size, or by one
-    where it is zero, and with random signs, always the same ones; None where none is used.
+    """The tangent of a function along a change of all the leaves that are `used`, of each by its own size, by one where
+    it is zero, and with random signs, always the same ones; None where none is used.
     """
     random = np.random.default_rng(0)
 
@@ -363,12 +374,28 @@ def _pushed(function, at, used):
         # A bound may be infinite.
         finite = jnp.isfinite(x)
         size = jnp.max(jnp.where(finite, jnp.abs(x), 0.0), initial=0.0)
-        return jnp.where(finite, jnp.where(size > 0, size, 1.0) * jnp.asarray(signs, x.dtype), 0.0)
+        size = jnp.where(size > 0, jnp.maximum(size, _LEAST_CHANGE), 1.0)
+        return jnp.where(finite, size * jnp.asarray(signs, x.dtype), 0.0)
 
     along = jax.tree.map(change, at, used, is_leaf=lambda x: x is None)
     if not jax.tree.leaves(along):
         return None
     return lax.stop_gradient(eqx.filter_jvp(function, (at,), (along,))[1])
+
+
+def _free(used, leaves, structure, t, state):
+    """Which of the leaves of a system that are `used` constraints do not depend on.
+
+    A tangent that begins off the constraints that have moved returns to them in steps that are projected, at errors
+    that no step is short enough for.
+    """
+
+    def rows(values):
+        own = jax.tree.unflatten(structure, [values.get(k, x) for k, x in enumerate(leaves)])
+        return own.position_residual(t, state.q), own.velocity_residual(t, state.q, state.u)
+
+    binding = used_inputs(rows, {k: x for k, (x, own) in enumerate(zip(leaves, used, strict=True)) if own})
+    return [own and not binding[k] for k, own in enumerate(used)]
 
 
 def running_scales(system, state, options) -> RunningScales:

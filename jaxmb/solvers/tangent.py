@@ -26,9 +26,10 @@ from .scales import ends_of
 # The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
 _LOOSER, _FLOOR = 5.0, 0.01
 # The start of a tangent that parameters cause, which would be zero, in units of the other start. So steps do not begin
-# at no length, and a mode that is excited late has been followed until then. It may be the larger one only where the
-# effect of the parameters is fainter still.
-_FAINT = 1e-12
+# at no length, and a mode that is excited late has been followed until then. The effect of parameters is resolved
+# relative to it where that is fainter still. (From 1e-12 the first steps are so short that modes of derivatives differ
+# by 1e-10 of rounding errors.)
+_FAINT = 1e-4
 
 
 class TangentControl(eqx.Module):
