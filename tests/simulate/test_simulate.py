@@ -155,6 +155,18 @@ def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
     assert np.all(np.isnan(gradient(jnp.array([1.0, 2.0]), 5)))
 
 
+def test_a_derivative_of_the_states_of_all_steps(rod):
+    """Their number is known after the run, also where it is differentiated outside `jit`."""
+    state = mb.assemble(rod)
+
+    def last(inertia, saveat):
+        changed = mb.with_parameters(rod, {"rod.inertia": inertia})
+        return mb.simulate(changed, state, t1=0.5, saveat=saveat)["rod"].angle[-1]
+
+    slope = jax.grad(last)(1.0, diffrax.SaveAt(steps=True))
+    np.testing.assert_allclose(slope, jax.grad(last)(1.0, None), rtol=1e-10)
+
+
 @pytest.mark.parametrize("end", [0.3, -0.3])
 def test_times_that_are_traced_are_inside_the_interval(rod, end):
     state = mb.assemble(rod)
