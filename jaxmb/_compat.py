@@ -129,10 +129,15 @@ def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: 
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))
 
 
-def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
-    """`lax.cond` that under `vmap` is computed only for the lanes that take it, one after the other.
+# How many lanes take a branch at once on a GPU, on which thousands of them cost as much as one.
+_LANES = 4096
 
-    So what a lane takes rarely costs the others nothing. Where it is differentiated it is `cond_of_any_lane`.
+
+def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
+    """`lax.cond` that under `vmap` is computed only for the lanes that take it, one after the other on a CPU.
+
+    So what a lane takes rarely costs the others nothing. Elsewhere up to `_LANES` of them go at once. Where it is
+    differentiated it is `cond_of_any_lane`.
     (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10; equinox.filter_closure_convert, 0.13.)
     """
     taken, static = eqx.partition((eqx.filter_closure_convert(true_fn, operand), operand), eqx.is_array)
@@ -150,16 +155,23 @@ def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any
     def of_lanes(size, batched, pred, taken, other):
         of_all = lambda x, own: x if own else jnp.broadcast_to(x, (size, *jnp.shape(x)))
         pred, other = of_all(pred, batched[0]), jax.tree.map(of_all, other, batched[2])
-        lanes, all_batched = jnp.nonzero(pred, size=size, fill_value=0)[0], jax.tree.map(lambda x: True, other)
+        lanes, all_batched = jnp.nonzero(pred, size=size, fill_value=size)[0], jax.tree.map(lambda x: True, other)
+        together = 1 if jax.default_backend() == "cpu" else min(size, _LANES)
 
-        def compute(lane, out):
-            own = jax.tree.map(lambda x, own: x[lane] if own else x, taken, batched[1])
-            return jax.tree.map(lambda x, new: x.at[lane].set(new), out, branch(own))
+        def compute(lanes, out):
+            own = jax.tree.map(lambda x, own: x[lanes] if own else x, taken, batched[1])
+            axes = jax.tree.map(lambda own: 0 if own else None, batched[1])
+            new = jax.vmap(branch, (axes,))(own) if jnp.ndim(lanes) else branch(own)
+            return jax.tree.map(lambda x, new: x.at[lanes].set(new, mode="drop"), out, new)
 
         if size == 1:
             # XLA would compute the branch before a loop, as it does not depend on which lane takes it.
             return lax.cond(pred[0], lambda: compute(0, other), lambda: other), all_batched
-        return lax.fori_loop(0, jnp.sum(pred), lambda k, out: compute(lanes[k], out), other), all_batched
+        if together == 1:
+            return lax.fori_loop(0, jnp.sum(pred), lambda k, out: compute(lanes[k], out), other), all_batched
+        lanes = jnp.pad(lanes, (0, -size % together), constant_values=size)
+        of_round = lambda k, out: compute(lax.dynamic_slice_in_dim(lanes, k * together, together), out)
+        return lax.fori_loop(0, -(-jnp.sum(pred) // together), of_round, other), all_batched
 
     @jax.custom_jvp
     def chosen(pred, taken, other):

@@ -178,9 +178,15 @@ def test_conditions_of_a_batch(compat):
     assert "cond" in names, "equinox.internal.unvmap_any no longer makes one condition of those of a batch"
 
 
-@pytest.mark.parametrize("lanes", [1, 5])
-def test_conditions_of_lanes(compat, lanes):
-    """A branch that only the lanes that take it go through, with the values and derivatives of any other."""
+@pytest.mark.parametrize("lanes, at_once", [(1, None), (5, None), (5, 2), (5, 4096)])
+def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
+    """A branch that only the lanes that take it go through, with the values and derivatives of any other.
+
+    They go one after the other on a processor, and several at once elsewhere.
+    """
+    if at_once is not None:
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        monkeypatch.setattr(compat, "_LANES", at_once)
 
     def branched(cond, x, a):
         return cond(x[0] > 1, lambda x: jnp.sin(a) * x, lambda x: x, x)
