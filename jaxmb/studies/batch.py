@@ -34,7 +34,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     The members of a block go through the loop of a simulation together, as long as its slowest member needs, and each
     operation is one of all their numbers. For a few hundred simulations at once these are more than the caches hold,
     except of small machines, and members wait for the slowest of all: `jax.vmap` then takes longer than blocks, or even
-    than one run after the other. Use `jax.vmap` itself for functions without loops, and on a GPU, where batches pay from
+    than one run after the other. Use `jax.vmap` itself for functions without loops, and on a GPU, where it pays from
     some hundred members on: a step of a four-bar takes 0.2 ms there, and one of 65 536 four-bars 2 ms (H100; on a core
     one takes 0.01 ms).
 
