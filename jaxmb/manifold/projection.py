@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._compat import WrappedSolver, cond_of_any_lane, direction_of
+from .._compat import WrappedSolver, cond_of_any_lane, direction_of, inner_term
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass, solve_constrained
@@ -80,7 +80,7 @@ class Projection(AbstractManifold):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
             guards = contact_guards(system, formulation, newton_tolerance(self.newton_tol, rtol))
-            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, system, guards)
+            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, guards)
         _check_multistep(system, formulation, type(solver).__name__)
         if solver.solves_implicitly and not system.has_field_jacobian:
             raise ValueError(
@@ -242,12 +242,12 @@ class ProjectionTerm(AbstractManifoldTerm):
 
 
 class ProjectedSolver(WrappedSolver):
-    """A Runge–Kutta solver whose steps end with a projection on the constraints, or at events of contacts.
+    """A Runge–Kutta solver whose steps end with a projection on the constraints of the term's system, or at events of
+    contacts.
 
-    **Fields:** the `system`; the `guards` of its contacts, None without any.
+    **Fields:** the `guards` of the contacts, None without any.
     """
 
-    system: AbstractEquation
     guards: ContactGuards | None
 
     def init(self, terms, t0, t1, y0, args):
@@ -256,29 +256,29 @@ class ProjectedSolver(WrappedSolver):
     # Compiled inside the whole program, so that it is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        direction = direction_of(terms)
+        system, direction = inner_term(terms).vector_field.system, direction_of(terms)
         if made_jump is not False:
-            y0 = cond_of_any_lane(made_jump, lambda y: self._after_jump(t0 * direction, y), lambda y: y, y0)
+            y0 = cond_of_any_lane(made_jump, lambda y: self._after_jump(system, t0 * direction, y), lambda y: y, y0)
         first, last = t0, t1
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction
-        y1, failed = projected(self.system, t1, y1)
+        y1, failed = projected(system, t1, y1)
         # Of a step whose end was not found nothing is known, so that its error is infinite; where no error estimate
         # shortens it, the run ends with it.
         unknown = lambda x: jnp.where(failed, jnp.nan, x) if eqx.is_inexact_array(x) else x
         y1, dense_info = jax.tree.map(unknown, (y1, dense_info))
         error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
-        if drops_rows(self.system):
+        if drops_rows(system):
             # diffrax forgets the result of a step that is rejected.
-            violated = _violated(*lax.stop_gradient((self.system, t1, y1)))
+            violated = _violated(*lax.stop_gradient((system, t1, y1)))
             result = diffrax.RESULTS.where(violated, _FAILED, result)
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
             error = crossing(self.guards, direction, error, (first, last), (y0, y1), at)
         return y1, error, dense_info, solver_state, result
 
-    def _after_jump(self, t, y):
+    def _after_jump(self, system, t, y):
         if self.guards is None:
-            return after_impulse(self.system, t, y)
+            return after_impulse(system, t, y)
         return self.guards.impact(t, y).after

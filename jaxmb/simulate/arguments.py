@@ -54,6 +54,20 @@ def check_kinds(*given: Any) -> None:
             check_kind(name, value, kind, f"an object such as {example}", "leave it out for the default")
 
 
+def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
+    """Refuse steps without error estimates for a method that chooses its order by them, unless it has tolerances."""
+    estimates = stepsize_controller is None or isinstance(
+        stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
+    )
+    if not estimates and isinstance(solver, AbstractMultistep) and not solver.tolerances.fixed:
+        own, steps = type(solver).__name__, type(stepsize_controller).__name__
+        raise ValueError(
+            f"{own} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
+            f"solver=jaxmb.solvers.{own}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
+            "Steps that are only bounded have jaxmb.solvers.MultistepController(rtol, atol, dtmax=0.01)."
+        )
+
+
 def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales | None) -> Any:
     if isinstance(solver, AbstractMultistep):
         return MultistepController(rtol, atol, scales=scales)

@@ -29,6 +29,7 @@ from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
     check_error_estimate,
+    check_fixed_steps,
     check_kinds,
     check_steps,
     checked_jumps,
@@ -188,8 +189,6 @@ def simulate(
     the one that they cause together, each changed by its own size, or by one where it is zero. Its values differ within
     the tolerance from those of the same run without derivatives. An effect that is much smaller than that of other
     parameters is resolved relative to theirs; `direction={"kick.strength": 1.0}` watches that of this change instead.
-    Where states are projected on constraints after the steps of a Runge–Kutta solver, parameters of the constraints are
-    not among them, and none are where a `jax.jit` is differentiated as a whole.
     Where a force sets in almost at once, as in an impact, derivatives are less accurate than the motion: for a ball on
     a stiff floor their error is about 5000 `rtol`. Compare them with those of a tolerance that is a hundred times
     tighter. A controller of the user's is treated in the same way if it is, or wraps, a `MultistepController` or a
@@ -207,6 +206,7 @@ def simulate(
     check_steps(max_events, "max_events")
     method = named_solver(solver, state) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
+    check_fixed_steps(method, stepsize_controller)
     if error:
         check_error_estimate(saveat, stepsize_controller, event)
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._compat import used_inputs, with_values
+from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
 from ..contact_events import FoundEvents
@@ -23,6 +23,7 @@ from ..manifold import (
     after_jumps,
     default_manifold,
     natural_units,
+    project,
     state_blocks,
     with_internal_states,
 )
@@ -165,10 +166,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         direction = eqx.filter_jvp(lambda step: problem.assembled(moved(step))[0], (0.0,), (1.0,))[1]
     elif problem.differentiated:
         leaves, structure = jax.tree.flatten(system)
-        used = problem.differentiated[: len(leaves)]
-        if problem.projects_steps:
-            used = _free(used, leaves, structure, times["t0"], problem.state)
-        direction = _pushed(lambda system: problem.assembled(system)[0], system, jax.tree.unflatten(structure, used))
+        used = jax.tree.unflatten(structure, problem.differentiated[: len(leaves)])
+        direction = _pushed(lambda system: problem.assembled(system)[0], system, used)
     finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(start)]) & valid
 
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
@@ -301,8 +300,7 @@ def _solve_on_mesh(arguments, control, adjoint, limit, projects_steps):
 @_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
     arguments, control, adjoint, limit, projects_steps = primals
-    # Here it is not known which numbers are those of constraints.
-    if control.direction is None and not projects_steps:
+    if control.direction is None:
         used = jax.tree.map(lambda x: x is not None, tangents[0][0], is_leaf=lambda x: x is None)
         direction = _pushed(lambda term: term, lax.stop_gradient(arguments[0]), used)
         excites = bool(jax.tree.leaves(tangents[0][2]["y0"]))
@@ -312,8 +310,10 @@ def _solve_jvp(primals, tangents):
 
 
 def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
-    del projects_steps
     term, solver, options = arguments
+    if projects_steps:
+        restore = lambda term, y: project(term.vector_field.system, options["t0"], y)
+        control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
     solution = _solve_states(term, solver, options, adjoint, limit, MeshAdjoint(_rows(options)))
@@ -381,21 +381,6 @@ def _pushed(function, at, used):
     if not jax.tree.leaves(along):
         return None
     return lax.stop_gradient(eqx.filter_jvp(function, (at,), (along,))[1])
-
-
-def _free(used, leaves, structure, t, state):
-    """Which of the leaves of a system that are `used` constraints do not depend on.
-
-    A tangent that begins off the constraints that have moved returns to them in steps that are projected, at errors
-    that no step is short enough for.
-    """
-
-    def rows(values):
-        own = jax.tree.unflatten(structure, [values.get(k, x) for k, x in enumerate(leaves)])
-        return own.position_residual(t, state.q), own.velocity_residual(t, state.q, state.u)
-
-    binding = used_inputs(rows, {k: x for k, (x, own) in enumerate(zip(leaves, used, strict=True)) if own})
-    return [own and not binding[k] for k, own in enumerate(used)]
 
 
 def running_scales(system, state, options) -> RunningScales:

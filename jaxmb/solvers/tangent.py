@@ -11,6 +11,7 @@ They are those of the numerical solution: each step is differentiated along the 
 solver's memory. The derivative of the error estimate is then the error estimate of the tangent.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import with_inner
-from .evaluation import freeze
+from .evaluation import freeze, ravel, unravel_like
 from .scales import ends_of
 
 # The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
@@ -42,15 +43,19 @@ class TangentControl(eqx.Module):
     - `direction`: a tangent of the term, None where derivatives by its numbers are not taken. The tangent of the state
         that it causes is carried along.
     - `excites`: whether the tangent from a start that excites every mode is, beside that.
+    - `restored`: the starts, where constraints have to be returned to; None for those that excite every mode.
     """
 
     units: Float[Array, " n"]
     blocks: tuple[int, ...] = eqx.field(static=True)
     direction: PyTree = None
     excites: bool = eqx.field(static=True, default=True)
+    restored: tuple[Float[Array, " n"], ...] | None = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
         """A start with entries of random signs, between one half and one unit, always the same one; and a faint one."""
+        if self.restored is not None:
+            return self.restored
         random = np.random.default_rng(0)
         entries = random.choice([-1.0, 1.0], self.units.size) * random.uniform(0.5, 1.0, self.units.size)
         excited = self.units * jnp.asarray(entries, self.units.dtype)
@@ -58,13 +63,29 @@ class TangentControl(eqx.Module):
             return (excited,)
         return (excited, _FAINT * excited) if self.excites else (_FAINT * excited,)
 
+    @property
+    def directions(self) -> tuple[PyTree, ...]:
+        """The tangent of the term that each start goes with, None for that which excites every mode."""
+        if self.direction is None:
+            return (None,)
+        return (None, self.direction) if self.excites else (self.direction,)
+
+    def on_constraints(self, restore: Any, term: PyTree, y0: PyTree) -> "TangentControl":
+        """The same with starts that are tangents of states that `restore(term, y)` returns, of a term.
+
+        A solver that returns its steps to constraints would have the first one end at another tangent, however short.
+        """
+        none = jax.tree.map(lambda _: None, term)
+        starts = [
+            ravel(pushed_only(restore, (term, y0), (none if own is None else own, unravel_like(y0, w))))
+            for own, w in zip(self.directions, self.starts(), strict=True)
+        ]
+        return dataclasses.replace(self, restored=tuple(starts))
+
     def of_terms(self, terms: PyTree) -> tuple[PyTree, ...]:
         """The tangents of a solver's terms, which diffrax has wrapped."""
         none = jax.tree.map(lambda _: None, terms)
-        if self.direction is None:
-            return (none,)
-        along = with_inner(terms, self.direction, None)
-        return (none, along) if self.excites else (along,)
+        return tuple(none if own is None else with_inner(terms, own, None) for own in self.directions)
 
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""

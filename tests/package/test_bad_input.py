@@ -235,6 +235,15 @@ def test_combinations(pendulum):
         mb.simulate(pendulum, state, t1=0.1, stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
 
 
+def test_given_steps_for_a_method_of_many_orders(pendulum):
+    """They need tolerances of the solver's own, by which it chooses the order."""
+    state = mb.assemble(pendulum)
+    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01, "t1": 0.1}
+    for solver in (None, mb.solvers.Hermite()):
+        with pytest.raises(ValueError, match=r"(Adams|Hermite)\(rtol=1e-8, atol=1e-10\)"):
+            mb.simulate(pendulum, state, solver=solver, **fixed)
+
+
 def test_nothing_to_solve_implicitly():
     turned = planar.Driver("drive", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t)
     system = mb.Scene([bar()], joints=[pin(), turned]).compile()

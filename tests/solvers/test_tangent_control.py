@@ -126,6 +126,56 @@ def test_a_force_of_strength_zero_on_a_mass_at_rest(solver):
         np.testing.assert_allclose(forward(0.0, rtol), whole(0.0, rtol), rtol=1e-12)
 
 
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
+def test_a_force_of_strength_zero_beside_constraints(solver):
+    """Derivatives of a cart on a rail at rest, by the strength alone and beside those by where it starts."""
+    rail = planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
+
+    def push(poses, velocities, t, parameters):
+        return parameters["strength"] * jnp.sin(12.0 * t) * jnp.array([[1.0, 0.0, 0.0]])
+
+    force = mb.Force("push", "cart", push, parameters={"strength": 0.0})
+    system = mb.Scene([planar.Body("cart", mass=1.0, inertia=0.1)], joints=[rail], forces=[force]).compile()
+    start = mb.assemble(system)
+
+    def end(strength, offset):
+        changed = mb.with_parameters(system, {"push.strength": strength})
+        moved = mb.State(start.q.at[0].add(offset), start.u)
+        sol = mb.simulate(changed, moved, t1=1.5, rtol=1e-8, solver=SOLVERS[solver], throw=False)
+        return sol["cart"].position[-1, 0]
+
+    exact = 1.5 / 12 - np.sin(18) / 144
+    for derivative in (jax.jit(jax.grad(end)), jax.grad(jax.jit(end))):
+        np.testing.assert_allclose(derivative(0.0, 0.0), exact, rtol=1e-6)
+    both = jax.jit(jax.grad(end, argnums=(0, 1)))(0.0, 0.0)
+    np.testing.assert_allclose(both, [exact, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end, argnums=(0, 1)))(0.0, 0.0), both, rtol=1e-12)
+
+
+def test_parameters_of_constraints_with_steps_that_are_projected():
+    """Where constraints move with parameters, tangents start on those that have moved: steps need not be short."""
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    system = mb.Scene([bar], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    nominal, along = mb.parameters(system)["pin.point_b"], jnp.array([0.5, 0.5])
+
+    def end(shift, solver, rtol, direction):
+        changed = mb.with_parameters(system, {"pin.point_b": nominal + shift * along})
+        start = mb.assemble(changed, throw=False)
+        watched = {"pin.point_b": along} if direction else None
+        sol = mb.simulate(changed, start, t1=0.2, rtol=rtol, solver=SOLVERS[solver], direction=watched, throw=False)
+        return jnp.sum(sol.ys.q[-1]), sol.stats["num_steps"]
+
+    derivative = jax.jit(jax.grad(end, has_aux=True), static_argnums=(1, 2, 3))
+    exact, _ = derivative(0.0, "Adams", 1e-11, False)
+    for direction in (False, True):
+        found, steps = derivative(0.0, "Dopri8", 1e-8, direction)
+        np.testing.assert_allclose(found, exact, rtol=1e-6)
+        assert steps < 12
+    whole = jax.jit(end, static_argnums=(1, 2, 3))
+    np.testing.assert_allclose(jax.grad(lambda x: whole(x, "Dopri8", 1e-8, False)[0])(0.0), exact, rtol=1e-6)
+
+
 def test_controls_that_are_zero():
     """Their gradient, where an optimisation of controls begins, is that of any others, since the system is linear."""
     cart = planar.Body("cart", mass=1.0, inertia=0.1)
