@@ -111,8 +111,9 @@ else:
         "studies.sweep": "cases load_sweep sweep",
     }
     _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}
-    __all__ = sorted(name for name in {*globals(), *_MODULES, *_SOURCES} if not name.startswith("_"))
-    __all__.remove("TYPE_CHECKING")
+    # Modules that Python puts here when it imports them, and which are no part of the interface.
+    _INNER = {"TYPE_CHECKING", "bodies", "contact_events", "linalg", "states"}
+    __all__ = sorted(name for name in {*globals(), *_MODULES, *_SOURCES} - _INNER if not name.startswith("_"))
 
     def __getattr__(name: str) -> object:
         """A module, or a name of one, at its first use; from then on it is found without this function."""
@@ -126,4 +127,4 @@ else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return sorted({*globals(), *__all__} - _INNER)
