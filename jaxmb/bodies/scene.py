@@ -2,7 +2,7 @@
 
 import inspect
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jax import lax
 
 from .._traced_functions import traced_by_jax
 from .._types import State
-from ..linalg.arrays import is_traced
+from ..linalg.arrays import ARRAYS, is_traced
 from ..parts.base import (
     GROUND,
     AbstractActor,
@@ -351,10 +351,17 @@ def _check_rotation(part, components, own, layout, poses):
 
 
 def _loaded(part):
-    """The part with ones in place of forces and moments that are zero, as those of inputs may be."""
-    values = values_of(part)
-    loads = [name for name, own in declarations(type(part)).items() if own.unit in ("N", "N m")]
-    ones = {name: np.ones_like(values[name]) for name in loads if values[name] is not None and not np.any(values[name])}
+    """The part with ones in place of forces and moments that are zero, as those of inputs may be, and of zeros among
+    the parameters of a user's function.
+    """
+    filled = lambda x: np.ones_like(x) if isinstance(x, ARRAYS) and not np.any(x) else x
+    ones = {}
+    for name, own in declarations(type(part)).items():
+        value = values_of(part)[name]
+        if isinstance(value, Mapping):
+            ones[name] = {key: filled(x) for key, x in value.items()}
+        elif own.unit in ("N", "N m") and value is not None:
+            ones[name] = filled(value)
     return _call(part, "with_fields", **ones) if ones else part
 
 

@@ -1,5 +1,6 @@
 """Scenes that are made of others, and parts that cannot act on a point mass."""
 
+import jax.numpy as jnp
 import pytest
 
 import jaxmb as mb
@@ -36,6 +37,10 @@ def compiled(bodies, part):
     return mb.Scene(bodies, joints=joints, forces=forces).compile()
 
 
+def turning(poses, velocities, t, parameters):
+    return jnp.array([[1.0, 0.0, 1.0]]) * jnp.stack([1.0, 1.0, parameters["moment"]])
+
+
 @pytest.mark.parametrize(
     ("bodies", "part"),
     [
@@ -51,6 +56,7 @@ def compiled(bodies, part):
         (FLAT, planar.Torque("part", "mass", torque=0.0)),
         (DEEP, spatial.Torque("part", "mass", torque=(0.0, 0.0, 0.0))),
         (FLAT, mb.RigidContact("part", "mass", terrain=terrain.Flat(), centre=(0.1, 0.0))),
+        (FLAT, mb.Force("part", "mass", turning, parameters={"moment": 0.0})),
     ],
 )
 def test_what_would_turn_a_point_mass_is_refused(bodies, part):
