@@ -95,15 +95,15 @@ class _Search(NamedTuple):
     """The search for the first zero in a step, whose times are fractions of it.
 
     **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
-    are `looked_at`; whether these are positive at the start of the step; guards and their rates at the end of it;
-    whether one is negative in its middle; the number of evaluations in this `phase`.
+    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step; whether one is
+    negative in its middle; the number of evaluations in this `phase`.
     """
 
     phase: Any
     s: Any
     bracket: Bracket
     looked_at: Any
-    positive: Any
+    waiting: Any
     end: Any
     rates: Any
     dips: Any
@@ -145,7 +145,7 @@ def crossing(
         one,
         Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0)),
         none > 0,
-        jnp.array(False),
+        none > 0,
         none,
         none,
         jnp.array(False),
@@ -163,38 +163,42 @@ def _looked(search: _Search, values, rates, start, touch):
     """At the end of a step: guards that are negative, and those whose rate has changed its sign."""
     below = values < -touch
     inside = (start < 0) & (rates > 0) & jnp.isfinite(start) & ~below
-    # Of several the one that is least at the end.
-    least = jnp.argmin(jnp.where(inside, values, jnp.inf))
-    dips, crosses = jnp.any(inside) & ~jnp.any(below), jnp.any(below)
-    of_a = jnp.where(dips, start[least], search.bracket.of_a)
-    of_b = jnp.where(dips, rates[least], jnp.min(jnp.where(below, values, jnp.inf)))
+    crosses = jnp.any(below)
+    search = search._replace(waiting=inside & ~crosses, end=values, rates=rates)
+    bracket = search.bracket._replace(of_b=jnp.min(jnp.where(below, values, jnp.inf)))
+    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, count=jnp.array(0))
+    return jax.tree.map(lambda a, b: jnp.where(crosses, a, b), risen, _next_dip(search, start))
+
+
+def _next_dip(search: _Search, start):
+    """Before the search for the zero of the rate of the next guard that waits for it, of several the one that is least
+    at the end of the step; the search is done where none does.
+    """
+    least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
+    own, one = jnp.arange(start.size) == least, jnp.ones_like(search.s)
+    bracket = Bracket(jnp.zeros_like(one), one, start[least], search.rates[least], jnp.array(0))
     return search._replace(
-        phase=jnp.where(crosses, _RISE, jnp.where(dips, _DIP, _DONE)),
-        s=search.s / 2,
-        bracket=search.bracket._replace(of_a=of_a, of_b=of_b),
-        looked_at=jnp.where(crosses, below, jnp.arange(values.size) == least),
-        end=values,
-        rates=rates,
+        phase=jnp.where(jnp.any(search.waiting), _DIP, _DONE),
+        s=0.5 * one,
+        bracket=bracket,
+        looked_at=own,
+        waiting=search.waiting & ~own,
         count=jnp.array(0),
     )
 
 
 def _dipped(search: _Search, values, rates, start, touch):
     """Towards the zero of a guard's rate, where it is least."""
-    del start
     own = jnp.argmax(search.looked_at)
     again = _narrowed(search, rates[own])
     ends = _is_short(again)
     dips = ends & (values[own] < -touch)
-    bracket, one = again.bracket, jnp.ones_like(search.s)
-    b = jnp.where(dips, search.s, jnp.where(ends, one, bracket.b))
-    return again._replace(
-        phase=jnp.where(dips, _RISE, jnp.where(ends, _DONE, _DIP)),
-        s=jnp.where(dips, search.s / 2, again.s),
-        bracket=bracket._replace(a=jnp.where(ends, 0.0, bracket.a), b=b),
-        dips=dips,
-        count=jnp.where(ends, 0, again.count),
+    bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s)
+    risen = again._replace(
+        phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, dips=jnp.array(True), count=jnp.array(0)
     )
+    chosen = jax.tree.map(lambda a, b: jnp.where(ends, a, b), _next_dip(search, start), again)
+    return jax.tree.map(lambda a, b: jnp.where(dips, a, b), risen, chosen)
 
 
 def _risen(search: _Search, values, rates, start, touch):
