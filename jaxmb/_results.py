@@ -42,8 +42,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
     )
     invalid_parameters = (
-        "A parameter is not finite, or not of the sign that its part asks for, or a direction is not a unit vector, "
+        "A parameter is not finite, or not in the range that its part asks for, or a direction is not a unit vector, "
         "or a design variable is outside its bounds. `jaxmb.with_parameters` with numbers that are not traced names it."
     )
     # The last one, since results are stored by their numbers.
-    saved_outside = "A saved time is not between `t0` and `t1`, or not a number."
+    saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the one that it follows."

@@ -37,9 +37,10 @@ class Event(NamedTuple):
     ```
 
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
-    `"close"`, `"open"`, or `"rest"`: the end of infinitely many bounces; of friction `"stick"`, `"slip"`, or `"impact"`
-    for an impulse alone; the `impulse` [N s, N m s]; `energy_lost` [J]: the kinetic energy that was lost at this time,
-    by all parts together, so that each of them has the same; `ContactEvents.energy_lost` has one for each time.
+    `"close"`, `"open"`, `"rest"`: the end of infinitely many bounces, or `"impulse"` of a contact that stays closed
+    while others strike; of friction `"stick"`, `"slip"`, or `"impact"` for an impulse alone; the `impulse` [N s, N m
+    s]; `energy_lost` [J]: the kinetic energy that was lost at this time, by all parts together, so that each of them
+    has the same; `ContactEvents.energy_lost` has one for each time.
     """
 
     time: float
@@ -58,6 +59,7 @@ class ContactEvents(eqx.Module):
     motion.events.times, motion.events.impulses, motion.events.energy_lost
     ```
 
+    Impacts at `t0`, and what happens at announced `jumps`, are part of the motion and are not listed.
     A state that is saved just at an event may be that before it or that after it. Times, impulses and energies have
     first derivatives; `rest` counts as a constant.
 
@@ -137,8 +139,9 @@ class ContactEvents(eqx.Module):
                     continue
                 was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
                 impulse = float(impulses[k, i])
-                struck = impulse > 0 and was_open
-                kind = "impact" if struck and is_open else "close" if was_open and not is_open else "open"
+                struck = impulse > 0
+                kind = "close" if was_open and not is_open else "open" if is_open and not was_open else "impact"
+                kind = "impulse" if struck and not (was_open or is_open) else kind
                 if struck or was_open != is_open:
                     rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
                 if rest[k, i] > 0 and after[k, i] == CLOSED:

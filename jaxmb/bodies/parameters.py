@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
 from ..linalg.arrays import is_traced
+from ..parts.base import AbstractPart
 from ..parts.fields import Declaration, entry, in_range, inner_parts, paths
 from ..parts.series import AbstractSignal
 from ..system.catalogue import ParameterPath
@@ -104,6 +106,9 @@ def are_in_range(parts: Iterable[Any]) -> bool | Bool[Array, ""]:
             value = entry(own, keys)
             if is_traced(value):
                 ok = ok & in_range(declared, value)
+        agree = own.numbers_agree() if isinstance(own, AbstractPart) else True
+        if is_traced(agree):
+            ok = ok & jnp.all(agree)
     return ok
 
 

@@ -55,6 +55,9 @@ NO_SECOND_DERIVATIVES = (
     "Second derivatives through impacts are not supported: their times and states have first derivatives only."
 )
 
+# An event is found to this fraction of its time, and more exactly.
+_AT_ONCE = 1e-10
+
 
 class Impact(NamedTuple):
     """An event of contacts.
@@ -329,8 +332,9 @@ def _release(system, formulation, touch, event, at, along):
     motion = State(system.rates(t, y.q, y.u), event.before, z)
     value = push(reserve, (system, t, y), (dsystem, dt, dy))
     rate = eqx.filter_jvp(lambda t, y: reserve(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
-    # What an impact opens, or sets in motion, is not at its limit before.
-    is_zero = jnp.abs(left[own]) <= NEAR * touch * largest
+    # What an impact opens, or sets in motion, is not at its limit before. Where forces balance there may be none to
+    # compare with: then the time to the limit is, with the time itself.
+    is_zero = jnp.abs(left[own]) <= jnp.maximum(NEAR * touch * largest, _AT_ONCE * jnp.abs(rate * t))
     at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
     return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
 

@@ -112,6 +112,10 @@ class AbstractPart(eqx.Module):
     def validate(self) -> None:
         """Hook: raise a `ValueError` for inconsistent numbers; each by itself has already been checked."""
 
+    def numbers_agree(self) -> Any:
+        """Hook: whether the numbers are as `validate` asks, which it cannot tell of those that are traced."""
+        return True
+
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
         own = fields.values_of(self)

@@ -289,6 +289,9 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
         if not self.lower < self.upper:
             raise ValueError(f"{self.label}: lower must be less than upper, got {self.lower} and {self.upper}.")
 
+    def numbers_agree(self):
+        return self.lower < self.upper
+
     def with_numbers(self, given):
         if self.within in self.joint.periodic and self.upper - self.lower >= 2 * np.pi:
             raise ValueError(

@@ -87,6 +87,9 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
                 f"and {self.coefficient}."
             )
 
+    def numbers_agree(self):
+        return True if self.static_coefficient is None else self.static_coefficient >= self.coefficient
+
     def scalar_coordinates(self, space, parts):
         if self._directions(space, parts.get(self.joint_name)) == 2:
             return tuple(ScalarCoordinate(f"{self.name}.mode_{k}", moves=True) for k in (1, 2))

@@ -57,6 +57,9 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
         if not self.restitution <= 1:
             raise ValueError(f"{self.label}: restitution must lie between 0 and 1, got {self.restitution}.")
 
+    def numbers_agree(self):
+        return self.restitution <= 1
+
     def scalar_coordinates(self, space, parts):
         del space, parts
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
@@ -95,6 +98,10 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
             raise ValueError(f"{self.label}: give lower, upper or both.")
         if self.lower is not None and self.upper is not None and not self.lower < self.upper:
             raise ValueError(f"{self.label}: lower must be less than upper, got {self.lower} and {self.upper}.")
+
+    def numbers_agree(self):
+        agree = super().numbers_agree()
+        return agree if self.lower is None or self.upper is None else agree & (self.lower < self.upper)
 
     def with_numbers(self, given):
         if self.within in self.joint.periodic:
@@ -241,6 +248,9 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
         super().validate()
         if not self.radius_a + self.radius_b > 0:
             raise ValueError(f"{self.label}: of radius_a and radius_b only one may be zero; give the other one.")
+
+    def numbers_agree(self):
+        return super().numbers_agree() & (self.radius_a + self.radius_b > 0)
 
     def gap(self, space, poses):
         return norm(separation(space, self, poses)) - self.radius_a - self.radius_b

@@ -47,20 +47,21 @@ def _at_frozen_start_jvp(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def at_moving_times(term: Any, ts: Any, ys: Any) -> Any:
-    """Saved states at moving times, from those at the times where they are now."""
+def at_moving_times(term: Any, ts: Any, moves: Any, ys: Any) -> Any:
+    """Saved states at moving times, from those at the times where they are now; `moves` are zeros with the derivatives
+    of the times that move. (Those of events have derivatives with which their states have moved already.)
+    """
     return ys
 
 
 @at_moving_times.def_jvp
 def _at_moving_times_jvp(primals, tangents):
-    def moved(term, ts, ys):
-        at = lambda t, y: _series(term, lax.stop_gradient(t), y, t - lax.stop_gradient(t))
+    def moved(term, ts, moves, ys):
         finite = jnp.isfinite(ts)
         first = jnp.argmax(finite)
         # Entries after the end of a run have no field.
         inside = jax.tree.map(lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, x[first]), (ts, ys))
-        new = jax.vmap(at)(*inside)
+        new = jax.vmap(lambda t, y, move: _series(term, lax.stop_gradient(t), y, move))(*inside, moves)
         return jax.tree.map(lambda x, y: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, ys)
 
     return eqx.filter_jvp(moved, primals, tangents)
@@ -72,15 +73,19 @@ def _series(term, t, y, step):
     return jax.tree.map(lambda y, f, g: y + step.astype(y.dtype) * (f + step.astype(y.dtype) / 2 * g), y, first, second)
 
 
-def saved_times(series: diffrax.SubSaveAt, found: Any, start: Any, end: Any) -> Any:
-    """The times of a series of saved states with the derivatives of those that were asked for.
+def saved_times(series: diffrax.SubSaveAt, found: Any, start: Any, end: Any) -> tuple[Any, Any]:
+    """The times of a series of saved states with the derivatives of those that were asked for, and the moves of these:
+    zeros with their derivatives.
 
-    **Arguments:** `found`: the times without derivatives.
+    **Arguments:** `found`: the times without derivatives, but for those of events.
     """
     if series.steps:
         # Only the ends of a run move among its steps.
-        moved = jnp.where(found == lax.stop_gradient(end), end, found)
-        return moved.at[0].set(jnp.where(found[0] == lax.stop_gradient(start), start, moved[0])) if series.t0 else moved
-    asked = ([start[None]] if series.t0 else []) + ([] if series.ts is None else [series.ts])
-    asked = jnp.concatenate(asked + ([end[None]] if series.t1 else []))
-    return jnp.where(found == lax.stop_gradient(asked), asked, found)
+        asked = jnp.broadcast_to(end, found.shape)
+        asked = asked.at[0].set(jnp.where(found[0] == lax.stop_gradient(start), start, end)) if series.t0 else asked
+    else:
+        asked = ([start[None]] if series.t0 else []) + ([] if series.ts is None else [series.ts])
+        asked = jnp.concatenate(asked + ([end[None]] if series.t1 else []))
+    frozen = lax.stop_gradient(asked)
+    is_asked = found == frozen
+    return jnp.where(is_asked, asked, found), jnp.where(is_asked, asked - frozen, 0.0)

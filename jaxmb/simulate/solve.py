@@ -21,6 +21,7 @@ from ..linalg.jitted import jitted
 from ..manifold import (
     AbstractManifold,
     after_jumps,
+    contact_guards,
     default_manifold,
     natural_units,
     project,
@@ -28,6 +29,7 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
+from ..manifold.manifold import newton_tolerance
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
@@ -50,6 +52,8 @@ from .outcome import Outcome, has_failed
 
 # Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
 _MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
+# What saves states as they are.
+_STATES = diffrax.SubSaveAt(t1=True).fn
 # The least change of a parameter whose effect is watched, of one that is next to zero, in its unit.
 _LEAST_CHANGE = 1e-4
 
@@ -176,7 +180,12 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if system.contacts is not None:
         # Contacts may close, or be closed, at the start.
         options["made_jump"] = jnp.array(True)
+    given = start
     if problem.moving[0]:
+        if system.contacts is not None:
+            # The field is that of the contacts that close or open, and of the friction that slips, at the start.
+            guards = contact_guards(system, problem.method, newton_tolerance(None, problem.rtol))
+            start = guards.impact(times["t0"], start).after
         options["y0"] = start = at_frozen_start(term, times["t0"], start)
     at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
     outside: Any = False
@@ -185,7 +194,11 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         inside = jnp.clip(saved_at, *ends)
         # A time that is computed as t1 is may differ from it by rounding errors.
         rounding = 8 * jnp.finfo(ends.dtype).eps * jnp.max(jnp.abs(ends))
-        outside, saved_at = ~jnp.all(jnp.abs(inside - saved_at) <= rounding), inside
+        sign = jnp.where(options["t0"] <= options["t1"], 1, -1)
+        ordered = jnp.all(sign * jnp.diff(saved_at) >= 0)
+        outside, saved_at = ~(jnp.all(jnp.abs(inside - saved_at) <= rounding) & ordered), inside
+        # Without the derivatives that clipping takes from the times at the ends.
+        first = eqx.tree_at(lambda first: first.ts, first, saved_at + first.ts - lax.stop_gradient(first.ts))
     options["t1"] = at_once(options["t1"])
     controller, after = options["stepsize_controller"], saved_at
     jumps = controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
@@ -194,6 +207,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
             # States that are saved at a jump are those after it, also in a run that comes to it from there.
             after = after_jumps(saved_at, jumps, options["t0"], options["t1"])
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
+    are_states = first.fn is _STATES
+    if any(problem.moving):
+        # A user's function is one of states at times that move.
+        options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], _STATES)
     control = _tangent_control(system, options, direction)
     if problem.differentiated and not problem.changes:
         excites = any(problem.differentiated[len(jax.tree.leaves(system)) :])
@@ -205,21 +222,27 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
     correction, lost = policy.correction(problem.interpolated), None
-    # `SaveAt(fn=...)` may save something else than states.
-    are_states = jax.tree.structure(saved) == jax.tree.structure(start)
     if are_states and correction is not None:
         saved, lost = _corrected(system, options, ts, saved, correction)
     if after is not saved_at:
         ts = _replaced(ts, after, saved_at)
     if any(problem.moving):
-        ts = saved_times(first, ts, times["t0"], times["t1"])
-        if are_states and problem.moving[1]:
-            saved = at_moving_times(term, ts, saved)
+        ts, moves = saved_times(first, ts, times["t0"], times["t1"])
+        if problem.moving[1]:
+            saved = at_moving_times(term, ts, moves, saved)
+        if problem.moving[0] and first.t0:
+            saved = jax.tree.map(lambda x, y: x.at[0].set(y), saved, given)
+        if not are_states:
+            saved = _of_states(first.fn, ts, saved, (times["t0"], start))
 
     found, events = None, events_found(solution.controller_state)
     if events is not None:
         found = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
     end = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
+    if found is not None and problem.event is not None:
+        # The last step is cut off at the user's event, before what was found at its end.
+        later = jnp.isfinite(found.times) & (found.times > end[0])
+        found = found._replace(number=found.number - jnp.sum(later))
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(finite, result, RESULTS.assembly_failed)
     if valid is not True:
@@ -322,25 +345,29 @@ def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
 
 def _solve_states(term, solver, options, adjoint, limit, derivatives):
     """The solution with states saved first, and then what the user's function makes of them."""
-    function, states = options["saveat"].subs[0].fn, diffrax.SubSaveAt(t1=True).fn
-    saveat = options["saveat"]
-    if function is not states and derivatives is not None:
-        saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, saveat, states)
+    function, saveat = options["saveat"].subs[0].fn, options["saveat"]
+    if function is not _STATES and derivatives is not None:
+        saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, saveat, _STATES)
     if adjoint is None:
         adjoint, saveat = Loop.around(saveat, limit, derivatives)
     options = options | {"adjoint": adjoint, "saveat": saveat}
     solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
-    if function is states or derivatives is None:
+    if function is _STATES or derivatives is None:
         return solution
-    ts, finite = solution.ts[0], jnp.isfinite(solution.ts[0])
+    ys = _of_states(function, solution.ts[0], solution.ys[0], (options["t0"], options["y0"]))
+    return eqx.tree_at(lambda solution: solution.ys[0], solution, ys)
+
+
+def _of_states(function, ts, ys, start):
+    """What a user's function makes of saved states. Entries after the end of a run, whose states are infinite, are
+    infinite, and have no derivatives.
+    """
 
     def saved(t, y, finite):
-        # Entries after the end of a run are infinite, and their derivatives zero.
-        t, y = jax.tree.map(lambda x, x0: jnp.where(finite, x, x0), (t, y), (options["t0"], options["y0"]))
+        t, y = jax.tree.map(lambda x, x0: jnp.where(finite, x, x0), (t, y), start)
         return jax.tree.map(lambda x: jnp.where(finite, x, jnp.asarray(jnp.inf, x.dtype)), function(t, y, None))
 
-    ys = jax.vmap(saved)(ts, solution.ys[0], finite)
-    return eqx.tree_at(lambda solution: solution.ys[0], solution, ys)
+    return jax.vmap(saved)(ts, ys, jnp.isfinite(ts))
 
 
 def _rows(options) -> int:

@@ -32,6 +32,9 @@ _END = 1e-9
 _SHORTER = 1e-2
 # The result of a solve that ends since there is no state after an event.
 NO_STATE: Any = diffrax.RESULTS.internal_error
+# A guard that is as negative as this at the start of a run, of a state that is as exact as its digits, and rises, may
+# take until the end of the step.
+_OVERLAP = 1e-5
 # Where a guard is zero at the start of a step as well, its rise there is looked for down to this power of two.
 _HALVINGS = 30
 
@@ -166,7 +169,9 @@ def _looked(search: _Search, values, rates, start, touch):
     crosses = jnp.any(below)
     search = search._replace(waiting=inside & ~crosses, end=values, rates=rates)
     bracket = search.bracket._replace(of_b=jnp.min(jnp.where(below, values, jnp.inf)))
-    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, count=jnp.array(0))
+    risen = search._replace(
+        phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, count=jnp.array(0)
+    )
     return jax.tree.map(lambda a, b: jnp.where(crosses, a, b), risen, _next_dip(search, start))
 
 
@@ -203,17 +208,22 @@ def _dipped(search: _Search, values, rates, start, touch):
 
 def _risen(search: _Search, values, rates, start, touch):
     """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
-    del rates, start, touch
+    del rates
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
     positive, ends = least > 0, search.count >= _HALVINGS
     before = search.bracket
     found = before._replace(a=search.s, of_a=least, moved=jnp.array(0))
     back = before._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=least)
     bracket = jax.tree.map(lambda found, back: jnp.where(positive, found, back), found, back)
+    # Those that have been negative all the time, and have risen, are not crossed here.
+    overlap = search.looked_at & (values < -touch) & (values >= -_OVERLAP) & (start > 0) & (search.end >= values)
+    eases = ends & ~positive & jnp.all(overlap | ~search.looked_at)
     return search._replace(
         phase=jnp.where(positive, _ZERO, jnp.where(ends, _DONE, _RISE)),
         s=jnp.where(positive, 0.5 * (bracket.a + bracket.b), search.s / 2),
-        bracket=bracket,
+        bracket=bracket._replace(b=jnp.where(eases, 1.0, bracket.b)),
+        end=jnp.where(eases & overlap, jnp.maximum(search.end, 0.0), search.end),
+        dips=search.dips & ~eases,
         count=jnp.where(positive, 0, search.count),
     )
 

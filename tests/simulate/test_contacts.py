@@ -7,11 +7,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 from compiling import jit_quickly
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import planar, spatial, terrain
 from jaxmb.manifold import Projection
 
 G = 9.81
@@ -171,6 +172,90 @@ def test_the_time_of_opening_has_a_derivative():
 
     time, slope = jit_quickly(lambda x: jax.jvp(opens, (x,), (jnp.ones_like(x),)))(jnp.array(G))
     np.testing.assert_allclose(slope, -time / (2 * G), rtol=1e-7)
+
+
+def test_the_time_of_opening_where_forces_balance():
+    """A particle on a floor that is pushed upwards by more and more leaves it when nothing acts on it altogether."""
+    system = mb.Scene(
+        [planar.PointMass("ball", mass=1.0, position=(0.0, 0.0))],
+        joints=[mb.RigidContact("floor", "ball", terrain=terrain.Flat())],
+        forces=[mb.Gravity((0.0, -10.0)), planar.PointForce("push", "ball", force=(0.0, 0.0))],
+    ).compile()
+    state = mb.assemble(system)
+
+    def opens(time):
+        push = {"push.force": lambda t: jnp.stack([0.0 * t, 10.0 * t / time])}
+        motion = mb.simulate(system, state, t1=2.0, inputs=push, rtol=1e-9, max_steps=300, max_events=8)
+        return motion.events.times[0]
+
+    found = jit_quickly(lambda x: jax.jvp(opens, (x,), (jnp.ones_like(x),)))(jnp.array(1.0))
+    np.testing.assert_allclose(found, [1.0, 1.0], rtol=1e-8)
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])
+def test_a_ball_among_pegs(solver):
+    """In one step it comes near to several of them; the one that it hits need not be the nearest at the end."""
+    pegs = [(0.3 * (k - row / 2), -0.3 * row) for row in range(4) for k in range(row + 1)]
+    contacts = [
+        mb.RigidBallContact(f"peg{k}", "ground", "ball", radius_a=0.05, radius_b=0.05, point_a=at, restitution=0.6)
+        for k, at in enumerate(pegs)
+    ]
+    ball = planar.PointMass("ball", mass=1.0, position=(0.0, 0.6))
+    system = mb.Scene([ball], joints=contacts, forces=[mb.Gravity((0.0, -G))]).compile()
+    start = mb.assemble(system)
+    # From the roots of the distances, which are polynomials of degree four of the time.
+    cases = {
+        (-0.07344423617020886, -0.2900834186828825): (1, (-1.7390333603, -1.2669948206)),
+        (0.00697999863446766, 0.2610434542726609): (2, (1.9465855, -1.4138574)),
+    }
+    for (x, v), (number, last) in cases.items():
+        state = dataclasses.replace(start, q=start.q.at[0].set(x), u=start.u.at[0].set(v))
+        motion = mb.simulate(system, state, t1=1.0, rtol=1e-10, solver=solver)
+        assert len(motion.events) == number
+        np.testing.assert_allclose(motion["ball"].position[-1], last, atol=1e-7)
+
+
+def test_events_are_those_until_the_motion_ends():
+    event = diffrax.Event(lambda t, y, args, **_: t - 0.4, optimistix.Newton(1e-10, 1e-10))
+    motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, event=event, rtol=1e-10)
+    np.testing.assert_allclose(motion.ts[-1], 0.4)
+    assert len(motion.events) == 0 and motion.stats["num_events"] == 0
+
+
+def test_impulses_of_contacts_that_stay_closed_are_events():
+    """A ball strikes a block on the floor, which passes the impulse on."""
+    system = mb.Scene(
+        [planar.PointMass("block", mass=3.0, position=(0.0, 0.0)), planar.PointMass("ball", mass=1.0, position=(0, 1))],
+        joints=[
+            mb.RigidContact("floor", "block", terrain=terrain.Flat()),
+            mb.RigidBallContact("hit", "block", "ball", radius_a=0.1, radius_b=0.1, restitution=0.5),
+        ],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system, fix={"floor.mode": 1}), t1=0.6, rtol=1e-10)
+    assert [(event.part, event.kind) for event in motion.events] == [("floor", "impulse"), ("hit", "impact")]
+    expected = 1.5 * np.sqrt(2 * G * 0.8)
+    np.testing.assert_allclose([event.impulse for event in motion.events], expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("gap", [-1e-6, -1e-8, -1e-10])
+def test_a_start_that_overlaps_by_its_last_digits(gap):
+    state = mb.assemble(BALL)
+    for speed in (1.0, -1.0):
+        start = dataclasses.replace(state, q=state.q.at[1].set(gap), u=state.u.at[1].set(speed))
+        motion = mb.simulate(BALL, start, t1=0.05, rtol=1e-8)
+        rebound = 1.0 if speed > 0 else 0.5
+        np.testing.assert_allclose(motion["ball"].velocity[-1, 1], rebound - 0.05 * G, atol=1e-4)
+
+
+def test_numbers_that_do_not_agree_where_they_are_traced():
+    @jax.jit
+    def run(restitution):
+        system = mb.with_parameters(BALL, {"floor.restitution": restitution})
+        return mb.simulate(system, mb.assemble(BALL), t1=0.1).result._value
+
+    assert run(1.0) == mb.RESULTS.successful._value
+    assert run(1.5) == mb.RESULTS.invalid_parameters._value
 
 
 @pytest.mark.parametrize("around", [lambda f: f, jax.jit], ids=["eager", "jit"])

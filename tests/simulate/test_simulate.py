@@ -181,7 +181,7 @@ def test_times_that_are_traced_are_inside_the_interval(rod, end):
     # As the end is computed in another way.
     angles, ended = run(jnp.array([0.5 * end, np.sign(end) * 0.1 * 3]))
     assert ended == mb.RESULTS.successful._value and np.all(np.isfinite(angles))
-    for times in ([0.5, 1.1], [-0.1, 0.5], [0.5, np.nan]):
+    for times in ([0.5, 1.1], [-0.1, 0.5], [0.5, np.nan], [0.9, 0.5]):
         angles, ended = run(end * jnp.array(times))
         assert ended == mb.RESULTS.saved_outside._value and np.all(np.isnan(angles))
 

@@ -69,6 +69,9 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
                 "a larger value would create energy."
             )
 
+    def numbers_agree(self):
+        return self.unloading <= 1
+
     def complete(self, space, poses):
         return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
 

@@ -90,6 +90,9 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         if not self.lower < self.upper:
             raise ValueError(f"{self.label}: lower must be less than upper, got {self.lower} and {self.upper}.")
 
+    def numbers_agree(self):
+        return self.lower < self.upper
+
     def _energy(self, angle):
         depth = ramp(jnp.stack([self.lower - angle, angle - self.upper]), self.smoothing)
         return self.stiffness * jnp.sum(depth ** (self.exponent + 1)) / (self.exponent + 1)
