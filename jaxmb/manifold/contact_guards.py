@@ -60,10 +60,8 @@ class ContactGuards(AbstractGuards):
         modes = modes_of(system, q)
         free = jnp.where(modes[:n] == OPEN, gaps(system, t, q), system.length)
         frictions = contacts_of(system).frictions
-        if frictions is None:
-            acts = modes == CLOSED
-        else:
-            acts = jnp.concatenate([modes[:n] == CLOSED, modes[n:] >= STICK])
+        acts = self.forces(y)
+        if frictions is not None:
             rates = direction_rates(system, t, q, y.u)
             slips, slip = jnp.abs(modes[n:]) == FORWARD, modes[n:] * rates[n:]
             free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
@@ -100,6 +98,10 @@ class ContactGuards(AbstractGuards):
     def impact(self, t: Scalar, y: State, dated: bool = False) -> Impact:
         """The event at a state; see `impact`."""
         return impact(self.system.at(y), self.formulation, self.touch, t, y, dated)
+
+    def forces(self, y):
+        modes, (n, _) = modes_of(self.system, self.system.normalize(y.q)), counts(self.system)
+        return jnp.concatenate([modes[:n] == CLOSED, modes[n:] >= STICK])
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))

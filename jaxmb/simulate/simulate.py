@@ -181,6 +181,9 @@ def simulate(
     of a motion whose events move with the parameters, while their sequence stays: the time of an impact has a
     derivative, its number has none.
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
+    Gaps and forces of contacts are looked at in the middle of each step as well as at its ends. What comes and goes
+    between these is not seen, as a lone bump below a body in free flight: bound the steps there, with
+    `stepsize_controller=jaxmb.solvers.MultistepController(rtol, atol, dtmax=0.01)`.
 
     A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
     step to step, and a force whose strength is zero, as a control at the start of an optimisation, is seen by its

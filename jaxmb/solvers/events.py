@@ -30,6 +30,12 @@ _FRACTION, _EVALUATIONS, _SECANTS = 1e-13, 60, 12
 _END = 1e-9
 # After an event that follows another one at once the next step is this fraction of the last one that was tried.
 _SHORTER = 1e-2
+# In the middle of a step gaps are those of a cubic polynomial, and forces the mean of those at its ends, up to these
+# fractions of them; otherwise it is halved, so many times at most, as they may jump. Where they are not up to a
+# hundredth of that, or a force varies, the next step is at most twice as long, or they could repeat themselves in it.
+_COARSE, _BENT, _HALVED, _NOT_SMOOTH, _VARIES, _GROWTH = 0.25, 0.05, 4, 0.01, 0.4, 2.0
+# Forces that are smaller than this, relative to the largest ones, are compared with it.
+_FAINT = 1e-3
 # The result of a solve that ends since there is no state after an event.
 NO_STATE: Any = diffrax.RESULTS.internal_error
 # A guard that is as negative as this at the start of a run, of a state that is as exact as its digits, and rises, may
@@ -51,8 +57,8 @@ class Crossing(AbstractErrorWithMore):
     **Fields:** the `error` for the controller inside; the `target`: the time of the first zero in the step; one where a
     guard is negative `within` the step, and otherwise zero, since diffrax expects no truth values in an error; the
     `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
-    motion at the start of the step: there was no state after an event, and it gave an infinite one; `touch` and
-    `near` of the guards.
+    motion at the start of the step: there was no state after an event, and it gave an infinite one; how `coarse` the
+    step is for guards that vary in it, more than one where it is too long; `touch` and `near` of the guards.
     """
 
     error: PyTree
@@ -61,6 +67,7 @@ class Crossing(AbstractErrorWithMore):
     lowest: Float[Array, ""]
     falling: Float[Array, ""]
     lost: Float[Array, ""]
+    coarse: Float[Array, ""]
     touch: Float[Array, ""]
     near: Float[Array, ""]
 
@@ -77,9 +84,9 @@ def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
     return eqx.tree_at(lambda y_error: y_error.error, y_error, function(y_error.error), is_leaf=lambda x: x is None)
 
 
-# What the search in a step looks for: whether there is a zero in it, the least value of a guard, a point before the
-# zero at which guards are positive, the zero; nothing more.
-_LOOK, _DIP, _RISE, _ZERO, _DONE = range(5)
+# What the search in a step looks for: a zero at its end or in its middle, forces at its start, where one of them is
+# least, where the rate of a guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
+_LOOK, _HALF, _START, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(8)
 
 
 class Bracket(NamedTuple):
@@ -98,8 +105,8 @@ class _Search(NamedTuple):
     """The search for the first zero in a step, whose times are fractions of it.
 
     **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
-    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step; whether one is
-    negative in its middle; the number of evaluations in this `phase`.
+    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, and guards at its
+    `middle`; whether one is negative within it, and how `coarse` it is; the number of evaluations in this `phase`.
     """
 
     phase: Any
@@ -109,7 +116,9 @@ class _Search(NamedTuple):
     waiting: Any
     end: Any
     rates: Any
+    middle: Any
     dips: Any
+    coarse: Any
     count: Any
 
 
@@ -124,6 +133,7 @@ def crossing(
     (t0, t1), (y0, y1) = step, ends
     sign = jnp.asarray(direction, t0.dtype)
     start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
+    known = _Known(start, guards.forces(y0), (t1 - t0).astype(start.dtype), guards.touch)
 
     def advance(search):
         # One evaluation for all that is looked for, so that the guards are compiled once.
@@ -132,56 +142,120 @@ def crossing(
         values, rates = guards.values(t * sign, y), guards.rates(t * sign, y) * sign.astype(start.dtype)
         out = lax.switch(
             search.phase,
-            [_looked, _dipped, _risen, _zero_found],
+            [_looked, _halved, _started, _least_found, _dipped, _risen, _zero_found],
             search._replace(count=search.count + 1),
             values,
             rates,
-            start,
-            guards.touch,
+            known,
         )
         return out
 
     none, one = jnp.zeros_like(start), jnp.ones((), t0.dtype)
-    zero = jnp.zeros((), start.dtype)
-    first = _Search(
-        jnp.array(_LOOK),
-        one,
-        Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0)),
-        none > 0,
-        none > 0,
-        none,
-        none,
-        jnp.array(False),
-        jnp.array(0),
-    )
+    zero, no = jnp.zeros((), start.dtype), jnp.array(False)
+    bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
+    first = _Search(jnp.array(_LOOK), one, bracket, none > 0, none > 0, none, none, none, no, zero, jnp.array(0))
     found = lax.while_loop(lambda search: search.phase != _DONE, advance, first)
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
-    within, falling, lost = (x.astype(start.dtype) for x in (found.dips, falling, lost))
+    falling, lost, within = (x.astype(start.dtype) for x in (falling, lost, found.dips))
     touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
-    return Crossing(error, t0 + found.bracket.b * (t1 - t0), within, jnp.min(found.end), falling, lost, touch, near)
+    target = t0 + found.bracket.b * (t1 - t0)
+    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near)
 
 
-def _looked(search: _Search, values, rates, start, touch):
+class _Known(NamedTuple):
+    """What a search knows of a step: the rates of guards at its start, which of them are forces, its length, and what
+    counts as zero.
+    """
+
+    start: Any
+    forces: Any
+    length: Any
+    touch: Any
+
+
+def _looked(search: _Search, values, rates, known):
     """At the end of a step: guards that are negative, and those whose rate has changed its sign."""
-    below = values < -touch
-    inside = (start < 0) & (rates > 0) & jnp.isfinite(start) & ~below
+    below = values < -known.touch
+    inside = (known.start < 0) & (rates > 0) & jnp.isfinite(known.start) & ~below
     crosses = jnp.any(below)
-    search = search._replace(waiting=inside & ~crosses, end=values, rates=rates)
-    bracket = search.bracket._replace(of_b=jnp.min(jnp.where(below, values, jnp.inf)))
-    risen = search._replace(
-        phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, count=jnp.array(0)
+    return search._replace(
+        phase=jnp.where(crosses, _RISE, _HALF),
+        s=search.s / 2,
+        bracket=search.bracket._replace(of_b=jnp.min(jnp.where(below, values, jnp.inf))),
+        looked_at=below,
+        waiting=inside & ~crosses,
+        end=values,
+        rates=rates,
+        count=jnp.zeros_like(search.count),
     )
-    return jax.tree.map(lambda a, b: jnp.where(crosses, a, b), risen, _next_dip(search, start))
 
 
-def _next_dip(search: _Search, start):
+def _halved(search: _Search, values, rates, known):
+    """At the middle: guards that are negative there, and those whose rate is another than that of a cubic polynomial
+    with what is known of them at both ends and their value here.
+    """
+    below = values < -known.touch
+    dips = jnp.any(below)
+    watched = jnp.isfinite(known.start) & jnp.isfinite(search.rates)
+    at_start, at_end = known.length * known.start, known.length * search.rates
+    cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
+    expected = at_start + 0.5 * (at_end - at_start - 3 * cubic) + 0.75 * cubic
+    off = jnp.abs(expected - known.length * rates)
+    size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), known.touch)
+    coarse = jnp.max(jnp.where(watched, off / (_COARSE * size), 0.0), initial=0.0)
+    search = search._replace(coarse=jnp.where(dips, 0.0, coarse), middle=values)
+    bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
+    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
+    ends = search._replace(phase=jnp.array(_DONE))
+    starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
+    acts = jnp.any(known.forces)
+    other = _chosen(coarse > 1, ends, _chosen(acts, starts, _next_dip(search, known)))
+    return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
+
+
+def _started(search: _Search, values, rates, known):
+    """At the start: forces that vary by more than a parabola shows, and those that it shows to be next to zero."""
+    del rates
+    first, middle, last = values, search.middle, search.end
+    bent, sloped = 2 * (first + last - 2 * middle), 4 * middle - 3 * first - last
+    least_at = jnp.where(bent > 0, -sloped / jnp.where(bent > 0, 2 * bent, 1.0), 0.0)
+    inside = known.forces & (least_at > 0) & (least_at < 1)
+    least = jnp.where(inside, first + 0.5 * sloped * least_at, jnp.inf)
+    own = jnp.argmin(least)
+    varies = jnp.maximum(jnp.abs(first - middle), jnp.abs(last - middle))
+    size = jnp.maximum(jnp.max(jnp.abs(jnp.stack([first, middle, last])), axis=0), _FAINT)
+    off = jnp.maximum(0.25 * jnp.abs(bent) / _BENT, _VARIES * varies) / size
+    search = search._replace(coarse=jnp.maximum(search.coarse, jnp.max(jnp.where(known.forces, off, 0.0), initial=0.0)))
+    coarse, ends = search.coarse > 1, search._replace(phase=jnp.array(_DONE))
+    looks = search._replace(
+        phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
+    )
+    other = _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
+    return _chosen(coarse, ends, other)._replace(count=jnp.zeros_like(search.count))
+
+
+def _least_found(search: _Search, values, rates, known):
+    """Where a force is about the least of the step."""
+    del rates
+    below = values < -known.touch
+    dips = jnp.any(below)
+    bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
+    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
+    return _chosen(dips, risen, _next_dip(search, known))._replace(count=jnp.zeros_like(search.count))
+
+
+def _chosen(condition, one: _Search, other: _Search) -> _Search:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+
+
+def _next_dip(search: _Search, known):
     """Before the search for the zero of the rate of the next guard that waits for it, of several the one that is least
     at the end of the step; the search is done where none does.
     """
     least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
-    own, one = jnp.arange(start.size) == least, jnp.ones_like(search.s)
-    bracket = Bracket(jnp.zeros_like(one), one, start[least], search.rates[least], jnp.array(0))
+    own, one = jnp.arange(known.start.size) == least, jnp.ones_like(search.s)
+    bracket = Bracket(jnp.zeros_like(one), one, known.start[least], search.rates[least], jnp.array(0))
     return search._replace(
         phase=jnp.where(jnp.any(search.waiting), _DIP, _DONE),
         s=0.5 * one,
@@ -192,21 +266,20 @@ def _next_dip(search: _Search, start):
     )
 
 
-def _dipped(search: _Search, values, rates, start, touch):
+def _dipped(search: _Search, values, rates, known):
     """Towards the zero of a guard's rate, where it is least."""
     own = jnp.argmax(search.looked_at)
     again = _narrowed(search, rates[own])
     ends = _is_short(again)
-    dips = ends & (values[own] < -touch)
+    dips = ends & (values[own] < -known.touch)
     bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s)
     risen = again._replace(
         phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, dips=jnp.array(True), count=jnp.array(0)
     )
-    chosen = jax.tree.map(lambda a, b: jnp.where(ends, a, b), _next_dip(search, start), again)
-    return jax.tree.map(lambda a, b: jnp.where(dips, a, b), risen, chosen)
+    return _chosen(dips, risen, _chosen(ends, _next_dip(search, known), again))
 
 
-def _risen(search: _Search, values, rates, start, touch):
+def _risen(search: _Search, values, rates, known):
     """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
     del rates
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
@@ -216,7 +289,8 @@ def _risen(search: _Search, values, rates, start, touch):
     back = before._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=least)
     bracket = jax.tree.map(lambda found, back: jnp.where(positive, found, back), found, back)
     # Those that have been negative all the time, and have risen, are not crossed here.
-    overlap = search.looked_at & (values < -touch) & (values >= -_OVERLAP) & (start > 0) & (search.end >= values)
+    overlap = search.looked_at & (values < -known.touch) & (values >= -_OVERLAP)
+    overlap = overlap & (known.start > 0) & (search.end >= values)
     eases = ends & ~positive & jnp.all(overlap | ~search.looked_at)
     return search._replace(
         phase=jnp.where(positive, _ZERO, jnp.where(ends, _DONE, _RISE)),
@@ -228,9 +302,9 @@ def _risen(search: _Search, values, rates, start, touch):
     )
 
 
-def _zero_found(search: _Search, values, rates, start, touch):
+def _zero_found(search: _Search, values, rates, known):
     """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
-    del rates, start, touch
+    del rates, known
     again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
     return again._replace(phase=jnp.where(_is_short(again), _DONE, _ZERO))
 
@@ -272,7 +346,7 @@ class EventState(AbstractControllerState):
 
     **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
     `length` that it had before it was made to end there; the `count` of events, their `times` and the raveled `states`
-    before them, in buffers; `touch` of the guards.
+    before them, in buffers; `touch` of the guards; how many times in a row a step was `halved`.
     """
 
     inner: Any
@@ -282,6 +356,7 @@ class EventState(AbstractControllerState):
     times: Float[Array, " events"]
     states: Float[Array, "events n"]
     touch: Float[Array, ""]
+    halved: Any
 
     @property
     def intended(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -325,7 +400,7 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
         touch = jnp.zeros((), flat.dtype)
         none = jnp.asarray(jnp.inf, t0.dtype), jnp.zeros((), t0.dtype), jnp.array(0)
-        return first, EventState(inner, *none, times, states, touch)
+        return first, EventState(inner, *none, times, states, touch, jnp.array(0))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         before, found = controller_state, y_error
@@ -338,15 +413,19 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
         at_zero = at_zero | (close & (found.lowest < -found.touch))
         crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
-        again, ends = keep & crossed, keep & at_zero & ~crossed
+        coarse = (found.coarse > 1) & (before.halved < _HALVED) & ~(crossed | at_zero)
+        again, ends = keep & (crossed | coarse), keep & at_zero & ~crossed
         # The controller inside does not learn of a step that was good but too long, nor of one without a length, where
         # one event follows another at once.
         empty = t1 <= t0
         inner = jax.tree.map(lambda new, old: jnp.where(again | empty, old, new), inner, before.inner)
-        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, found.target, next_t1)
+        shorter = jnp.where(crossed, found.target, t0 + 0.5 * (t1 - t0))
+        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, shorter, next_t1)
+        growing = jnp.where(keep & ~again & (found.coarse > _NOT_SMOOTH), t1 + _GROWTH * (t1 - t0), jnp.inf)
+        next_t1 = jnp.minimum(next_t1, growing)
         length = jnp.where(jnp.isinf(before.target), t1 - t0, before.length)
         next_t1 = jnp.where(empty & ~again, t1 + _SHORTER * length, next_t1)
-        target = jnp.where(again, found.target, jnp.inf)
+        target = jnp.where(keep & crossed, found.target, jnp.inf)
         place = jnp.where(ends, jnp.minimum(before.count, self.most), self.most)
         state = EventState(
             inner,
@@ -356,12 +435,13 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),
             found.touch,
+            jnp.where(keep & coarse, before.halved + 1, 0),
         )
         full = ends & (before.count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
         lost = found.lost > 0
         result = diffrax.RESULTS.where(lost, NO_STATE, result)
-        return keep & ~crossed & ~lost, next_t0, next_t1, made_jump | ends, state, result
+        return keep & ~crossed & ~coarse & ~lost, next_t0, next_t1, made_jump | ends, state, result
 
 
 def events_found(controller_state: Any) -> EventState | None:

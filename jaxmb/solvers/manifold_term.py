@@ -96,6 +96,10 @@ class AbstractGuards(eqx.Module):
         passed in one direction only; infinite for others.
         """
 
+    @abc.abstractmethod
+    def forces(self, y: PyTree[Array]) -> Bool[Array, "guards"]:
+        """Which guards are forces, of the size of one at most: the motion does not show how they vary in a step."""
+
 
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     """A vector field on a manifold, with a chart that says which components of the state are independent.

@@ -215,6 +215,33 @@ def test_a_ball_among_pegs(solver):
         np.testing.assert_allclose(motion["ball"].position[-1], last, atol=1e-7)
 
 
+def test_a_stop_that_vibrates():
+    """Nothing of the motion towards it asks for short steps."""
+    body = planar.Body("body", mass=2.0, inertia=0.1, velocity=(1.0, 0.0))
+    slide = planar.Prismatic("slide", "ground", "body", point=(0.0, 0.0), axis=(1.0, 0.0))
+    stop = mb.Stop("stop", "slide.displacement", upper=2.0, restitution=0.5)
+    system = mb.Scene([body], joints=[slide, stop]).compile()
+    place = lambda t: 2.0 + 0.2 * np.sin(20.0 * t)
+    # The motion up to there is uniform.
+    fine = np.linspace(1.5, 2.5, 100_001)
+    first = fine[np.argmax(fine > place(fine))]
+    inputs = {"stop.upper": lambda t: 2.0 + 0.2 * jnp.sin(20.0 * t)}
+    motion = mb.simulate(system, mb.assemble(system), t1=2.1, inputs=inputs)
+    np.testing.assert_allclose(motion.events.times[0], first, atol=1e-5)
+
+
+def test_a_particle_at_rest_lifts_off_when_it_is_pulled():
+    """Where everything rests no error estimate asks for short steps, and the pull is over at the end of a long one."""
+    system = mb.Scene(
+        [planar.PointMass("ball", mass=1.0, position=(0.0, 0.0))],
+        joints=[mb.RigidContact("floor", "ball", terrain=terrain.Flat(), restitution=0.5)],
+        forces=[mb.Gravity((0.0, -10.0)), planar.PointForce("pull", "ball", force=(0.0, 0.0))],
+    ).compile()
+    inputs = {"pull.force": lambda t: jnp.stack([0.0 * t, 15.0 * jnp.sin(2 * jnp.pi * t)])}
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0, inputs=inputs)
+    np.testing.assert_allclose(motion.events.times[0], np.arcsin(2 / 3) / (2 * np.pi), rtol=1e-8)
+
+
 def test_events_are_those_until_the_motion_ends():
     event = diffrax.Event(lambda t, y, args, **_: t - 0.4, optimistix.Newton(1e-10, 1e-10))
     motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, event=event, rtol=1e-10)

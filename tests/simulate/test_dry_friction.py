@@ -31,6 +31,25 @@ def slider(angle=0.0, velocity=3.0, **coefficients):
     ).compile()
 
 
+@pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])
+def test_a_block_that_is_pushed_to_and_fro_slips_at_each_peak(solver):
+    """While it sticks nothing moves, so that no error estimate asks for short steps."""
+    rail = planar.Prismatic("rail", "ground", "block", axis=(1.0, 0.0), point=(0.0, 0.0))
+    push = mb.JointForce("push", "rail.displacement", force=0.0)
+    system = mb.Scene(
+        [planar.Body("block", mass=1.0, inertia=0.1)],
+        joints=[rail],
+        forces=[mb.Gravity((0.0, -10.0)), mb.DryFriction("rub", "rail", coefficient=0.5), push],
+    ).compile()
+    inputs = {"push.force": lambda t: 5.2 * jnp.sin(2 * jnp.pi * t)}
+    motion = mb.simulate(system, mb.assemble(system), t1=3.0, inputs=inputs, solver=solver)
+    slips = np.array([event.time for event in motion.events if event.kind == "slip"])
+    np.testing.assert_allclose(slips, np.arcsin(5.0 / 5.2) / (2 * np.pi) + 0.5 * np.arange(6), rtol=1e-8)
+    assert [event.kind for event in motion.events] == 6 * ["slip", "stick"]
+    # It comes back where it was.
+    np.testing.assert_allclose(motion["block"].position[-1, 0], 0.0, atol=1e-8)
+
+
 @pytest.mark.always
 def test_a_block_slides_stops_and_stays():
     system = slider(coefficient=0.3)
