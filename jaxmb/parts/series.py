@@ -31,7 +31,11 @@ class AbstractSignal(eqx.Module):
 
     @abc.abstractmethod
     def check_interval(self, label: str, t0: Scalar, t1: Scalar) -> None:
-        """Raise a `ValueError` if the value is not known from `t0` to `t1`."""
+        """Raise a `ValueError` if the value is not known from `t0` to `t1`, unless these are traced."""
+
+    @abc.abstractmethod
+    def is_known(self, t0: Scalar, t1: Scalar) -> Any:
+        """Whether the value is known from `t0` to `t1`, up to rounding errors."""
 
     @property
     @abc.abstractmethod
@@ -134,6 +138,11 @@ class Series(AbstractSignal):
                 f"{float(t1):g} s; give a longer series or a shorter motion."
             )
 
+    def is_known(self, t0, t1):
+        first, last = jnp.minimum(t0, t1), jnp.maximum(t0, t1)
+        rounding = 8 * jnp.finfo(self.ts.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
+        return (first >= self.ts[0] - rounding) & (last <= self.ts[-1] + rounding)
+
     @property
     def continuous(self):
         return self.interpolation != "held"
@@ -159,6 +168,9 @@ class Signal(AbstractSignal):
 
     def check_interval(self, label, t0, t1):
         pass
+
+    def is_known(self, t0, t1):
+        return True
 
     @property
     def continuous(self):

@@ -61,7 +61,7 @@ def _at_moving_times_jvp(primals, tangents):
         first = jnp.argmax(finite)
         # Entries after the end of a run have no field.
         inside = jax.tree.map(lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, x[first]), (ts, ys))
-        new = jax.vmap(lambda t, y, move: _series(term, lax.stop_gradient(t), y, move))(*inside, moves)
+        new = jax.vmap(lambda t, y, move: _series(term, lax.stop_gradient(t), y, move))(inside[0], inside[1], moves)
         return jax.tree.map(lambda x, y: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, ys)
 
     return eqx.filter_jvp(moved, primals, tangents)

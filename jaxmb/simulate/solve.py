@@ -182,9 +182,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         options["made_jump"] = jnp.array(True)
     given = start
     if problem.moving[0]:
-        if system.contacts is not None:
+        guards = contact_guards(system, problem.method, newton_tolerance(None, problem.rtol))
+        if guards is not None:
             # The field is that of the contacts that close or open, and of the friction that slips, at the start.
-            guards = contact_guards(system, problem.method, newton_tolerance(None, problem.rtol))
             start = guards.impact(times["t0"], start).after
         options["y0"] = start = at_frozen_start(term, times["t0"], start)
     at_once, saved_at = lambda times: jnp.where(finite, times, options["t0"]), lax.stop_gradient(first.ts)
@@ -261,6 +261,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
     if lost is not None:
         result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
+    if problem.traced:
+        for signal, _ in system.signals.values():
+            known = signal.is_known(times["t0"], times["t1"])
+            result = RESULTS.where(known | has_failed(result), result, RESULTS.input_ended)
     if outside is not False:
         result = RESULTS.where(outside & ~has_failed(result), RESULTS.saved_outside, result)
     stats = dict(solution.stats) | {"max_steps": problem.limit}

@@ -207,10 +207,8 @@ def _halved(search: _Search, values, rates, known):
     search = search._replace(coarse=jnp.where(dips, 0.0, coarse), middle=values)
     bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
     risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
-    ends = search._replace(phase=jnp.array(_DONE))
     starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
-    acts = jnp.any(known.forces)
-    other = _chosen(coarse > 1, ends, _chosen(acts, starts, _next_dip(search, known)))
+    other = _chosen(jnp.any(known.forces), starts, _next_dip(search, known))
     return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
 
 
@@ -227,12 +225,11 @@ def _started(search: _Search, values, rates, known):
     size = jnp.maximum(jnp.max(jnp.abs(jnp.stack([first, middle, last])), axis=0), _FAINT)
     off = jnp.maximum(0.25 * jnp.abs(bent) / _BENT, _VARIES * varies) / size
     search = search._replace(coarse=jnp.maximum(search.coarse, jnp.max(jnp.where(known.forces, off, 0.0), initial=0.0)))
-    coarse, ends = search.coarse > 1, search._replace(phase=jnp.array(_DONE))
     looks = search._replace(
         phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
     )
-    other = _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
-    return _chosen(coarse, ends, other)._replace(count=jnp.zeros_like(search.count))
+    found = _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
+    return found._replace(count=jnp.zeros_like(search.count))
 
 
 def _least_found(search: _Search, values, rates, known):

@@ -89,6 +89,16 @@ def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
     np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-7)
 
 
+def test_a_series_that_is_shorter_than_a_motion_whose_end_is_traced(pendulum):
+    @jax.jit
+    def ended(t1):
+        inputs = {"motor.torque": mb.Series(TS, TORQUES)}
+        return mb.simulate(pendulum, pendulum.guess, t1=t1, inputs=inputs).result._value
+
+    assert ended(TS[-1]) == mb.RESULTS.successful._value
+    assert ended(1.1 * TS[-1]) == mb.RESULTS.input_ended._value
+
+
 def test_a_driver_that_is_a_series_moves_with_its_rates(pendulum):
     rod = planar.Body("rod", mass=MASS, inertia=planar.rod(MASS, LENGTH), position=(LENGTH / 2, 0.0))
     drive = planar.Driver(
