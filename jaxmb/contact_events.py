@@ -17,6 +17,9 @@ from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
 
+# Impulses of contacts that are this small beside another one at the same time are none.
+_ROUNDING = 1e-12
+
 
 class FoundEvents(NamedTuple):
     """What a run notes of its events: their `number`, and buffers with the `times` of the ends of steps at which they
@@ -124,6 +127,10 @@ class ContactEvents(eqx.Module):
         )
         rows = []
         for k in np.flatnonzero(np.isfinite(times)):
+            of_contacts = impulses[k, : self.contacts]
+            strikes = np.any(of_contacts[before[k, : self.contacts] == OPEN] > 0)
+            # Contacts that stay closed may have impulses of rounding errors.
+            least = _ROUNDING * np.max(of_contacts, initial=0.0) if strikes else np.inf
             for i, name in enumerate(self.names):
                 if i >= self.contacts:
                     if self.names.index(name) < i:
@@ -139,7 +146,7 @@ class ContactEvents(eqx.Module):
                     continue
                 was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
                 impulse = float(impulses[k, i])
-                struck = impulse > 0
+                struck = impulse > (0.0 if was_open else least)
                 kind = "close" if was_open and not is_open else "open" if is_open and not was_open else "impact"
                 kind = "impulse" if struck and not (was_open or is_open) else kind
                 if struck or was_open != is_open:
