@@ -195,8 +195,7 @@ def _halved(search: _Search, values, rates, known):
     """At the middle: guards that are negative there, and those whose rate is another than that of a cubic polynomial
     with what is known of them at both ends and their value here.
     """
-    below = values < -known.touch
-    dips = jnp.any(below)
+    dips, risen = _negative_within(search, values, known)
     watched = jnp.isfinite(known.start) & jnp.isfinite(search.rates)
     at_start, at_end = known.length * known.start, known.length * search.rates
     cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
@@ -204,9 +203,7 @@ def _halved(search: _Search, values, rates, known):
     off = jnp.abs(expected - known.length * rates)
     size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), known.touch)
     coarse = jnp.max(jnp.where(watched, off / (_COARSE * size), 0.0), initial=0.0)
-    search = search._replace(coarse=jnp.where(dips, 0.0, coarse), middle=values)
-    bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
-    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
+    search = search._replace(coarse=coarse, middle=values)
     starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
     other = _chosen(jnp.any(known.forces), starts, _next_dip(search, known))
     return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
@@ -235,11 +232,16 @@ def _started(search: _Search, values, rates, known):
 def _least_found(search: _Search, values, rates, known):
     """Where a force is about the least of the step."""
     del rates
-    below = values < -known.touch
-    dips = jnp.any(below)
-    bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
-    risen = search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
+    dips, risen = _negative_within(search, values, known)
     return _chosen(dips, risen, _next_dip(search, known))._replace(count=jnp.zeros_like(search.count))
+
+
+def _negative_within(search: _Search, values, known):
+    """Whether guards are negative at a point within the step, and the search back from there if they are."""
+    below = values < -known.touch
+    bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
+    dips = jnp.any(below)
+    return dips, search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
 
 
 def _chosen(condition, one: _Search, other: _Search) -> _Search:

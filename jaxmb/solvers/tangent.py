@@ -43,7 +43,7 @@ class TangentControl(eqx.Module):
     - `direction`: a tangent of the term, None where derivatives by its numbers are not taken. The tangent of the state
         that it causes is carried along.
     - `excites`: whether the tangent from a start that excites every mode is, beside that.
-    - `restored`: the starts, where constraints have to be returned to; None for those that excite every mode.
+    - `restored`: the starts on constraints (`on_constraints`); None where those of `starts` need not be on any.
     """
 
     units: Float[Array, " n"]
