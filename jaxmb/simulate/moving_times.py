@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..linalg.arrays import is_traced
+from ..solvers import twice_differentiable
 
 _FROZEN = contextvars.ContextVar("frozen", default=False)
 
@@ -68,6 +69,7 @@ def _at_moving_times_jvp(primals, tangents):
 
 
 def _series(term, t, y, step):
+    step = twice_differentiable(step)
     field = lambda t, y: term.vf(t, y, None)
     first, second = jax.jvp(field, (t, y), (jnp.ones_like(t), field(t, y)))
     return jax.tree.map(lambda y, f, g: y + step.astype(y.dtype) * (f + step.astype(y.dtype) / 2 * g), y, first, second)

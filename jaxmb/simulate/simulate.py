@@ -171,9 +171,9 @@ def simulate(
     Derivatives are taken on the mesh of the run, which is integrated once: steps are linear maps of tangents, and all
     modes are the same numbers. `Adams` linearises the equations once a step, at its end: that is a discretisation of
     the tangent equation of the same order as the method. Other solvers are differentiated as they step. Both converge
-    with the tolerance to the true derivatives. Times have first and second derivatives as well: `t0`, `t1`, saved
-    times, that of an event, and, with `Adams`, those of `jumps`. Second derivatives are those of first ones in forward
-    mode (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
+    with the tolerance to the true derivatives. Times have first and second derivatives as well, and no third ones:
+    `t0`, `t1`, saved times, that of an event, and, with `Adams`, those of `jumps`. Second derivatives are those of
+    first ones in forward mode (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
 
     Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open, and `DryFriction` sticks and slips, at events, at
     which a step ends: `Trajectory.events` lists them. An event is found to a thousandth of `rtol`, relative to the size

@@ -36,4 +36,5 @@ from .one_step import with_tangents as with_tangents
 from .order import StepEstimate as StepEstimate, choose_order as choose_order
 from .scales import Block as Block, RunningScales as RunningScales
 from .tangent import Tangent as Tangent, TangentControl as TangentControl
+from .times import twice_differentiable as twice_differentiable
 from .tolerances import Tolerances as Tolerances

@@ -29,6 +29,7 @@ from .evaluation import (
     unravel_like,
 )
 from .steps import AbstractSteps, LinearStep
+from .times import twice_differentiable
 
 
 class Coefficients(eqx.Module):
@@ -218,7 +219,7 @@ def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
         else:
             # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
             time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
-            late = time - lax.stop_gradient(time)
+            late = twice_differentiable(time - lax.stop_gradient(time))
             field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
             flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
             at = jump.time + late

@@ -108,3 +108,10 @@ def test_the_start_of_a_block_that_slips():
     slowing = 0.3 * 9.81 - 1.0
     found = jit_quickly(jax.jacfwd(end))(START)
     np.testing.assert_allclose(found, [slowing * (1.0 - START) - 3.0, slowing], rtol=1e-8)
+
+
+def test_a_third_derivative_by_times_is_refused(pendulum):
+    """States move with their times by two terms of a series, whose third derivative would be zero."""
+    angle = lambda end: saved(pendulum, START, end, None).ys.q[-1, 2]
+    with pytest.raises(ValueError, match="third derivative by times"):
+        jax.jit(jax.jacfwd(jax.hessian(angle))).trace(0.9)

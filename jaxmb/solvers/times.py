@@ -1,0 +1,41 @@
+"""How often results are differentiated by a time."""
+
+import jax
+
+NO_THIRD_DERIVATIVES = (
+    "A third derivative by times of a run was asked for, by `t0`, `t1`, saved times or those of `jumps`, which have "
+    "first and second ones. A first one is in closed form: velocities and `Trajectory.accelerations`."
+)
+
+
+@jax.custom_jvp
+def twice_differentiable(time):
+    """A time, whose third derivatives raise a `ValueError`."""
+    return time
+
+
+# The slope of a number is one, and that slope's is zero, which is not differentiated. (In terms of the number, so that
+# they are batches where it is one.)
+@jax.custom_jvp
+def _slope(x):
+    return 1.0 + _curvature(x)
+
+
+@jax.custom_jvp
+def _curvature(x):
+    return 0.0 * x
+
+
+@twice_differentiable.defjvp
+def _number_jvp(primals, tangents):
+    return primals[0], tangents[0] * _slope(primals[0])
+
+
+@_slope.defjvp
+def _slope_jvp(primals, tangents):
+    return _slope(primals[0]), tangents[0] * _curvature(primals[0])
+
+
+@_curvature.defjvp
+def _curvature_jvp(primals, tangents):
+    raise ValueError(NO_THIRD_DERIVATIVES)
