@@ -6,6 +6,7 @@ known: nothing is solved, and little of a step is stored. This is the same metho
 the mesh of the motion; it differs from the derivative of the step by less than the local error of the tangent.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from .evaluation import (
     at_solution,
     chart_after_jump,
     field_of,
+    guards_of,
     kept_of_chart,
     next_chart,
     ravel,
@@ -130,7 +132,8 @@ class AdamsSteps(AbstractSteps):
             first = start(before.tprev, new.history.differences[0], before.tnext - before.tprev)
             of_start = first.mesh, jnp.ones_like(order), first.known
             mesh, order, known = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, known))
-            jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), old.history.differences[0], old.chart)
+            last = jnp.where(old.history.known > 0, old.history.mesh[0], before.tprev)
+            jump = Jump(made, last, before.tprev, ravel(before.y), old.history.differences[0], old.chart)
         kept = kept_of_chart(terms, new.chart)
         return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
 
@@ -211,34 +214,55 @@ class AdamsSteps(AbstractSteps):
 
 def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
     """The tangents after a jump, where there was one."""
+    guards = guards_of(of(moved.terms)[0])
 
-    def restart(moved, flat, f):
-        terms, args, _ = of(moved.terms)
-        if moved.jumps is None:
-            late = at = None
-        else:
-            # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
-            time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
-            late = twice_differentiable(time - lax.stop_gradient(time))
-            field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
-            flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
-            at = jump.time + late
-        y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
-        chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
-        field = field_of(terms, jump.time, y, chart, args)
-        if late is None:
-            (flat, f), _ = field(jump.time, ravel(y))
-        else:
-            (flat, f), _ = field(at, ravel(y))
-            flat = _moved_on(lambda t, y: field(t, y)[0][1], at, flat, f, -late)
-            (flat, f), _ = field(jump.time, flat)
-        return flat, jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
+    def tangents(at_jump):
+        restart = functools.partial(_restart, of, like, jump, at_jump)
+        return jax.jvp(restart, (moved, jump.y, jump.f), (dmoved, w, memory[0]))[1]
 
     def restarted():
-        _, new = jax.jvp(restart, (moved, jump.y, jump.f), (dmoved, w, memory[0]))
+        if moved.jumps is None or guards is None:
+            new = tangents(moved.jumps is not None)
+        else:
+            # A run starts, and goes on after an impact, at a time that is none of the jumps, and at the start there is
+            # nothing before it.
+            is_jump = any_of_batch(_is_jump(moved.jumps, jump))
+            new = lax.cond(is_jump, lambda: tangents(True), lambda: tangents(False))
         return jax.tree.map(lambda new, old: jnp.where(jump.made, new, old), new, (w, memory))
 
     return lax.cond(any_of_batch(jump.made), restarted, lambda: (w, memory))
+
+
+def _restart(of, like, jump, at_jump, moved, flat, f):
+    """The state after a restart and the memory there, from the state and the field before it; `at_jump`: whether it may
+    be at a jump whose time has derivatives.
+    """
+    terms, args, _ = of(moved.terms)
+    if not at_jump:
+        late = at = None
+    else:
+        # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
+        time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
+        late = twice_differentiable(time - lax.stop_gradient(time))
+        late = jnp.where(_is_jump(lax.stop_gradient(moved.jumps), jump), late, 0.0)
+        field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
+        flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
+        at = jump.time + late
+    y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
+    chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
+    field = field_of(terms, jump.time, y, chart, args)
+    if late is None:
+        (flat, f), _ = field(jump.time, ravel(y))
+    else:
+        (flat, f), _ = field(at, ravel(y))
+        flat = _moved_on(lambda t, y: field(t, y)[0][1], at, flat, f, -late)
+        (flat, f), _ = field(jump.time, flat)
+    return flat, jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
+
+
+def _is_jump(jumps, jump):
+    """Whether a restart is at one of the times of jumps."""
+    return jnp.any((jump.before <= jumps) & (jumps <= jump.time)) & (jump.before < jump.time)
 
 
 def _moved_on(field, t, flat, f, time):

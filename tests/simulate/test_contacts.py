@@ -192,6 +192,26 @@ def test_the_time_of_opening_where_forces_balance():
     np.testing.assert_allclose(found, [1.0, 1.0], rtol=1e-8)
 
 
+def test_the_time_of_a_jump_beside_a_contact():
+    """Neither the start of the run nor an impact is a jump: the ball bounces, and a pull sets in later."""
+    system = mb.Scene(
+        [planar.PointMass("ball", mass=1.0, position=(0.0, 0.2))],
+        joints=[mb.RigidContact("floor", "ball", terrain=terrain.Flat(), restitution=0.5)],
+        forces=[mb.Gravity((0.0, -10.0)), planar.PointForce("pull", "ball", force=(0.0, 0.0))],
+    ).compile()
+    state = mb.assemble(system)
+
+    def height(time):
+        pull = {"pull.force": lambda t: jnp.where(t < time, 0.0, 1.0) * jnp.array([0.0, 4.0])}
+        motion = mb.simulate(system, state, t1=0.38, inputs=pull, jumps=time[None], rtol=1e-10, max_events=8)
+        return motion["ball"].position[-1, 1]
+
+    # The impact is at 0.2 s, with 1 m/s after it.
+    found, slope = jit_quickly(jax.value_and_grad(height))(jnp.array(0.3))
+    np.testing.assert_allclose(found, 0.18 - 5.0 * 0.18**2 + 2.0 * 0.08**2, rtol=1e-9)
+    np.testing.assert_allclose(slope, -4.0 * 0.08, rtol=1e-8)
+
+
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])
 def test_a_ball_among_pegs(solver):
     """In one step it comes near to several of them; the one that it hits need not be the nearest at the end."""
