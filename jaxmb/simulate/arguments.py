@@ -202,10 +202,11 @@ def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
     """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
     first = saveat.subs[0]
-    if first.ts is None or first.ts.shape[0] == 0:
+    if first.ts is None or first.ts.shape[0] == 0 or start == end:
+        # In no time at all every time would be saved.
         return saveat
     more = max(_FEWEST_TIMES, 2 ** math.ceil(math.log2(first.ts.shape[0]))) - first.ts.shape[0]
-    never = np.full(more, np.inf if end >= start else -np.inf, first.ts.dtype)
+    never = np.full(more, np.inf if end > start else -np.inf, first.ts.dtype)
     times = np.concatenate([np.asarray(first.ts), never])
     return eqx.tree_at(lambda saveat: saveat.subs[0].ts, saveat, times)
 

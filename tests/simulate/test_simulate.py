@@ -374,3 +374,9 @@ def test_moment_of_a_blade_is_about_its_point():
     reaction = sol.reactions[name]
     assert float(jnp.max(jnp.abs(reaction.force))) > 0.1
     np.testing.assert_allclose(reaction.moment, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_no_time_at_all(rod, count):
+    motion = mb.simulate(rod, mb.assemble(rod), t0=1.0, t1=1.0, saveat=np.ones(count))
+    np.testing.assert_array_equal(motion.ts, np.ones(count))

@@ -293,11 +293,26 @@ def channels_of(
         levels[name] = deviation is not None or f"{name}.sigma" in free
         shape = shapes[sensor.quantity]
         late = f"{name}.delay" in free
-        out.append(readings_of(sensor, data, deviation, shape, places[name], ts.shape[0], ts.dtype, late))
+        channel = readings_of(sensor, data, deviation, shape, places[name], ts.shape[0], ts.dtype, late)
+        if not late:
+            _check_delay(channel, np.asarray(ts), float(experiment.t0))
+        out.append(channel)
     if any(levels.values()) and not all(levels.values()):
         missing = next(name for name, there in levels.items() if not there)
         raise ValueError(f"sigma is given for other quantities but not for {missing!r}; give all or none.")
     return tuple(out)
+
+
+def _check_delay(channel, ts, t0):
+    """Raise a `ValueError` for readings of the motion before it begins."""
+    there = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
+    early = ts[there & (ts - float(channel.delay) < t0)]
+    if early.size:
+        raise ValueError(
+            f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so what it reads at {early[0]:g} s is "
+            f"the motion before t0 = {t0:g}. Start t0 earlier, or leave out samples before "
+            f"{t0 + float(channel.delay):g} s, or put NaN in their place."
+        )
 
 
 def initial_unknown(system: AbstractSystem, name: str) -> Initial:
