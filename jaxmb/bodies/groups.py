@@ -29,13 +29,14 @@ BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 class Input(eqx.Module):
     """A number of stacked parts that is a function of time: the parameter's name, the keys that lead to it in the
-    part, and the number of the part.
+    part, the number of the part, and whether it `moves` what the part measures, so that its rate counts.
     """
 
     signal: AbstractSignal
     name: str = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)
     member: int = eqx.field(static=True)
+    moves: bool = eqx.field(static=True)
 
 
 class Group(eqx.Module):
@@ -63,13 +64,18 @@ class Group(eqx.Module):
         return self._at(member, jax.tree.map(lambda leaf: leaf[member], self.part), t)
 
     def _at(self, member, part, t):
-        """One part with its inputs at a time."""
+        """One part with its inputs at a time, and their rates."""
+        drift = jax.tree.map(lambda _: None, part)
         for own in self.inputs:
             where = lambda part, keys=own.keys: entry(part, keys)
             given = where(part)
-            value = jnp.where(member == own.member, jnp.asarray(own.signal(t), given.dtype), given)
-            part = eqx.tree_at(where, part, value)
-        return part
+            signal = lambda t, own=own, like=given: jnp.asarray(own.signal(t), like.dtype)
+            value, rate = jax.jvp(signal, (t,), (jnp.ones_like(t),)) if part.takes_drift else (signal(t), None)
+            part = eqx.tree_at(where, part, jnp.where(member == own.member, value, given))
+            if rate is not None:
+                rate = jnp.where(member == own.member, rate, jnp.zeros_like(rate))
+                drift = eqx.tree_at(where, drift, rate, is_leaf=lambda x: x is None)
+        return part.with_fields(drift=drift) if self.inputs and part.takes_drift else part
 
     @property
     def body_index(self) -> np.ndarray:

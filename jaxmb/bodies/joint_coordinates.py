@@ -1,5 +1,6 @@
 """The own coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -110,11 +111,16 @@ def held_groups(
         group = groups[own.group].group
         driver = JointDriver(name, name, value=value - rates[name] * jnp.asarray(t, value.dtype), rate=rates[name])
         part = driver.with_fields(
-            joints={"0": group.single(own.member, t)},
+            joints={"0": jax.tree.map(lambda leaf, k=own.member: leaf[k], group.part)},
             places=(tuple(range(len(group.bodies[own.member]))),),
             within=own.field,
             rows=math.prod(own.shape),
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)
-        out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout)))
+        inputs = tuple(
+            dataclasses.replace(signal, keys=("joints", "0", *signal.keys), member=0)
+            for signal in group.inputs
+            if signal.member == own.member
+        )
+        out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout, inputs)))
     return tuple(out)

@@ -118,12 +118,12 @@ _BIND = (*_BIND_POSITIONS, "velocity_constraints", "servos")
 
 
 def signals_of(groups: Mapping[str, Sequence[Any]]) -> dict[str, tuple[AbstractSignal, bool]]:
-    """The inputs of some groups by name, and whether constraints depend on them.
+    """The inputs of some groups by name, and whether constraints, or velocities that forces depend on, do so on them.
 
     **Arguments:** `groups`, by the name of the system's field that holds them.
     """
     return {
-        own.name: (own.signal, kind in _BIND)
+        own.name: (own.signal, kind in _BIND or own.moves)
         for kind, of_kind in groups.items()
         for g in of_kind
         for own in g.group.inputs
@@ -139,6 +139,7 @@ def with_signals(
     """
     new: dict[tuple[str, int], list[Input]] = {}
     varying, of_frames = set(), {number.name for number in stacked_numbers({"frames": groups["frames"]})}
+    laws = {joint: name for g in groups["nonideal"] for joint, name in zip(g.joints, g.group.names, strict=True)}
     for number in stacked_numbers(groups):
         signal = signals.get(number.name)
         constant = number.declared.constant or number.kind in ("bodies", "frames") or number.name in of_frames
@@ -149,8 +150,18 @@ def with_signals(
                 f"A position constraint depends on {number.name!r}, so it must not jump: use interpolation='linear' or "
                 "'cubic' instead of 'held'."
             )
+        part, declared = groups[number.kind][number.group].group.part, number.declared
+        places = declared.is_point or declared.is_direction or declared.is_attitude
+        law = laws.get(number.name.split(".")[0]) if places and number.kind == "constraints" else None
+        if law is not None or not part.may_vary(number.keys):
+            raise ValueError(
+                f"{number.name!r} cannot be an input: {repr(law) if law else f'a {part.kind}'} takes velocities of "
+                "points that are fixed in their bodies. Put the part on a body that a JointDriver moves."
+            )
         varying.add(number.name)
-        own = Input(signal, number.name, number.keys, number.member)
+        # All numbers of a joint place the coordinate that other parts measure.
+        moves = places or number.keys[0] == "joints"
+        own = Input(signal, number.name, number.keys, number.member, moves)
         new.setdefault((number.kind, number.group), []).append(own)
     for name in signals:
         if name not in varying:

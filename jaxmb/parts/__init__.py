@@ -22,6 +22,9 @@ tie = Maxwell("tie", "ground", "bar", stiffness=100.0, damping=20.0, point_a=(0.
 system = jaxmb.Scene([bar], joints=[pin], forces=[tie]).compile()
 ```
 
+Where numbers of a part are inputs, `separation_rate`, and `rate_of` for other functions of the part and the poses,
+contain their rates: `rate_of(space, self, lambda part, poses: part.length(space, poses), poses, velocities)`.
+
 A part is a class derived from one of the base classes. Helpers declare the meaning of its fields (`point()`, `axis()`,
 `length()`, `parameter()`, …), annotated with `Number`, `Numbers` (by name) or `Names`; its kernel is a pure function of
 the poses of its bodies. For examples of a joint, a force and a contact law see `notebooks/05_extending.ipynb`.
@@ -78,6 +81,7 @@ from .fields import (
 from .space import (
     AbstractSpace as AbstractSpace,
     force_pair as force_pair,
+    rate_of as rate_of,
     separation as separation,
     separation_rate as separation_rate,
 )

@@ -12,7 +12,6 @@ import numpy as np
 from . import fields
 from .base import AbstractDynamicForce
 from .coordinate_parts import AbstractCoordinatePart, AbstractScalarPart
-from .forces import generalized_force
 
 
 class Motor(AbstractCoordinatePart, AbstractDynamicForce):
@@ -65,7 +64,7 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: self.force.reshape(-1)
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)
 
     def state_rates(self, space, poses, velocities, t):
         x, v = self.measured_with_rate(space, poses, velocities)
@@ -143,7 +142,7 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
             x = self.near(x, self.middle)
             return self.gear * self.force(self.gear * x[0], self.gear * v[0])[None]
 
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)
 
     def state_rates(self, space, poses, velocities, t):
         return {} if self.lag is None else {"activation": (self._clipped_control() - self.activation) / self.lag}

@@ -213,8 +213,13 @@ class AbstractActor(AbstractPart):
     """
 
     body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
+    # The rates of its numbers that are functions of time, in a part of None otherwise; None without any. See
+    # `with_drift`.
+    drift: Any = eqx.field(init=False, repr=False)
     # When a scene settles the part: 0 from its bodies, 1 after the joints between them, 2 after tendons as well.
     stage: ClassVar[int] = 0
+    # Whether its kernels are given the `drift`.
+    takes_drift: ClassVar[bool] = True
     # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
     takes_bodies: ClassVar[bool] = False
 
@@ -222,12 +227,20 @@ class AbstractActor(AbstractPart):
         out = super().__new__(cls, *args, **kwargs)
         # Here, so that parts with an `__init__` of their own have it as well.
         object.__setattr__(out, "body_frames", {})
+        object.__setattr__(out, "drift", None)
         return out
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Hook: the names of the parts that it acts on or measures, where these are not bodies that it names itself."""
         return ()
+
+    def may_vary(self, keys: tuple[str, ...]) -> bool:
+        """Hook: whether the number at the end of these keys may be an input. Where the velocity of a point counts that
+        such a number moves in its body, it may not, unless the kernels know (`with_drift`).
+        """
+        del keys
+        return True
 
     @abc.abstractmethod
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
@@ -376,6 +389,8 @@ class AbstractConstraint(AbstractLink):
 
     rows: AbstractVar[int]
     rheonomic: AbstractVar[bool]
+    # Their residuals are differentiated with respect to time.
+    takes_drift: ClassVar[bool] = False
 
     @abc.abstractmethod
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:

@@ -29,7 +29,7 @@ from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
 from .shapes import Ground, marked_ball, wheel
 from .smooth import dry_friction, ramp, step
-from .terrain import AbstractTerrain, distance, outward
+from .terrain import AbstractTerrain, distance, outward, over_ground
 
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]
@@ -205,6 +205,9 @@ class AbstractContact(AbstractPotentialForce):
         check_returns(self.label, "terrain.height", (), self.terrain.height, place)
         return part
 
+    def may_vary(self, keys):
+        return keys[0] not in ("radius", "centres")
+
     def wrenches(self, space, poses, velocities, t):
         return self._each(space, lambda *own: self._wrench(space, *own), poses, velocities)
 
@@ -232,7 +235,8 @@ class AbstractContact(AbstractPotentialForce):
         return ramp(radius - self.distance(centre), self.smoothing)
 
     def _wrench(self, space, pose, velocity, point, radius):
-        centre, travel = space.point(pose, point), space.point_velocity(pose, velocity, point)
+        centre = space.point(pose, point)
+        travel = over_ground(self, centre, space.point_velocity(pose, velocity, point))
         depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
         load, normal = self.normal.force(depth), self.outward(centre)
         engaged = self.onset(depth / self.damping_depth)
@@ -243,7 +247,7 @@ class AbstractContact(AbstractPotentialForce):
             return wrench
         lowest = space.body_point(pose, centre - radius * normal)
         along = lambda v: v - jnp.dot(v, normal) * normal
-        slip = along(space.point_velocity(pose, velocity, lowest))
+        slip = along(over_ground(self, centre, space.point_velocity(pose, velocity, lowest)))
         friction = self.friction.force(load, engaged, slip, along(travel))
         return wrench + space.point_force(pose, lowest, friction)
 
@@ -268,7 +272,8 @@ class Contact(AbstractContact):
     **Arguments:**
 
     - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
-    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but that it rises and sinks where its
+        numbers are inputs.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
     - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.

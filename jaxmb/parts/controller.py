@@ -14,6 +14,7 @@ from .coordinate_parts import AbstractOfJoints
 from .forces import generalized_force
 from .frames import AbstractFrame
 from .names import unknown
+from .space import rate_of
 
 # What is seen of a body or a frame, and in which space if not in both.
 _OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
@@ -153,7 +154,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         forces, _ = self._evaluated(space, poses, velocities, t)
         return generalized_force(
             space,
-            lambda x: self._acted(space, x),
+            self,
+            lambda part, x: part._acted(space, x),
             poses,
             velocities,
             lambda value, rate: self._row(space, poses, forces),
@@ -203,8 +205,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         base = quantity.removesuffix("_rate")
         if base == quantity:
             return self._coordinate(space, poses, name)
-        rates = jax.vmap(space.rates)(poses, velocities)
-        return jax.jvp(lambda x: self._coordinate(space, x, f"{source}.{base}"), (poses,), (rates,))[1]
+        coordinate = lambda part, x: part._coordinate(space, x, f"{source}.{base}")
+        return rate_of(space, self, coordinate, poses, velocities)[1]
 
     def _of_body(self, space, poses, velocities, source, quantity):
         (k,), frame, d = self.places[int(source)], self.joints.get(source), space.dimension

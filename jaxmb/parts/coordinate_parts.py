@@ -14,10 +14,19 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import fields
-from .base import AbstractConstraint, AbstractForce, AbstractLink, AbstractPart, AbstractPotentialForce, KnownParts
+from .base import (
+    AbstractConstraint,
+    AbstractForce,
+    AbstractLink,
+    AbstractPart,
+    AbstractPotentialForce,
+    KnownParts,
+    Wrenches,
+)
 from .forces import generalized_force
 from .names import unknown
 from .smooth import ramp
+from .space import rate_of
 
 
 class AbstractOfJoints(AbstractLink):
@@ -116,8 +125,11 @@ class AbstractCoordinatePart(AbstractOfJoints):
 
     def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """The coordinate and its rate, raveled."""
-        rates = jax.vmap(space.rates)(poses, velocities)
-        return jax.jvp(lambda x: self.measured(space, x), (poses,), (rates,))
+        return rate_of(space, self, lambda part, x: part.measured(space, x), poses, velocities)
+
+    def force_along(self, space, poses, velocities, law) -> Wrenches:
+        """Wrenches of a force along the coordinate, `law(value, rate)`, raveled."""
+        return generalized_force(space, self, lambda part, x: part.measured(space, x), poses, velocities, law)
 
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of angles that are known up to full turns the smallest such difference."""
@@ -196,7 +208,7 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * self._stretch(x) - self.damping * v
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * jnp.sum(self._stretch(self.measured(space, poses)) ** 2)
@@ -223,7 +235,7 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: self.force.reshape(-1)
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)
 
 
 class JointDriver(AbstractCoordinatePart, AbstractConstraint):
@@ -310,7 +322,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
             (force,) = jax.vjp(self._depths, x)[1](self.stiffness * depth + self.damping * rate)
             return -force
 
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * jnp.sum(self._depths(self.measured(space, poses)) ** 2)
@@ -335,4 +347,4 @@ class JointFriction(AbstractScalarPart, AbstractForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)
-        return generalized_force(space, lambda x: self.measured(space, x), poses, velocities, law)
+        return self.force_along(space, poses, velocities, law)

@@ -23,7 +23,7 @@ from .base import (
     Wrenches,
 )
 from .coordinate_parts import AbstractOfJoints, is_length
-from .space import AbstractSpace
+from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
 
 # The mode of friction that sticks, as `jaxmb.system` numbers modes; 1 and -1 are those of slip in either direction.
@@ -252,6 +252,11 @@ class DryFriction(AbstractDryFriction):
         k = int(np.argmax(np.abs(normal)))
         return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
 
+    def may_vary(self, keys):
+        # Where bodies touch, points of theirs are fixed in them; a terrain rises and sinks.
+        in_contact = keys[0] == "joints" and isinstance(self.joints["0"], AbstractRigidContact)
+        return not in_contact or "terrain" in keys
+
     def slip(self, space, poses, velocities):
         slip = self._relative_velocity(space, poses, velocities)
         return slip if self.speed is None else slip - self.speed.reshape(-1)
@@ -259,15 +264,15 @@ class DryFriction(AbstractDryFriction):
     def _relative_velocity(self, space, poses, velocities):
         held = self.joints["0"]
         if isinstance(held, AbstractRigidContact):
+            if self.drift is not None:
+                held = held.with_fields(drift=self.drift.joints["0"])
             bodies = len(held.bodies)
             return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]), self.pole)
-        rates = jax.vmap(space.rates)(poses, velocities)
+        return rate_of(space, self, lambda part, x: part._lengths(space, x), poses, velocities)[1]
 
-        def lengths(poses):
-            own = held.coordinates_at(space, poses)
-            return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
-
-        return jax.jvp(lengths, (poses,), (rates,))[1]
+    def _lengths(self, space, poses):
+        own = self.joints["0"].coordinates_at(space, poses)
+        return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
 
     def _length(self, name, value):
         return value if self.radius is None or is_length(name) else self.radius * value

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
-from .space import both_points, force_pair, separation, separation_rate
+from .space import both_points, force_pair, rate_of, separation, separation_rate
 
 
 class Gravity(AbstractPart):
@@ -26,15 +26,14 @@ class Gravity(AbstractPart):
     name: str = eqx.field(static=True, default="gravity", kw_only=True)
 
 
-def generalized_force(space, coordinates, poses, velocities, law):
+def generalized_force(space, part, coordinates, poses, velocities, law):
     """Wrenches of generalized forces along given coordinates.
 
-    `coordinates(poses)` has shape (n,), `law(value, rate)` returns the n conjugate forces; the wrench on body k is
-    `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
+    `coordinates(part, poses)` has shape (n,), `law(value, rate)` returns the n conjugate forces; the wrench on body k
+    is `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
     """
-    pose_rates = jax.vmap(space.rates)(poses, velocities)
-    value, rate = jax.jvp(coordinates, (poses,), (pose_rates,))
-    _, pull = jax.vjp(coordinates, poses)
+    value, rate = rate_of(space, part, coordinates, poses, velocities)
+    _, pull = jax.vjp(lambda x: coordinates(part, x), poses)
     (gradient,) = pull(law(value, rate))
     return jax.vmap(space.pull_back)(poses, gradient)
 

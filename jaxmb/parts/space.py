@@ -9,8 +9,11 @@ A `pose` places a body, a `velocity` is its rate of motion, and a `wrench` does 
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, ClassVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -113,7 +116,31 @@ def separation_rate(
 ) -> Point:
     """Rate [m/s] of the world vector from point A to point B."""
     of_b = space.point_velocity(poses[1], velocities[1], part.point_b)
-    return of_b - space.point_velocity(poses[0], velocities[0], part.point_a)
+    rate = of_b - space.point_velocity(poses[0], velocities[0], part.point_a)
+    return with_drift(part, rate, lambda part: separation(space, part, poses))
+
+
+def rate_of(
+    space: AbstractSpace,
+    part: Any,
+    function: Callable[[Any, Float[Array, "k p"]], Array],
+    poses: Float[Array, "k p"],
+    velocities: Float[Array, "k v"],
+) -> tuple[Array, Array]:
+    """The value and the rate of `function(part, poses)`, for numbers of the part that are inputs with their rates."""
+    rates = jax.vmap(space.rates)(poses, velocities)
+    value, rate = jax.jvp(lambda x: function(part, x), (poses,), (rates,))
+    return value, with_drift(part, rate, lambda part: function(part, poses))
+
+
+def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Array:
+    """The rate of `function(part)`, from that which it has by the motion of the bodies, with that by numbers of the
+    part that are inputs, such as a point that moves in its body.
+    """
+    if part.drift is None:
+        return rate
+    still = part.with_fields(drift=None)
+    return rate + eqx.filter_jvp(function, (still,), (part.drift,))[1]
 
 
 def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], force_W: Point) -> Float[Array, "2 v"]:

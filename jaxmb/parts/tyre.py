@@ -18,7 +18,7 @@ from .contact import AbstractNormalLaw
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .space import AbstractSpace, Point, Pose
-from .terrain import AbstractTerrain, distance, outward
+from .terrain import AbstractTerrain, distance, outward, over_ground
 
 
 class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
@@ -77,6 +77,9 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         check_returns(self.label, "terrain.height", (), self.terrain.height, place)
         return self.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
 
+    def may_vary(self, keys):
+        return keys[0] not in ("radius", "centre", "axis")
+
     def wrenches(self, space, poses, velocities, t):
         pose, velocity = poses[0], velocities[0]
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
@@ -84,7 +87,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         wrench = space.pull_back(pose, -load * gradient)
         normal, point, along, *_ = self._contact(space, pose, velocity)
         engaged = step(depth / self.damping_depth)
-        approach = jnp.dot(space.point_velocity(pose, velocity, self.centre), normal)
+        approach = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
         sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
         # The law of dry friction, with the deflection in the place of slip.
         friction = dry_friction(self.coefficient * load, -sliding, 1.0)
@@ -110,6 +113,10 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         rim = centre + self.lowest(space, pose, outward(self.terrain, centre))
         return ramp(-distance(self.terrain, rim), self.smoothing)
 
+    def _velocity(self, space, pose, velocity, point):
+        """The velocity of a point fixed in the body over the ground."""
+        return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
+
     def _contact(self, space, pose, velocity):
         """The ground's normal, the wheel's lowest point fixed in the body, the directions along the ground, the slip
         velocities along them, and the rolling speed, regularised.
@@ -118,6 +125,6 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         normal = outward(self.terrain, centre)
         point = space.body_point(pose, centre + self.lowest(space, pose, normal))
         along = self.directions(space, pose, normal)
-        slip = along @ space.point_velocity(pose, velocity, point)
-        rolling = jnp.dot(along[0], space.point_velocity(pose, velocity, self.centre))
+        slip = along @ self._velocity(space, pose, velocity, point)
+        rolling = jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
         return normal, point, along, slip, jnp.sqrt(rolling**2 + self.transition_speed**2)

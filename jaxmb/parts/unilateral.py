@@ -20,7 +20,7 @@ from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordin
 from .coordinate_parts import AbstractScalarPart
 from .shapes import Box, Ground, marked_ball, wheel
 from .space import AbstractSpace, both_points, separation
-from .terrain import AbstractTerrain, distance
+from .terrain import AbstractTerrain, distance, over_ground
 
 # The mode of a contact that is closed, as `jaxmb.system` numbers modes.
 _CLOSED = 1
@@ -181,8 +181,13 @@ class AbstractRigidContact(AbstractGeometricContact):
         def velocity(k):
             return space.point_velocity(poses[k], velocities[k], space.body_point(poses[k], point))
 
-        relative = velocity(-1) - velocity(0) if len(poses) == 2 else velocity(-1)
+        relative = velocity(-1) - velocity(0) if len(poses) == 2 else self.over_ground(point, velocity(-1))
         return self.tangents(space, poses, pole) @ relative
+
+    def over_ground(self, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
+        """Hook: the velocity [m/s] of one body against what it touches at a point, from that in the world."""
+        del point
+        return velocity
 
 
 class RigidContact(AbstractRigidContact):
@@ -214,6 +219,9 @@ class RigidContact(AbstractRigidContact):
 
     def touching(self, space, poses):
         return space.point(poses[0], self.centre) - self.radius * self.outward(space, poses)
+
+    def over_ground(self, point, velocity):
+        return over_ground(self, point, velocity)
 
     def shapes(self, space, size):
         solid = wheel if space.dimension == 2 else marked_ball

@@ -114,7 +114,8 @@ def simulate(
 
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
         of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where
-        a held series jumps and, if constraints depend on it, at every time of a linear one.
+        a held series jumps and, if it moves a point, an axis or a joint, or constraints depend on it, at every time of
+        a linear one.
 
     **Other arguments, rarely needed:**
 
@@ -144,7 +145,7 @@ def simulate(
         tolerances; both together take two to two and a half times as long as one, and nothing more to compile.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
-        then exert. A function that is evaluated at a jump should return its value after it, as a state saved there
+        then exert, without restitution where contacts are closed. A function that is evaluated at a jump should return its value after it, as a state saved there
         does. Needs `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints.
         A warning tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import planar, spatial
 
 G, LENGTH, MASS = 9.81, 0.7, 1.3
 INERTIA = MASS * LENGTH**2 / 3
@@ -217,3 +217,134 @@ def test_an_input_is_not_set_as_a_number(pendulum):
     driven = mb.with_inputs(pendulum, {"motor.torque": mb.Series(TS, TORQUES)})
     with pytest.raises(ValueError, match="is an input of this system"):
         mb.with_parameters(driven, {"motor.torque": 1.0})
+
+
+def sliding(forces=(), joints=()):
+    """A block of 2 kg on a rail along x, at 0.7 m, and its state at 0.3 m/s."""
+    block = planar.Body("block", mass=2.0, inertia=0.1, position=(0.7, 0.0))
+    rail = planar.Prismatic("rail", "ground", "block", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis_a=(1.0, 0.0))
+    return mb.Scene([block], joints=[rail, *joints], forces=forces).compile()
+
+
+# All that is fixed in the ground moves along x at this rate.
+SPEED = 0.5
+MOVING = lambda t: jnp.stack([SPEED * t, 0.0 * t])
+
+
+def test_forces_take_the_rates_of_points_that_move():
+    """Each damps the rate at which the block moves away from what moves, with a coefficient of its own."""
+    control = lambda t, measured, states, parameters: (-8.0 * measured["rate"], {})
+    forces = [
+        planar.SpringDamper("pair", "ground", "block", stiffness=0.0, damping=1.0, free_length=0.0),
+        mb.JointSpring("spring", "rail.displacement", stiffness=0.0, damping=2.0),
+        planar.Bushing("bush", "ground", "block", stiffness=(0.0,) * 3, damping=(4.0,) * 3, point=(0.0, 0.0)),
+        mb.Controller("control", control, {"rate": "rail.displacement_rate"}, "rail.displacement"),
+        mb.Actuator("drive", "rail.displacement", gain=(0.0,) * 3, bias=(0.0, 0.0, -16.0)),
+        mb.JointFriction("rub", "rail.displacement", force=32.0, transition_speed=1.0),
+        mb.JointStop("stop", "rail.displacement", lower=0.0, upper=0.5, stiffness=0.0, damping=64.0, smoothing=1e-9),
+        mb.JointSpring("winch", "cord.length", stiffness=0.0, damping=128.0),
+        planar.Damper("oil", "ground", "block", damping=256.0),
+        mb.Motor("motor", "rail.displacement", mode="speed", command=0.0, gain=512.0, lag=1.0),
+    ]
+    cord = mb.Tendon("cord", [("ground", (0.0, 0.0)), ("block", (0.0, 0.0))])
+    inputs = dict.fromkeys(("pair.point_a", "bush.point_a", "oil.point_a", "rail.point_a"), MOVING)
+    inputs |= {"cord.points": lambda t: jnp.stack([MOVING(t), 0.0 * MOVING(t)])}
+    system = mb.with_inputs(sliding(forces, [cord]), inputs)
+    state = mb.assemble(system, rates={"block.x": 0.3})
+    system, time = system.with_states(state.z), jnp.array(0.0)
+    found = mb.formulations.accelerations(system, mb.formulations.Multipliers(), time, state.q, state.u)[0]
+    rate = 0.3 - SPEED
+    damped = -(1 + 2 + 4 + 8 + 16 + 64 + 128 + 256) * rate - 32 * np.tanh(rate)
+    np.testing.assert_allclose(found[0], damped / 2.0, rtol=1e-8)
+    np.testing.assert_allclose(system.state_rates(time, state.q, state.u), [-512 * rate])
+
+
+def test_the_rate_of_a_joint_with_a_point_that_moves():
+    system = mb.with_inputs(sliding(), {"rail.point_a": MOVING})
+    state = mb.assemble(system, t=2.0, fix={"rail.displacement": 0.3}, rates={"rail.displacement": 0.2})
+    np.testing.assert_allclose([state.q[0], state.u[0]], [0.3 + 2.0 * SPEED, 0.2 + SPEED], rtol=1e-12)
+
+
+def test_contacts_on_ground_that_rises():
+    """Forces are those on ground at rest of a body that moves downwards as fast, against friction as well."""
+    laws = {"normal": mb.contact.Linear(1e4), "friction": mb.contact.Coulomb(0.5, transition_speed=0.1)}
+    slope = mb.terrain.Slope(0.3)
+    tyre = {"slip_stiffness": 5.0, "coefficient": 0.8, "relaxation_length": 0.2, "damping": 300.0}
+    wheel = planar.Body("wheel", mass=1.0, inertia=0.1, position=(0.0, 0.25))
+    forces = [
+        planar.Contact("contact", "wheel", terrain=slope, radius=0.3, damping=500.0, **laws),
+        planar.Tyre("tyre", "wheel", terrain=slope, radius=0.3, normal=laws["normal"], **tyre),
+    ]
+    still = mb.Scene([wheel], forces=forces).compile()
+    levels = {f"{name}.terrain.level": lambda t: SPEED * t for name in ("contact", "tyre")}
+    rising = mb.with_inputs(still, levels)
+    state = mb.assemble(still)
+    u = jnp.array([0.4, -0.2, 1.0])
+
+    def accelerations(system, u):
+        system = system.with_states(jnp.array([0.01]))
+        return mb.formulations.accelerations(system, mb.formulations.Multipliers(), jnp.array(0.0), state.q, u)[0]
+
+    expected = accelerations(still, u - jnp.array([0.0, SPEED, 0.0]))
+    np.testing.assert_allclose(accelerations(rising, u), expected, rtol=1e-12)
+    assert np.abs(expected - accelerations(still, u)).max() > 1.0
+
+
+@pytest.mark.parametrize("kind", ["sphere", "disc"])
+def test_rolling_on_a_plane_that_moves(kind):
+    """As on a plane at rest, seen from the plane."""
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1), position=(0.0, 0.0, 0.1))
+    rolling = {
+        "sphere": spatial.RollingSphere("rolling", "ball", radius=0.1),
+        "disc": spatial.RollingDisc("rolling", "ball", radius=0.1, axis=(0.0, 1.0, 0.0)),
+    }
+    still = mb.Scene([ball], joints=[rolling[kind]]).compile()
+    moving = mb.with_inputs(still, {"rolling.point": lambda t: jnp.stack([SPEED * t, 2 * SPEED * t, 0.0 * t])})
+    q, u = still.guess.q, jnp.array([0.3, 0.1, 0.0, 0.2, -0.5, 0.7])
+    seen = u - jnp.array([SPEED, 2 * SPEED, 0.0, 0.0, 0.0, 0.0])
+    residuals = lambda system, u: system.velocity_residual(jnp.array(0.0), q, u)
+    np.testing.assert_allclose(residuals(moving, u), residuals(still, seen), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("part", "name"),
+    [
+        (planar.Contact("on", "block", terrain=mb.terrain.Flat(), normal=mb.contact.Linear(1e4)), "on.centres"),
+        (planar.Friction("rub", "rail", coefficient=0.1), "rail.point_a"),
+    ],
+    ids=["contact", "friction"],
+)
+def test_points_that_must_be_fixed(part, name):
+    with pytest.raises(ValueError, match=f"'{name}' cannot be an input"):
+        mb.with_inputs(sliding([part]), {name: MOVING})
+
+
+def test_a_spring_and_damper_on_a_base_that_shakes():
+    """Against SciPy, with the derivative by the amplitude, in which the motion is linear."""
+    pair = planar.SpringDamper("pair", "ground", "block", stiffness=50.0, damping=3.0, free_length=0.5)
+    system = sliding([pair])
+
+    def end(amplitude):
+        shaken = {"pair.point_a": lambda t: jnp.stack([amplitude * jnp.sin(5 * t), 0.0 * t])}
+        start = mb.assemble(system, rates={"block.x": 0.3})
+        return mb.simulate(system, start, t1=2.0, inputs=shaken, rtol=1e-10)["block"].position[-1, 0]
+
+    def exact(amplitude):
+        base = lambda t: (amplitude * np.sin(5 * t), 5 * amplitude * np.cos(5 * t))
+        rates = lambda t, y: [y[1], -(50 * (y[0] - base(t)[0] - 0.5) + 3 * (y[1] - base(t)[1])) / 2]
+        return solve_ivp(rates, (0.0, 2.0), [0.7, 0.3], rtol=1e-12, atol=1e-13).y[0, -1]
+
+    slope = (exact(0.1) - exact(0.0)) / 0.1
+    np.testing.assert_allclose(end(0.1), exact(0.1), rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(0.1), slope, rtol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(0.1), slope, rtol=1e-7)
+
+
+def test_dry_friction_of_a_rail_that_moves():
+    """It drags the block until that moves as the rail does."""
+    rub = mb.DryFriction("rub", "rail", coefficient=0.3)
+    system = mb.with_inputs(sliding([rub, mb.Gravity((0.0, -G))]), {"rail.point_a": MOVING})
+    motion = mb.simulate(system, mb.assemble(system, rates={"block.x": 0.0}), t1=1.0, saveat=[0.1, 1.0], rtol=1e-10)
+    drag, stuck = 0.3 * G, SPEED / (0.3 * G)
+    np.testing.assert_allclose(motion.ys.q[0, 0], 0.7 + drag * 0.1**2 / 2, rtol=1e-9)
+    np.testing.assert_allclose(motion.ys.q[1, 0], 0.7 + SPEED * (1.0 - stuck / 2), rtol=1e-9)

@@ -71,6 +71,9 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     def share(self, place: Vector, surface: Surface) -> Number:
         """Fraction of the force, from 0 to 1, where the disc's centre is at a point of the other body's frame."""
 
+    def may_vary(self, keys):
+        return keys[0] in ("normal", "friction", "damping", "damping_depth", "smoothing")
+
     def wrenches(self, space, poses, velocities, t):
         disc = _Disc(poses[0], velocities[0], self.centre, space)
         own = lambda *other: self._pair(space, disc, *other)

@@ -138,7 +138,7 @@ class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * x - self.damping * v
-        return generalized_force(space, lambda p: self._motions(space, p), poses, velocities, law)
+        return generalized_force(space, self, lambda part, p: part._motions(space, p), poses, velocities, law)
 
     def energy(self, space, poses, t):
         return 0.5 * jnp.sum(self.stiffness * self._motions(space, poses) ** 2)

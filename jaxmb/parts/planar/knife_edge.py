@@ -5,6 +5,7 @@ from typing import ClassVar
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractVelocityConstraint
 from ..shapes import sleeve
+from ..space import with_drift
 
 
 class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
@@ -37,6 +38,7 @@ class KnifeEdge(AbstractPlanarPart, AbstractVelocityConstraint):
     def residual(self, space, poses, velocities, t):
         along = space.direction(poses[0], self.axis)
         v = space.point_velocity(poses[0], velocities[0], self.point)
+        v = with_drift(self, v, lambda part: space.point(poses[0], part.point))
         return (along[0] * v[1] - along[1] * v[0])[None]
 
     def shapes(self, space, size):

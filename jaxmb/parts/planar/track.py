@@ -153,7 +153,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda length, rate: -(self.pretension + self.stiffness * (length - self.free_length))
-        return generalized_force(space, lambda p: self.length(space, p), poses, velocities, law)
+        return generalized_force(space, self, lambda part, p: part.length(space, p), poses, velocities, law)
 
     def energy(self, space, poses, t):
         stretch = self.length(space, poses) - self.free_length

@@ -69,7 +69,7 @@ class TorsionalSpringDamper(AbstractSpatialPart, AbstractPair, AbstractPotential
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * (x - self.free_angle) - self.damping * v
-        return generalized_force(space, lambda p: angle(space, self, p), poses, velocities, law)
+        return generalized_force(space, self, lambda part, p: angle(space, part, p), poses, velocities, law)
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * (angle(space, self, poses) - self.free_angle) ** 2
@@ -135,7 +135,7 @@ class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * x - self.damping * v
-        return generalized_force(space, lambda p: self._motions(space, p), poses, velocities, law)
+        return generalized_force(space, self, lambda part, p: part._motions(space, p), poses, velocities, law)
 
     def energy(self, space, poses, t):
         return 0.5 * jnp.sum(self.stiffness * self._motions(space, poses) ** 2)

@@ -11,6 +11,7 @@ from ...linalg.rotations import cross, dot, norm
 from .. import fields
 from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
 from ..shapes import Ground, along, marked_ball, sleeve, wheel
+from ..space import with_drift
 from .axes import perpendiculars
 
 
@@ -47,6 +48,7 @@ class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         v = space.point_velocity(poses[0], velocities[0], self.point)
+        v = with_drift(self, v, lambda part: space.point(poses[0], part.point))
         return dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
 
     def shapes(self, space, size):
@@ -61,6 +63,7 @@ class AbstractDisc(AbstractSpatialPart):
     radius: fields.Number = fields.length(sign="positive")
     axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
     centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
+    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
 
 
@@ -74,6 +77,11 @@ def _lowest_rim_point(space, part, pose):
     m = cross(n, cross(part.normal, n))
     length = norm(m)
     return -part.radius * m / jnp.where(length > 0, length, 1.0)
+
+
+def _from_plane(space, part, pose):
+    """World vector [m] from the plane's point to the centre."""
+    return space.point(pose, part.centre) - part.point
 
 
 def _tangential(normal, v):
@@ -97,20 +105,19 @@ class RollingDisc(AbstractDisc, AbstractCompound):
     - `name`; `body`: that the disc is fixed in, or a frame in it, by name.
     - `radius` [m] > 0; `axis`, unit, shape (3,): the axle fixed in the body, default its z axis; `centre` [m], shape
         (3,), of the disc, fixed in the body, default the origin of its frame.
-    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0.
+    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
+        `"rolling.point"` is that of a plane that moves.
     """
 
-    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
-
     def components(self):
-        disc = {"radius": self.radius, "axis": self.axis, "centre": self.centre, "normal": self.normal}
-        return (DiscContact(self.name, self.body, point=self.point, **disc), DiscRolling(self.name, self.body, **disc))
+        disc = {"radius": self.radius, "axis": self.axis, "centre": self.centre}
+        disc |= {"point": self.point, "normal": self.normal}
+        return (DiscContact(self.name, self.body, **disc), DiscRolling(self.name, self.body, **disc))
 
 
 class DiscContact(AbstractDisc, AbstractConstraint):
     """A disc that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisc`."""
 
-    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -132,7 +139,8 @@ class DiscRolling(AbstractDisc, AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         rho = space.body_direction(poses[0], _lowest_rim_point(space, self, poses[0]))
-        return _tangential(self.normal, space.point_velocity(poses[0], velocities[0], self.centre + rho))
+        slip = space.point_velocity(poses[0], velocities[0], self.centre + rho)
+        return _tangential(self.normal, with_drift(self, slip, lambda part: _from_plane(space, part, poses[0])))
 
 
 class AbstractBall(AbstractSpatialPart):
@@ -161,7 +169,8 @@ class RollingSphere(AbstractBall, AbstractCompound):
 
     - `name`; `body`: that the sphere is fixed in, or a frame in it, by name.
     - `radius` [m] > 0; `centre` [m], shape (3,), of the sphere, fixed in the body, default the origin of its frame.
-    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0.
+    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
+        `"rolling.point"` is that of a plane that moves.
     - `spin` [rad/s], of a turntable: the rate at which the plane turns about its normal through `point`, default a
         plane at rest.
     """
@@ -209,6 +218,7 @@ class SphereRolling(AbstractBall, AbstractVelocityConstraint):
         e = self.normal / norm(self.normal)
         rho = space.body_direction(poses[0], -self.radius * e)
         slip = space.point_velocity(poses[0], velocities[0], self.centre + rho)
+        slip = with_drift(self, slip, lambda part: _from_plane(space, part, poses[0]))
         if self.spin is not None:
             slip = slip - self.spin * cross(e, space.point(poses[0], self.centre) - self.point)
         return _tangential(self.normal, slip)
