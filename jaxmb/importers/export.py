@@ -36,7 +36,9 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     ```
 
     Joints that make a tree become joints of MuJoCo, with the names and the values of the coordinates here; those that
-    close loops become equality constraints, which MuJoCo holds softly. Frames of bodies are at their mass centres.
+    close loops become equality constraints, which MuJoCo holds softly. Angles are in (−π, π] at the given pose, from
+    which MuJoCo counts them on; what a spring, stop or actuator counts from another turn is written for these angles.
+    Several springs, dampers, frictions or stops of one joint are one. Frames of bodies are at their mass centres.
 
     **Arguments:** `system`: a compiled scene; `state`: where the machine stands, default the poses given with the
     bodies, which must satisfy the constraints; `ignore`: names of parts to leave out.

@@ -14,6 +14,10 @@ from .description import rotation_of
 from .export_tree import Tree, numbers, parts_of
 from .notes import Notes
 
+# MuJoCo reads this free length of a tendon's spring as the length in the pose of the file.
+_LENGTH_OF_POSE = -1.0
+_COUNTS = "These see an angle within half a turn of middle, or of free; MuJoCo counts it on from the given pose: {}."
+
 
 def write_forces(
     system: RigidBodySystem, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes
@@ -35,6 +39,9 @@ def write_forces(
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
         else:
             writer.inertia(part)
+    for turns in writer.turns.values():
+        if len({*turns.values()}) > 1:
+            notes.say(_COUNTS, *turns)
     for group in system.frames:
         for k, name in enumerate(group.group.names):
             writer.frame(name, group, k, system)
@@ -45,6 +52,9 @@ class _Writer:
         self.tree, self.elements, self.sections, self.notes = tree, elements, sections, notes
         self.tendons: dict[str, Any] = {}
         self.springs: dict[str, tuple[float, float]] = {}
+        # By names of joints: the range that stops leave; and for each part how far the joint is ahead of what it sees.
+        self.ranges: dict[str, tuple[float, float]] = {}
+        self.turns: dict[str, dict[str, float]] = {}
 
     def site(self, name: str, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
         """A site at a place and attitude in the world."""
@@ -53,6 +63,14 @@ class _Writer:
         own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
         if rotation is not None:
             own.set("quat", numbers(from_matrix(back @ rotation)))
+
+    def ahead(self, part, joint, about):
+        """By how many full turns [rad] MuJoCo's value of a joint is ahead of the one that a part sees, of an angle the
+        one within half a turn of another.
+        """
+        turns = part.turns(joint.value, about)
+        self.turns.setdefault(joint.name, {})[part.name] = turns
+        return turns
 
     def frame(self, name, group, k, system):
         number = group.group.bodies[k][0]
@@ -84,7 +102,7 @@ class _Writer:
         if element is None:
             self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
             return
-        element.set("armature", numbers(float(element.get("armature", 0.0)) + float(part.part.inertia)))
+        _add(element, "armature", part.part.inertia)
 
     def write_JointSpring(self, part):
         own = part.part
@@ -93,14 +111,22 @@ class _Writer:
         if tendon is None and (joint is None or joint.type == "ball"):
             return False
         element: Any = tendon if joint is None else self.tree.elements[joint.name]
+        _add(element, "damping", own.damping)
         stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
+        if stiffness == 0:
+            return None
+        if joint is not None:
+            if part.is_periodic() and own.middle is None:
+                self.notes.say(_COUNTS, part.name)
+            free += self.ahead(part, joint, free if own.middle is None else own.middle)
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))
         total = before + stiffness
-        free = free if total == 0 else (before * its_free + stiffness * free) / total
+        free = (before * its_free + stiffness * free) / total
         self.springs[coordinate] = total, free
         element.set("stiffness", numbers(total))
+        if joint is None and free == _LENGTH_OF_POSE:
+            free = np.nextafter(free, 0.0)
         element.set("springlength" if joint is None else "springref", numbers(free))
-        element.set("damping", numbers(float(element.get("damping", 0.0)) + float(own.damping)))
         return None
 
     def write_SpringDamper(self, part):
@@ -123,7 +149,7 @@ class _Writer:
         ]
         if len(balls) != 1:
             return False
-        self.tree.elements[balls[0].name].set("damping", numbers(part.part.damping))
+        _add(self.tree.elements[balls[0].name], "damping", part.part.damping)
         return None
 
     def write_Actuator(self, part):
@@ -132,13 +158,18 @@ class _Writer:
         joint = self.tree.coordinates.get(coordinate)
         if joint is None and coordinate not in self.tendons:
             return False
+        gain, bias = np.array(own.gain), np.array(own.bias)
+        if joint is not None and (gain[1] or bias[1]):
+            ahead = float(own.gear) * self.ahead(part, joint, own.middle)
+            gain[0] -= ahead * gain[1]
+            bias[0] -= ahead * bias[1]
         target = {"tendon": coordinate.split(".")[0]} if joint is None else {"joint": joint.name}
         element = ElementTree.SubElement(self.sections["actuator"], "general", attrib=target | {"name": part.name})
         element.set("gear", numbers(own.gear))
         element.set("gaintype", "affine")
-        element.set("gainprm", numbers(own.gain))
+        element.set("gainprm", numbers(gain))
         element.set("biastype", "affine")
-        element.set("biasprm", numbers(own.bias))
+        element.set("biasprm", numbers(bias))
         if own.lag is not None:
             element.set("dyntype", "filterexact")
             element.set("dynprm", numbers(own.lag))
@@ -151,7 +182,14 @@ class _Writer:
         own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
-        self.tree.elements[joint.name].set("range", numbers((own.lower, own.upper)))
+        lower, upper = float(own.lower), float(own.upper)
+        ahead = self.ahead(part, joint, 0.5 * (lower + upper))
+        least, most = self.ranges.get(joint.name, (-np.inf, np.inf))
+        lower, upper = max(least, lower + ahead), min(most, upper + ahead)
+        if lower >= upper:
+            return False
+        self.ranges[joint.name] = lower, upper
+        self.tree.elements[joint.name].set("range", numbers((lower, upper)))
         self.notes.say("Stops are MuJoCo's limits, of its own stiffness: {}.", part.name)
         return None
 
@@ -159,6 +197,11 @@ class _Writer:
         own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
-        self.tree.elements[joint.name].set("frictionloss", numbers(own.force))
+        _add(self.tree.elements[joint.name], "frictionloss", own.force)
         self.notes.say("Dry friction is MuJoCo's frictionloss: {}.", part.name)
         return None
+
+
+def _add(element, name, value):
+    """Add to a number of an element, which several parts may give."""
+    element.set(name, numbers(float(element.get(name, 0.0)) + float(value)))

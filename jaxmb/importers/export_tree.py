@@ -10,6 +10,7 @@ import numpy as np
 
 from ..bodies import RigidBodySystem
 from ..parts.base import GROUND, AbstractInertialConstraint
+from ..parts.coordinate_parts import turns
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
 from .description import rotation_of, turn_about
@@ -42,6 +43,16 @@ class PlacedPart:
     def direction(self, field: str, k: int = 0) -> np.ndarray:
         """A direction of the part that is fixed in its k-th body, in the world."""
         return rotation_of(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
+
+    def is_periodic(self, k: int = 0) -> bool:
+        """Whether the k-th coordinate that the part acts on is an angle known up to full turns."""
+        return self.acts_on[k].partition(".")[2] in self.part.joints[str(k)].periodic
+
+    def turns(self, value: float, about: Any, k: int = 0) -> float:
+        """By how many full turns [rad] a value of its k-th coordinate is ahead of the one that the part sees, of an
+        angle the one within half a turn of another.
+        """
+        return float(turns(jnp.asarray(value - about).reshape(()))) if self.is_periodic(k) else 0.0
 
     def coordinates(self) -> dict[str, np.ndarray]:
         found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
@@ -301,10 +312,13 @@ def _close_coupling(part, tree):
     if None in joints or own.coefficients.ndim > 1 or own.coefficients.size > 5:
         return None
     x, y = joints
-    shift = np.polynomial.Polynomial([y.value - float(own.other_zero), 1.0])
+    seen = y.value - float(own.other_zero)
+    shift = np.polynomial.Polynomial([seen - part.turns(seen, 0.0, 1), 1.0])
     polynomial = np.polynomial.Polynomial(np.asarray(own.coefficients))(shift)
     powers = np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
     powers[0] += float(own.zero) - x.value
+    # The row is taken up to full turns of x as well.
+    powers[0] -= part.turns(powers[0], 0.0)
     return [("joint", {"name": part.name, "joint1": x.name, "joint2": y.name, "polycoef": numbers(powers)})]
 
 
@@ -313,7 +327,8 @@ def _close_driver(part, tree):
     joint = tree.coordinates.get(part.acts_on[0])
     if joint is None or joint.type == "ball" or np.any(np.asarray(own.rate)):
         return None
-    constant = [float(np.reshape(own.value, -1)[0]) - joint.value, *itertools.repeat(0.0, 4)]
+    off = float(np.reshape(own.value, -1)[0]) - joint.value
+    constant = [off - part.turns(off, 0.0), *itertools.repeat(0.0, 4)]
     return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
 
 

@@ -30,8 +30,9 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     ```
 
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
-    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`. Several
-    joints of one body are one `spatial.Composite`, of which each is a coordinate.
+    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`; of a `weld`
+    whose `torquescale` is zero the point only. Several joints of one body are one `spatial.Composite`, of which each is
+    a coordinate.
 
     **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
     such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
@@ -208,14 +209,16 @@ def _tendon_coupling(mujoco, model, names, name, one, two, data):
 def _loop(mujoco, model, names, name, k, data):
     one, two = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
     weld = model.eq_type[k] == mujoco.mjtEq.mjEQ_WELD
+    # MuJoCo multiplies the residuals of a weld's rotation by this number: with zero it holds the point only.
+    holds_rotation = weld and data[10] != 0
     if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
         a, b = (names("body", model.site_bodyid[site]) for site in (one, two))
         turns = [rotation_of(model.site_quat[site]) for site in (one, two)]
         points = [np.array(model.site_pos[site]) for site in (one, two)]
-        return Loop(name, a, b, points[0], points[1], turns[0] @ turns[1].T if weld else None)
+        return Loop(name, a, b, points[0], points[1], turns[0] @ turns[1].T if holds_rotation else None)
     a, b = names("body", one), names("body", two)
     if weld:
-        return Loop(name, a, b, data[3:6], data[0:3], rotation_of(data[6:10]))
+        return Loop(name, a, b, data[3:6], data[0:3], rotation_of(data[6:10]) if holds_rotation else None)
     return Loop(name, a, b, data[0:3], data[3:6])
 
 

@@ -69,6 +69,107 @@ def test_a_scene_read_back_moves_alike():
     np.testing.assert_allclose(accelerations_at(again, one), expected, rtol=0, atol=1e-11)
 
 
+def hinged(*forces, joints=(), angle=0.0, other=0.0):
+    """MuJoCo's model of two arms on hinges at some angles, and the notes."""
+    bodies, hinges = [], []
+    axes = {"axis": (0.0, 0.0, 1.0), "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
+    for name, turn in (("hinge", angle), ("pin", other)):
+        attitude = (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+        bodies.append(spatial.Body(f"arm of {name}", mass=1.0, inertia=(0.02, 0.09, 0.07), orientation=attitude))
+        hinges.append(spatial.Revolute(name, "ground", f"arm of {name}", point=(0.0, 0.0, 0.0), **axes))
+    system = mb.Scene(bodies, joints=[*hinges, *joints], forces=forces).compile()
+    exported = importers.to_mjcf(system)
+    return mujoco.MjModel.from_xml_string(exported.text), exported.notes
+
+
+def test_what_several_parts_of_a_joint_do_adds_up():
+    spring = lambda name, **more: mb.JointSpring(name, "hinge.angle", free=0.1, **more)
+    stop = lambda name, *ends: mb.JointStop(name, "hinge.angle", lower=ends[0], upper=ends[1], stiffness=1e3)
+    rub = lambda name, force: mb.JointFriction(name, "hinge.angle", force=force)
+    springs = spring("a", stiffness=2.0, damping=0.1), spring("b", stiffness=0.0, damping=0.3)
+    model, _ = hinged(*springs, rub("c", 0.2), rub("d", 0.5), stop("e", -1.0, 0.6), stop("f", -0.8, 0.9))
+    assert model.dof_frictionloss[0] == pytest.approx(0.7, rel=1e-15)
+    assert model.dof_damping[0] == pytest.approx(0.4, rel=1e-15)
+    assert model.jnt_stiffness[0] == 2.0 and model.qpos_spring[0] == 0.1
+    np.testing.assert_array_equal(model.jnt_range[0], [-0.8, 0.6])
+
+
+def test_stops_of_a_joint_that_leave_no_range():
+    stop = lambda name, *ends: mb.JointStop(name, "hinge.angle", lower=ends[0], upper=ends[1], stiffness=1e3)
+    with pytest.raises(ValueError, match="JointStop 'b' cannot be expressed"):
+        hinged(stop("a", -1.0, -0.6), stop("b", 0.2, 0.9))
+
+
+def test_dampers_of_a_ball_joint_add_up():
+    ball = spatial.Body("ball", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    oil = [spatial.RotationalDamper(name, "ground", "ball", damping=c) for name, c in (("a", 0.02), ("b", 0.05))]
+    socket = spatial.Spherical("socket", "ground", "ball", point=(0.0, 0.0, 0.0))
+    text = importers.to_mjcf(mb.Scene([ball], joints=[socket], forces=oil).compile()).text
+    np.testing.assert_allclose(mujoco.MjModel.from_xml_string(text).dof_damping, 0.07, rtol=1e-15)
+
+
+TURN = 2 * np.pi
+
+
+@pytest.mark.parametrize(
+    "angle, springs, stretch, noted",
+    [
+        (3.0, {"a": {"free": 0.5, "middle": 1.0}}, 2.5, ()),
+        (3.0, {"a": {"free": -3.0}}, 6.0 - TURN, ("'a'.",)),
+        (3.5, {"a": {"free": 3.2, "middle": 4.0}}, 0.3, ()),
+        (3.5, {"a": {"free": -7.0, "middle": -8.0}}, 10.5 - 2 * TURN, ()),
+        (3.5, {"a": {"free": 3.2, "middle": 4.0}, "b": {"free": -1.0, "middle": -2.0}}, 2.4 - TURN / 2, ("'a', 'b'.",)),
+    ],
+)
+def test_springs_count_the_turns_of_an_angle(angle, springs, stretch, noted):
+    """What is written is right at the given pose; a note says where MuJoCo counts on otherwise."""
+    forces = [mb.JointSpring(name, "hinge.angle", stiffness=2.0, **own) for name, own in springs.items()]
+    model, notes = hinged(*forces, angle=angle)
+    assert model.qpos0[0] - model.qpos_spring[0] == pytest.approx(stretch, rel=1e-13)
+    assert [note.rpartition("; MuJoCo counts it on from the given pose: ")[2] for note in notes] == list(noted)
+
+
+def test_stops_and_actuators_count_the_turns_of_an_angle():
+    """At 3.5 rad, which MuJoCo has less a full turn."""
+    stop = mb.JointStop("stop", "hinge.angle", lower=3.0, upper=4.0, stiffness=1e3)
+    servo = mb.Actuator(
+        "servo", "hinge.angle", gear=1.5, gain=(5.0, 0.3, 0.1), bias=(0.2, -5.0, -1.0), middle=4.0, control=0.7
+    )
+    model, notes = hinged(stop, servo, angle=3.5)
+    assert model.qpos0[0] == pytest.approx(3.5 - TURN, rel=1e-14)
+    np.testing.assert_allclose(model.jnt_range[0], [3.0 - TURN, 4.0 - TURN], rtol=1e-14)
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 0.7
+    mujoco.mj_forward(model, data)
+    # f = (5 + 0.3 l) control + 0.2 − 5 l with l = 1.5 · 3.5.
+    assert data.actuator_force[0] == pytest.approx((5 + 0.3 * 5.25) * 0.7 + 0.2 - 5 * 5.25, rel=1e-13)
+    assert notes == ("Stops are MuJoCo's limits, of its own stiffness: 'stop'.",)
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        mb.JointDriver("drive", "hinge.angle", value=3.5),
+        # 0.5 = −0.5 + 2 (3.5 − 3), and 3.5 − 3 = 1 − 0.5 + 0 · 0.5².
+        mb.JointCoupling("gear", "pin.angle", "hinge.angle", coefficients=(-0.5, 2.0), zero=0.0, other_zero=3.0),
+        mb.JointCoupling("gear", "hinge.angle", "pin.angle", coefficients=(1.0, -1.0, 0.0), zero=3.0, other_zero=0.0),
+    ],
+)
+def test_equalities_count_the_turns_of_an_angle(equality):
+    """They hold where they hold here, at 3.5 rad, which MuJoCo has less a full turn."""
+    model, _ = hinged(joints=[equality], angle=3.5, other=0.5)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.efc_pos, [0.0], atol=1e-14)
+
+
+def test_a_spring_of_a_tendon_whose_free_length_is_minus_one():
+    """MuJoCo reads −1 as the length at the pose of the file."""
+    cord = mb.FixedTendon("cord", "hinge.angle", coefficients=(1.0,))
+    model, _ = hinged(mb.JointSpring("a", "cord.length", stiffness=2.0, free=-1.0), joints=[cord], angle=0.3)
+    np.testing.assert_allclose(model.tendon_lengthspring[0], -1.0, rtol=1e-15)
+
+
 # Those of the library that MuJoCo can express. `rolling_disc`, `net`, `swash_plate`, `double_wishbone` and
 # `spherical_four_bar` have constraints or forces that it has not.
 MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "spatial_loop", "cable")

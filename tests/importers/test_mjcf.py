@@ -225,6 +225,17 @@ def test_what_is_exact(joints, more, name, fields):
     assert all(re.search(said, note) for note in model.notes)
 
 
+@pytest.mark.parametrize("ends", ['body1="a" anchor=".1 .2 .3" relpose=".5 .2 .3 1 0 0 0"', 'site1="s" site2="o"'])
+@pytest.mark.parametrize("scale, kind", [("0", "Spherical"), ("3", "Fixed")])
+def test_a_weld_without_torque_holds_its_point_only(ends, scale, kind):
+    bodies = '<site name="o" pos=".1 .2 .3"/>' + rod("a", HINGE, '<site name="s" pos=".5 .2 .3"/>')
+    model = importers.mjcf(file(bodies, f'<equality><weld name="loop" {ends} torquescale="{scale}"/></equality>'))
+    own = part(model, "loop")
+    assert own.kind == kind and (own.body_a, own.body_b) == ("a", "ground")
+    np.testing.assert_allclose(own.point_b, [0.1, 0.2, 0.3], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(own.point_a, [0.5, 0.2, 0.3], rtol=0, atol=1e-15)
+
+
 def test_inertia_names_and_frames():
     inside = '<geom type="sphere" size=".02"/><site name="eye" pos="1 0 0"/>'
     fixed = f'<body name="sensor" pos="0 0 .1" euler="0 0 90">{inside}</body>'
