@@ -50,8 +50,7 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     if not system.spatial:
         raise ValueError("to_mjcf needs a spatial scene.")
     notes = Notes(checked_ignore(ignore))
-    poses = np.asarray(system.poses((system.guess if state is None else state).q))
-    tree = spanning_tree(system, poses, notes)
+    tree = spanning_tree(system, (system.guess if state is None else state).q, notes)
     root = ElementTree.Element("mujoco", model="scene")
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
     gravity = np.zeros(3) if system.gravity is None else np.asarray(system.gravity)

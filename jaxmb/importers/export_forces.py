@@ -24,15 +24,15 @@ def write_forces(
 ) -> None:
     """Write the forces, inertias of joints, tendons and frames of a system."""
     writer = _Writer(tree, elements, sections, notes)
-    for part in parts_of(system, system.tendons, tree.poses):
+    for part in parts_of(system, system.tendons, tree.poses, tree.scalars):
         writer.tendon(part)
-    for part in parts_of(system, system.forces, tree.poses):
+    for part in parts_of(system, system.forces, tree.poses, tree.scalars):
         if notes.leaves_out("forces", part.name):
             continue
         write = getattr(writer, f"write_{part.kind}", None)
         if write is None or write(part) is False:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-    for part in parts_of(system, system.constraints, tree.poses):
+    for part in parts_of(system, system.constraints, tree.poses, tree.scalars):
         if not isinstance(part.part, AbstractInertialConstraint) or notes.leaves_out("joints", part.name):
             continue
         if isinstance(part.part, AbstractUnilateralConstraint):
@@ -51,6 +51,8 @@ class _Writer:
     def __init__(self, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes):
         self.tree, self.elements, self.sections, self.notes = tree, elements, sections, notes
         self.tendons: dict[str, Any] = {}
+        # How far MuJoCo's lengths of tendons are ahead of those here, which may have wound up by full turns.
+        self.lengths: dict[str, float] = {}
         self.springs: dict[str, tuple[float, float]] = {}
         # By names of joints: the range that stops leave; and for each part how far the joint is ahead of what it sees.
         self.ranges: dict[str, tuple[float, float]] = {}
@@ -64,10 +66,14 @@ class _Writer:
         if rotation is not None:
             own.set("quat", numbers(from_matrix(back @ rotation)))
 
-    def ahead(self, part, joint, about):
-        """By how many full turns [rad] MuJoCo's value of a joint is ahead of the one that a part sees, of an angle the
-        one within half a turn of another.
+    def ahead(self, part, about):
+        """How far MuJoCo's value of a part's coordinate is ahead of the one that the part sees, of an angle the one
+        within half a turn of another: full turns, or what a tendon winds up in these.
         """
+        (coordinate,) = part.acts_on
+        joint = self.tree.coordinates.get(coordinate)
+        if joint is None:
+            return self.lengths.get(coordinate, 0.0)
         turns = part.turns(joint.value, about)
         self.turns.setdefault(joint.name, {})[part.name] = turns
         return turns
@@ -87,12 +93,16 @@ class _Writer:
                 ElementTree.SubElement(element, "site", site=f"{part.name} {k}")
         else:
             element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)
-            for name, coefficient in zip(part.acts_on, np.asarray(own.coefficients), strict=True):
+            counts, ahead = iter(part.scalars), 0.0
+            for k, (name, coefficient) in enumerate(zip(part.acts_on, np.asarray(own.coefficients), strict=True)):
                 joint = self.tree.coordinates.get(name)
                 if joint is None:
                     self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
                     return
                 ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
+                if part.is_periodic(k):
+                    ahead += float(coefficient) * part.turns(joint.value, next(counts), k)
+            self.lengths[f"{part.name}.length"] = ahead
         self.tendons[f"{part.name}.length"] = element
 
     def inertia(self, part):
@@ -115,10 +125,9 @@ class _Writer:
         stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
         if stiffness == 0:
             return None
-        if joint is not None:
-            if part.is_periodic() and own.middle is None:
-                self.notes.say(_COUNTS, part.name)
-            free += self.ahead(part, joint, free if own.middle is None else own.middle)
+        if joint is not None and part.is_periodic() and own.middle is None:
+            self.notes.say(_COUNTS, part.name)
+        free += self.ahead(part, free if own.middle is None else own.middle)
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))
         total = before + stiffness
         free = (before * its_free + stiffness * free) / total
@@ -159,8 +168,8 @@ class _Writer:
         if joint is None and coordinate not in self.tendons:
             return False
         gain, bias = np.array(own.gain), np.array(own.bias)
-        if joint is not None and (gain[1] or bias[1]):
-            ahead = float(own.gear) * self.ahead(part, joint, own.middle)
+        if gain[1] or bias[1]:
+            ahead = float(own.gear) * self.ahead(part, own.middle)
             gain[0] -= ahead * gain[1]
             bias[0] -= ahead * bias[1]
         target = {"tendon": coordinate.split(".")[0]} if joint is None else {"joint": joint.name}
@@ -183,7 +192,7 @@ class _Writer:
         if joint is None:
             return False
         lower, upper = float(own.lower), float(own.upper)
-        ahead = self.ahead(part, joint, 0.5 * (lower + upper))
+        ahead = self.ahead(part, 0.5 * (lower + upper))
         least, most = self.ranges.get(joint.name, (-np.inf, np.inf))
         lower, upper = max(least, lower + ahead), min(most, upper + ahead)
         if lower >= upper:

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 
+from .._types import Coordinates
 from ..bodies import RigidBodySystem
 from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.coordinate_parts import turns
@@ -24,8 +25,8 @@ def numbers(values: Any) -> str:
 
 @dataclasses.dataclass
 class PlacedPart:
-    """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, and the coordinates
-    of joints that it acts on.
+    """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, the coordinates of
+    joints that it acts on, and the values of its scalar coordinates.
     """
 
     name: str
@@ -34,6 +35,7 @@ class PlacedPart:
     bodies: tuple[str, ...]
     poses: np.ndarray
     acts_on: tuple[str, ...]
+    scalars: tuple[float, ...]
 
     def point(self, k: int) -> np.ndarray:
         """The part's point on its k-th body, in the world [m]."""
@@ -94,10 +96,11 @@ class LoopEqualities:
 @dataclasses.dataclass
 class Tree:
     """The bodies in order, parents first; the constraints that close loops; and for each coordinate, `"hip.angle"`, the
-    name of MuJoCo's joint. `elements`: the XML elements of joints.
+    name of MuJoCo's joint. `scalars`: the scalar coordinates of the scene; `elements`: the XML elements of joints.
     """
 
     poses: dict[str, np.ndarray]
+    scalars: np.ndarray
     nodes: list[TreeBody] = dataclasses.field(default_factory=list)
     loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
     coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
@@ -108,17 +111,20 @@ class Tree:
         return self.poses[body]
 
 
-def parts_of(system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray]) -> list[PlacedPart]:
-    """The parts of some groups."""
-    # Scalar coordinates are no bodies.
+def parts_of(
+    system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray], scalars: np.ndarray
+) -> list[PlacedPart]:
+    """The parts of some groups, at the poses of bodies by name and the values of the system's scalar coordinates."""
+    # Scalar coordinates are no bodies; their numbers are those after the bodies'.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
             own = group.group.single(k, jnp.zeros(()))
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
+            values = tuple(float(scalars[n - len(system.body_names)]) for n in group.group.bodies[k] if n not in names)
             places = np.stack([poses[body] for body in bodies])
             places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k)))
+            out.append(PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k), values))
     return out
 
 
@@ -130,13 +136,15 @@ def _acts_on(group, part, k):
     return tuple(f"{name}.{own}" for name, own in zip(names, within, strict=False))
 
 
-def spanning_tree(system: RigidBodySystem, poses: np.ndarray, notes: Notes) -> Tree:
+def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
     """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
+    poses = np.asarray(system.poses(q))
+    scalars = np.asarray(system.prepared_poses(q))[len(poses) : -1, 0]
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
-    tree = Tree(places)
+    tree = Tree(places, scalars)
     parts = [
         p
-        for p in parts_of(system, (*system.constraints, *system.free_joints), places)
+        for p in parts_of(system, (*system.constraints, *system.free_joints), places, scalars)
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))

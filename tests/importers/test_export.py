@@ -170,6 +170,20 @@ def test_a_spring_of_a_tendon_whose_free_length_is_minus_one():
     np.testing.assert_allclose(model.tendon_lengthspring[0], -1.0, rtol=1e-15)
 
 
+def test_a_cord_that_has_wound_up():
+    """Its length counts full turns of the hinge, of which MuJoCo's has none at the given pose."""
+    body = spatial.Body("arm", mass=1.0, inertia=(0.02, 0.09, 0.07))
+    hinge = spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    cord = mb.FixedTendon("cord", "hinge.angle", coefficients=(0.3,))
+    spring = mb.JointSpring("spring", "cord.length", stiffness=2.0, free=0.5)
+    servo = mb.Actuator("servo", "cord.length", gear=1.5, bias=(0.2, -5.0, -1.0))
+    system = mb.Scene([body], joints=[hinge, cord], forces=[spring, servo]).compile()
+    wound = mb.State(system.guess.q.at[-1].set(2 * TURN), system.guess.u)
+    model = mujoco.MjModel.from_xml_string(importers.to_mjcf(system, wound).text)
+    np.testing.assert_allclose(model.tendon_lengthspring[0], 0.5 - 0.6 * TURN, rtol=1e-14)
+    assert model.actuator_biasprm[0, 0] == pytest.approx(0.2 - 5.0 * 1.5 * 0.6 * TURN, rel=1e-14)
+
+
 # Those of the library that MuJoCo can express. `rolling_disc`, `net`, `swash_plate`, `double_wishbone` and
 # `spherical_four_bar` have constraints or forces that it has not.
 MACHINES = ("heavy_top", "free_body", "spatial_slider_crank", "bricard", "bennett", "spatial_loop", "cable")
