@@ -28,19 +28,26 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
 
     def run(here, size, left, number):
         del number
+        unit = _unit(trials, here, size, tol)
+        values, slopes, equal = _one_sided(trials, unit)
+        constraints = [
+            {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
+            for kind, own in (("eq", equal), ("ineq", ~equal))
+            if own.any()
+        ]
         result = _quietly(
             optimize.minimize,
-            lambda z: _value(trials, z, size),
-            here.z,
-            jac=lambda z: _good(trials, z).jacobian[0] / size,
+            lambda y: _value(trials, y * unit, size),
+            here.z / unit,
+            jac=lambda y: _good(trials, y * unit).jacobian[0] * unit / size,
             method="SLSQP",
-            bounds=optimize.Bounds(*trials.box),
-            constraints=_one_sided(trials),
-            callback=trials.record,
+            bounds=optimize.Bounds(*(side / unit for side in trials.box)),
+            constraints=constraints,
+            callback=lambda y: trials.record(y * unit),
             options={"ftol": tol, "maxiter": left},
         )
         if result.status == 0:
-            trials.ended(result.x)
+            trials.ended(result.x * unit)
         return result.nit, result.status == 0, str(result.message)
 
     return _repeated(run, trials, start, tol, limit)
@@ -49,12 +56,16 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
 def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
     """SciPy's trust-region interior point method, with quasi-Newton Hessians."""
     optimize = _scipy()
-    low, high = trials.limits.low / trials.scales, trials.limits.high / trials.scales
+    values, slopes, equal = _one_sided(trials, 1.0)
     constraints = []
-    if trials.scales.size:
-        values = lambda z: _good(trials, z).rows[1:] / trials.scales
-        slopes = lambda z: _good(trials, z).jacobian[1:] / trials.scales[:, None]
-        constraints = [optimize.NonlinearConstraint(values, low, high, jac=slopes, hess=optimize.BFGS())]
+    if equal.size:
+        high = np.where(equal, 0.0, np.inf)
+        constraints = [optimize.NonlinearConstraint(values, 0.0, high, jac=slopes, hess=optimize.BFGS())]
+
+    def ended(z, state):
+        """SciPy's own test disregards the barrier, which keeps the result off the bounds of constraints."""
+        trials.record(z)
+        return max(state.optimality, state.constr_violation, state.get("barrier_parameter", 0.0)) < tol
 
     def run(here, size, left, number):
         result = _quietly(
@@ -66,11 +77,13 @@ def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[
             method="trust-constr",
             bounds=optimize.Bounds(*trials.box, keep_feasible=True),
             constraints=constraints,
-            callback=lambda z, state: trials.record(z),
-            options={"gtol": tol, "xtol": tol, "barrier_tol": tol, "maxiter": left}
+            callback=ended,
+            options={"gtol": 0.0, "xtol": tol, "barrier_tol": tol, "maxiter": left}
             | {name: max(_BARRIER**number, tol) for name in ("initial_barrier_parameter", "initial_barrier_tolerance")},
         )
-        return result.nit, result.status in (1, 2), str(result.message)
+        # The trust region may have become too small for steps as well; without a tolerance SciPy calls that 4.
+        well = result.status == 3 or (result.status in (2, 4) and result.constr_violation <= tol)
+        return result.nit, well, "converged" if well else str(result.message)
 
     return _repeated(run, trials, start, tol, limit)
 
@@ -97,48 +110,64 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
     return ended, message.strip().rstrip(".")
 
 
-def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, float]:
+def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What one unit more of each constraint's bound would gain of the objective, which constraints are active, and the
-    largest component of the gradient of the objective that they do not balance.
+    part of the gradient of the objective that they and the bounds of parameters do not balance.
 
     The multipliers are those that come closest, in least squares, to balancing the gradient of the objective with those
-    of active constraints and bounds.
+    of active constraints and bounds, each of which only pushes inwards.
     """
     low, high, values = trials.limits.low, trials.limits.high, trial.rows[1:]
-    near = 10 * HOLDS * trials.scales
-    below, above = values <= low + near, values >= high - near
-    active = below | above
-    at_bound = (trial.z <= trials.box[0]) | (trial.z >= trials.box[1])
-    # A constraint without a gradient, such as a gap that is closed, balances nothing.
-    gradients = np.where(active[:, None], trial.jacobian[1:], 0.0)[:, ~at_bound]
-    found = np.linalg.lstsq(gradients.T, trial.jacobian[0, ~at_bound], rcond=1e-10)[0] if active.any() else 0.0 * values
-    signed = np.where(below, found, -found)
-    left = float(np.max(np.abs(trial.jacobian[0, ~at_bound] - gradients.T @ found), initial=0.0))
-    return np.where(active, np.where(low == high, np.abs(found), signed), 0.0) + 0.0, active, left
+    near = 10 * HOLDS
+    below, above = values <= low + near * trials.scales[0], values >= high - near * trials.scales[1]
+    at_low, at_high = trial.z <= trials.box[0] + near, trial.z >= trials.box[1] - near
+    gradient, slopes, axes = trial.jacobian[0], trial.jacobian[1:], np.eye(trial.z.size)
+    inwards = np.vstack([slopes[below], -slopes[above], axes[at_low], -axes[at_high]])
+    # The solver's tolerance is absolute: all are made of length one. A constraint without a gradient, such as a gap
+    # that is closed, balances nothing.
+    length, lengths = (x + (x == 0) for x in (np.linalg.norm(gradient), np.linalg.norm(inwards, axis=1)))
+    found = np.zeros(0)
+    # SciPy's solver crashes without unknowns.
+    if inwards.size:
+        found = _scipy().nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
+    sides = np.zeros((2, low.size))
+    sides[0, below], sides[1, above], _ = np.split(found, np.cumsum([below.sum(), above.sum()]))
+    sizes = np.where(low == high, np.abs(sides[0] - sides[1]), sides.sum(axis=0))
+    return sizes, below | above, gradient - inwards.T @ found
 
 
-def _one_sided(trials: Trials) -> list[dict[str, Any]]:
-    """The constraints as SLSQP wants them: equations, and functions that are not negative."""
-    limits, scales = trials.limits, trials.scales
-    out = []
-
-    def add(kind: str, which: np.ndarray, sign: float, bound: np.ndarray) -> None:
-        if which.any():
-            value = lambda z: (sign * (_good(trials, z).rows[1:] - bound) / scales)[which]
-            slope = lambda z: (sign * _good(trials, z).jacobian[1:] / scales[:, None])[which]
-            out.append({"type": kind, "fun": value, "jac": slope})
-
+def _one_sided(trials: Trials, unit: float):
+    """The constraints as SciPy wants them, relative to the sizes of their sides: functions of z in a unit, which are
+    not negative, or zero for equations; their derivatives; and which of them are equations.
+    """
+    limits = trials.limits
     equal = limits.low == limits.high
-    add("eq", equal, 1.0, limits.low)
-    add("ineq", np.isfinite(limits.low) & ~equal, 1.0, limits.low)
-    add("ineq", np.isfinite(limits.high) & ~equal, -1.0, limits.high)
-    return out
+    lower, upper = np.flatnonzero(np.isfinite(limits.low)), np.flatnonzero(np.isfinite(limits.high) & ~equal)
+    which = 1 + np.concatenate([lower, upper])
+    bounds = np.concatenate([limits.low[lower], limits.high[upper]])
+    scales = np.concatenate([trials.scales[0, lower], -trials.scales[1, upper]])
+    values = lambda y: (_good(trials, y * unit).rows[which] - bounds) / scales
+    slopes = lambda y: _good(trials, y * unit).jacobian[which] / scales[:, None] * unit
+    return values, slopes, np.concatenate([equal[lower], np.zeros(upper.size, bool)])
 
 
 def _size(trial: Trial) -> float:
     """The size of the objective, or of its change where parameters change by their scales, if that is larger."""
     size = max(abs(float(trial.rows[0])), float(np.max(np.abs(trial.jacobian[0]), initial=0.0)))
     return size if size > 0 else 1.0
+
+
+def _unit(trials: Trials, here: Trial, size: float, tol: float) -> float:
+    """The unit of parameters' changes for SLSQP, which takes a Hessian of one at first, and ends where the step that
+    follows from it promises less than the tolerance, as where the objective has a large constant part. There the unit
+    is such that the first step promises ten times the tolerance, unless it is then longer than one: what is left shows.
+
+    A power of two, so that nothing is rounded.
+    """
+    slope = float(np.linalg.norm(multipliers(trials, here)[2])) / size
+    if slope == 0 or slope**2 >= tol:
+        return 1.0
+    return 2.0 ** np.round(-0.5 * np.log2(max(slope, slope**2 / (10 * tol))))
 
 
 def _value(trials: Trials, z: np.ndarray, size: float) -> float:

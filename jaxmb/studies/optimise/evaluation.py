@@ -90,16 +90,17 @@ class Limits:
 
     def worst(self, values: np.ndarray, scales: np.ndarray) -> str:
         """The component that is farthest out of its bounds, relative to its size, in words."""
-        k = int(np.argmax(self.excess(values) / scales))
+        k = int(np.argmax(self.excess(values, scales)))
         low, high = self.low[k], self.high[k]
         if low == high:
             return f"{self.components[k]!r} is {values[k]:.6g} instead of {low:.6g}"
         side = f"below {low:.6g}" if values[k] < low else f"above {high:.6g}"
         return f"{self.components[k]!r} is {values[k]:.6g}, {side}"
 
-    def excess(self, values: np.ndarray) -> np.ndarray:
-        """How far components are out of their bounds; zero within."""
-        return np.maximum(np.maximum(self.low - values, values - self.high), 0.0)
+    def excess(self, values: np.ndarray, scales: np.ndarray) -> np.ndarray:
+        """How far components are out of their bounds, relative to the sizes of both sides; zero within."""
+        low, high = scales
+        return np.maximum(np.maximum((self.low - values) / low, (values - self.high) / high), 0.0)
 
 
 def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:

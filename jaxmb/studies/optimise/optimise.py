@@ -88,7 +88,7 @@ class Optimum:
         differentiated for it, of which `failed` trials were rejected.
     - `attempts`: all local optimisations, the best first, if there were several.
     - `success`: whether the method converged, at no edge beyond which trials fail, and all constraints hold, to 1e-6 of
-        their size; `message`: how it ended.
+        the bound, or where it is zero of their size; `message`: how it ended.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -192,7 +192,8 @@ def optimise(
     - `starts`: a number of starts: the given one, and others that fill the bounds evenly (a Sobol sequence by `seed`).
         All are evaluated in one batch, and the best `local` of them, default four at most, are optimised.
     - `max_iterations`, of each local optimisation; `tol`: the method's tolerance, of the objective relative to its size
-        (SLSQP), of the gradient and steps (trust-constr), of steps and objective (BFGS), or of a step (optax).
+        (SLSQP), of the gradient, the barrier and steps (trust-constr), of steps and objective (BFGS), or of a step
+        (optax).
     - `derivatives`: `"forward"`, cheaper for few parameters, or `"reverse"`, for many parameters and few outputs.
         `"auto"` chooses by their numbers, among the modes that the function allows. Values and derivatives of all that
         is needed come from one program.
@@ -204,7 +205,7 @@ def optimise(
     assembled and gives no warning of it: where the best designs lie there, constrain a margin as well, such as the sine
     of the transmission angle.
 
-    **Returns:** an `Optimum`, the best of all trials whose constraints hold to a millionth of their size; of
+    **Returns:** an `Optimum`, the best of all trials whose constraints hold to a millionth of their bounds; of
     `"slsqp"`, where it converged, the last one, unless a better one breaks them by no more.
 
     **Raises:** `ValueError` for unknown names, bounds that are reversed, a start out of bounds, an objective that is no
@@ -245,7 +246,7 @@ def optimise(
     best = trials.best
     sizes, active, unbalanced = multipliers(trials, best)
     slope = np.max(np.abs(trials.start.jacobian[0]), initial=0.0)
-    stuck = trials.failed > 0 and unbalanced > _BALANCED * slope
+    stuck = trials.failed > 0 and np.max(np.abs(unbalanced), initial=0.0) > _BALANCED * slope
     if stuck:
         message = f"{message}; trials fail where the objective decreases: constrain a margin from there"
     if spent:
@@ -330,9 +331,8 @@ def _best_starts(program: Program, limited: Limits, starts: int, local: int, see
     if not good.any():
         return []
     typical = np.median(np.abs(rows[good, 1:]), axis=0)
-    excess = np.array(
-        [np.max(limited.excess(r) / np.where(typical > 0, typical, 1.0), initial=0.0) for r in rows[:, 1:]]
-    )
+    scales = np.tile(np.where(typical > 0, typical, 1.0), (2, 1))
+    excess = np.array([np.max(limited.excess(r, scales), initial=0.0) for r in rows[:, 1:]])
     order = np.lexsort((rows[:, 0], np.where(excess > HOLDS, excess, 0.0), ~good))
     return [np.asarray(z[k], float) for k in order[:local] if good[k]]
 
@@ -359,7 +359,7 @@ def _from_nowhere(program, limited, shapes, first: Trial, box, most) -> tuple[Tr
     # In forward mode, since a reverse pass through anything that is NaN is NaN, whatever its weight.
     part = Program(program.function, program.space, tuple(finite), True)
     start = evaluate(part, first.z)
-    if not start.good or not kept.excess(start.rows).any():
+    if not start.good or not kept.excess(start.rows, np.ones((2, start.rows.size))).any():
         raise ValueError(f"{what}, and no constraint that is violated leads away from it. {cure}")
     found, spent = first_feasible(part, lambda z: evaluate(program, z), kept, first.z, box, most)
     if found is None:

@@ -80,7 +80,7 @@ class Trials:
 
     def violation(self, trial: Trial) -> float:
         """The largest violation of a constraint, relative to its size."""
-        return float(np.max(self.limits.excess(trial.rows[1:]) / self.scales, initial=0.0))
+        return float(np.max(self.limits.excess(trial.rows[1:], self.scales), initial=0.0))
 
     def merit(self, trial: Trial) -> tuple[float, float]:
         """What makes one trial better than another: first constraints that hold, then a small objective."""
@@ -108,12 +108,14 @@ def evaluate(program: Program, z: np.ndarray) -> Trial:
 
 
 def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
-    """Sizes of constraints: their largest bound, or where that is zero their first value or derivative."""
-    sides = np.abs(np.where(np.isfinite([limits.low, limits.high]), [limits.low, limits.high], 0.0))
-    size = np.max(sides, axis=0, initial=0.0)
-    first = np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0))
-    size = np.where(size > 0, size, first)
-    return np.where(size > 0, size, 1.0)
+    """Sizes of the lower and the upper side of constraints: their bounds, each its own, so that a far one does not
+    loosen the other; where it is zero, the other bound, or the first value or derivative if that is smaller.
+    """
+    known = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
+    own = known(np.abs([limits.low, limits.high]))
+    first = known(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
+    size = np.where(np.isfinite(own), own, np.minimum(own[::-1], first))
+    return np.where(np.isfinite(size), size, 1.0)
 
 
 def first_feasible(
@@ -140,11 +142,11 @@ def first_feasible(
     beyond = np.zeros_like(start)
     count = 1
     while count < most:
-        excess = limits.excess(here.rows) / scales
+        excess = limits.excess(here.rows, scales)
         violated = excess > 0
         if not violated.any():
             break
-        slope = np.where(here.rows < limits.low, -1.0, 1.0)[:, None] * here.jacobian / scales[:, None]
+        slope = np.where(here.rows < limits.low, -1 / scales[0], 1 / scales[1])[:, None] * here.jacobian
         step = -np.linalg.lstsq(slope[violated], excess[violated], rcond=1e-8)[0]
         # No step is longer than half the scale of a parameter.
         step *= min(1.0, 0.5 / max(np.max(np.abs(step)), 1e-300))
@@ -152,7 +154,7 @@ def first_feasible(
         while length > 1e-3 and count < most:
             trial = evaluate(program, np.clip(here.z + length * step, low, high))
             count += 1
-            smaller = np.linalg.norm(limits.excess(trial.rows) / scales) < (1 - 1e-3 * length) * np.linalg.norm(excess)
+            smaller = np.linalg.norm(limits.excess(trial.rows, scales)) < (1 - 1e-3 * length) * np.linalg.norm(excess)
             if trial.good and smaller:
                 moved = trial
                 break
@@ -161,7 +163,7 @@ def first_feasible(
             break
         beyond = moved.z - here.z
         here = moved
-        if np.max(limits.excess(here.rows) / scales) < 1e-2:
+        if np.max(limits.excess(here.rows, scales)) < 1e-2:
             break
     # The last steps, lengthened until the objective has a value.
     way = here.z - start if np.any(here.z != start) else beyond

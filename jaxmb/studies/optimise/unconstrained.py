@@ -17,14 +17,14 @@ from .trials import Trial, Trials
 def bfgs(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
     """BFGS with a line search that takes the infinite value of a trial that failed for a step too long."""
     solver = optx.BFGS(rtol=tol, atol=tol)
-    program = trials.program
+    program, size = trials.program, _size(start, tol)
     options = {"autodiff_mode": "fwd" if program.forward else "bwd"}
     y = jnp.asarray(start.z, jnp.result_type(float))
     structure = jax.eval_shape(lambda: y[0])
     tags: frozenset[object] = frozenset()
-    state = solver.init(_objective, y, program, options, structure, None, tags)
+    state = solver.init(_objective, y, (program, size), options, structure, None, tags)
     for _ in range(limit):
-        y, state, done, result = _bfgs_step(solver, program, y, state, options["autodiff_mode"])
+        y, state, done, result = _bfgs_step(solver, (program, size), y, state, options["autodiff_mode"])
         z = np.asarray(y, float)
         if not np.array_equal(z, trials.last.z):
             trials.record(z)
@@ -34,16 +34,26 @@ def bfgs(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, st
     return False, "the iterations are used up"
 
 
-def _objective(z, program: Program):
-    value = program.rows(z)[0][0]
+def _size(start: Trial, tol: float) -> Any:
+    """The change of the objective where parameters change by their scales, which a constant part of it does not enter;
+    where its tolerance is larger, that.
+    """
+    size = max(float(np.max(np.abs(start.jacobian[0]), initial=0.0)), tol * abs(float(start.rows[0])))
+    return jnp.asarray(size if size > 0 else 1.0, jnp.result_type(float))
+
+
+def _objective(z, problem: tuple[Program, Any]):
+    """The objective in units of its size: optimistix disregards changes of it below rounding errors of one."""
+    program, size = problem
+    value = program.rows(z)[0][0] / size
     return jnp.where(jnp.isfinite(value), value, jnp.inf), None
 
 
 @eqx.filter_jit
-def _bfgs_step(solver: Any, program: Program, y: Any, state: Any, mode: str):
+def _bfgs_step(solver: Any, problem: tuple[Program, Any], y: Any, state: Any, mode: str):
     options, tags = {"autodiff_mode": mode}, frozenset()
-    y, state, _ = solver.step(_objective, y, program, options, state, tags)
-    done, result = solver.terminate(_objective, y, program, options, state, tags)
+    y, state, _ = solver.step(_objective, y, problem, options, state, tags)
+    done, result = solver.terminate(_objective, y, problem, options, state, tags)
     return y, state, done, result
 
 

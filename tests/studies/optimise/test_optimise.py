@@ -62,6 +62,63 @@ def test_trust_constr_agrees(in_disk):
     np.testing.assert_allclose(other.constraints[0].multiplier, in_disk.constraints[0].multiplier, rtol=1e-2)
 
 
+@pytest.mark.parametrize("method", METHODS[:2])
+def test_a_far_bound_does_not_loosen_the_other(method):
+    area = lambda v: {"sum": v["x"] + v["y"], "area": v["x"] * v["y"]}
+    options = {"bounds": {"x": (0.1, 10.0), "y": (0.1, 10.0)}, "objective": "sum", "method": method}
+    best = mb.optimise(area, {"x": 5.0, "y": 2.0}, constraints={"area": (1.0, 1e7)}, **options)
+    np.testing.assert_allclose(best.objective, 2.0, rtol=1e-5)
+    assert best.success and best.outputs["area"] > 1 - 1e-6 and best.constraints[0].active
+
+
+def test_multipliers_of_trust_constr():
+    """Two constraints that meet, (x - 2)² + (y - 1)² and its multipliers of 2/3; a constraint and a bound."""
+    corner = lambda v: {"f": (v["x"] - 2) ** 2 + (v["y"] - 1) ** 2, "c": v["x"] ** 2 - v["y"], "d": v["x"] + v["y"]}
+    options = {"objective": "f", "method": "trust-constr"}
+    best = mb.optimise(corner, {"x": 0.5, "y": 0.5}, constraints={"c": (None, 0.0), "d": (None, 2.0)}, **options)
+    np.testing.assert_allclose(best.objective, 1.0, rtol=2e-7)
+    assert best.success and all(c.active for c in best.constraints)
+    np.testing.assert_allclose([c.multiplier for c in best.constraints], 2 / 3, rtol=1e-6)
+    options["bounds"] = {"x": (-1.0, 0.5)}
+    best = mb.optimise(corner, {"x": 0.0, "y": 0.0}, constraints={"d": (None, 1.0)}, **options)
+    np.testing.assert_allclose(best.constraints[0].multiplier, 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS[:3])
+def test_the_unit_of_the_objective_has_no_effect(method):
+    """Lengths of 1e-5, whose squares are small, in units that are powers of two: the same bits."""
+    square = lambda v, unit: unit * jnp.mean((v["x"] - jnp.array([3e-5, -2e-5])) ** 2)
+    small, large = (
+        mb.optimise(lambda v, unit=unit: square(v, unit), {"x": [1e-5, 1e-5]}, method=method)
+        for unit in (2.0**-40, 2.0**40)
+    )
+    assert small.success and large.success and small.trials == large.trials
+    np.testing.assert_array_equal(small.parameters["x"], large.parameters["x"])
+    np.testing.assert_allclose(small.parameters["x"], [3e-5, -2e-5], rtol=1e-8)
+
+
+def steep(x):
+    return (x[0] - 3) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
+
+
+def round_(x):
+    return jnp.sum((x - jnp.array([3.0, -2.0])) ** 2)
+
+
+@pytest.mark.parametrize("method", METHODS[:3])
+@pytest.mark.parametrize("varying, start", [(round_, [0.0, 0.0]), (steep, [0.5, 0.5])])
+def test_a_large_constant_part_of_the_objective_hides_nothing(method, varying, start):
+    best = mb.optimise(lambda v: 1e5 + varying(v["x"]), {"x": start}, method=method)
+    assert best.success and varying(best.parameters["x"]) < 1e-8 * 1e5
+
+
+def test_a_large_constant_part_where_the_start_is_on_a_bound_and_a_constraint():
+    outputs = lambda v: {"f": 1e5 + round_(v["x"]), "sum": jnp.sum(v["x"])}
+    options = {"constraints": {"sum": (0.0, None)}, "bounds": {"x": ([0.0, -np.inf], None)}}
+    best = mb.optimise(outputs, {"x": [0.0, 0.0]}, objective="f", **options)
+    assert best.success and round_(best.parameters["x"]) < 1e-8 * 1e5
+
+
 @pytest.mark.parametrize("method", ["slsqp", "trust-constr", "bfgs", optax.lbfgs()], ids=METHODS)
 def test_bounds_by_every_method(method):
     """The optimum on a bound: x = (0.8, 0.64)."""
