@@ -27,9 +27,10 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
+from .forces import over_ground
 from .shapes import Ground, marked_ball, wheel
 from .smooth import dry_friction, ramp, step
-from .terrain import AbstractTerrain, distance, outward, over_ground
+from .terrain import AbstractTerrain, distance, outward
 
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]

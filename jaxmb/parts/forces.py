@@ -1,15 +1,16 @@
 """Forces with the same definition in the plane and in space."""
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
-from .space import both_points, force_pair, rate_of, separation, separation_rate
+from .space import both_points, force_pair, rate_of, separation, separation_rate, with_drift
 
 
 class Gravity(AbstractPart):
@@ -24,6 +25,14 @@ class Gravity(AbstractPart):
 
     acceleration: fields.Number = fields.parameter(shape=("d",), unit="m/s²", kw_only=False)
     name: str = eqx.field(static=True, default="gravity", kw_only=True)
+
+
+def over_ground(part: Any, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
+    """A velocity [m/s] in the world, less that of the ground below a point, which rises and sinks where numbers of the
+    part's `terrain` are inputs.
+    """
+    upwards = jnp.zeros_like(point).at[-1].set(1.0)
+    return with_drift(part, velocity, lambda part: -part.terrain.height(point[:-1]) * upwards)
 
 
 def generalized_force(space, part, coordinates, poses, velocities, law):

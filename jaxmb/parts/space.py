@@ -127,7 +127,26 @@ def rate_of(
     poses: Float[Array, "k p"],
     velocities: Float[Array, "k v"],
 ) -> tuple[Array, Array]:
-    """The value and the rate of `function(part, poses)`, for numbers of the part that are inputs with their rates."""
+    """The value and the rate of `function(part, poses)`, which contains those of numbers of the part that are inputs.
+
+    ```python
+    class Rope(jaxmb.parts.AbstractPair, jaxmb.parts.AbstractForce):
+        drag: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N s/m", sign="positive")
+        point_a: jaxmb.parts.Number = jaxmb.parts.point(body=0, default="origin")
+        point_b: jaxmb.parts.Number = jaxmb.parts.point(body=1, default="origin")
+
+        def length(self, space, poses):
+            return jaxmb.rotations.norm(jaxmb.parts.separation(space, self, poses))
+
+        def wrenches(self, space, poses, velocities, t):
+            length, rate = jaxmb.parts.rate_of(space, self, lambda part, x: part.length(space, x), poses, velocities)
+            along = jaxmb.parts.separation(space, self, poses) / length
+            return jaxmb.parts.force_pair(space, self, poses, -self.drag * rate * along)
+
+    rope = Rope("rope", "ground", "bar", drag=2.0, point_a=(0.0, 1.0), point_b=(0.5, 0.0))
+    system = jaxmb.Scene([bar], joints=[pin], forces=[rope]).compile()
+    ```
+    """
     rates = jax.vmap(space.rates)(poses, velocities)
     value, rate = jax.jvp(lambda x: function(part, x), (poses,), (rates,))
     return value, with_drift(part, rate, lambda part: function(part, poses))
@@ -140,7 +159,8 @@ def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Arra
     if part.drift is None:
         return rate
     still = part.with_fields(drift=None)
-    return rate + eqx.filter_jvp(function, (still,), (part.drift,))[1]
+    moving = eqx.filter_jvp(function, (still,), (part.drift,))[1]
+    return rate if moving is None else rate + moving
 
 
 def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], force_W: Point) -> Float[Array, "2 v"]:

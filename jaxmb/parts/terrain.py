@@ -16,7 +16,6 @@ where z is up. A profile along x is constant along y, so it serves in both.
 
 import abc
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,6 @@ from ..linalg.arrays import is_traced
 from . import fields
 from .base import AbstractLaw
 from .smooth import step
-from .space import with_drift
 
 Place = Float[Array, "h"]
 
@@ -57,14 +55,6 @@ def outward(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, 
     """Unit outward normal of the ground below a point."""
     slope = jax.grad(terrain.height)(point[:-1])
     return jnp.ones_like(point).at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
-
-
-def over_ground(part: Any, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
-    """A velocity [m/s] in the world, less that of the ground below a point, which rises and sinks where numbers of the
-    part's `terrain` are inputs.
-    """
-    upwards = jnp.zeros_like(point).at[-1].set(1.0)
-    return with_drift(part, velocity, lambda part: -part.terrain.height(point[:-1]) * upwards)
 
 
 class Flat(AbstractTerrain):

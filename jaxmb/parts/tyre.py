@@ -15,10 +15,11 @@ from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
 from .boundary import check_returns
 from .contact import AbstractNormalLaw
+from .forces import over_ground
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .space import AbstractSpace, Point, Pose
-from .terrain import AbstractTerrain, distance, outward, over_ground
+from .terrain import AbstractTerrain, distance, outward
 
 
 class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):

@@ -18,9 +18,10 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
 from .coordinate_parts import AbstractScalarPart
+from .forces import over_ground
 from .shapes import Box, Ground, marked_ball, wheel
 from .space import AbstractSpace, both_points, separation
-from .terrain import AbstractTerrain, distance, over_ground
+from .terrain import AbstractTerrain, distance
 
 # The mode of a contact that is closed, as `jaxmb.system` numbers modes.
 _CLOSED = 1

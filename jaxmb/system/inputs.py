@@ -29,8 +29,8 @@ def with_inputs(system: System, inputs: Signals) -> System:
     Torques, forces, coefficients, lengths, points and the numbers of drivers and of user functions may be inputs. Their
     rates take part in the velocities and accelerations that constraints prescribe, and in the rates of coordinates and
     of points that forces act against; those of a terrain are velocities of the ground. Masses, moments of inertia,
-    gravity, the gains of servos, and points of compliant contacts and of joints that rub (`Friction`) may not. Derivatives with respect to the values of a series work as those with
-    respect to parameters.
+    gravity, the gains of servos, and points of compliant contacts and of joints that rub (`Friction`) may not.
+    Derivatives with respect to the values of a series work as those with respect to parameters.
 
     **Arguments:** `inputs`: a `Series`, or a function of time [s] that JAX can differentiate, by the name of the
     parameter that it replaces, `{"motor.torque": Series(ts, torques)}`.

@@ -63,8 +63,8 @@ class AbstractDisc(AbstractSpatialPart):
     radius: fields.Number = fields.length(sign="positive")
     axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
     centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
-    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
     normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
+    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
 
 
 def _lowest_rim_point(space, part, pose):

@@ -295,7 +295,7 @@ def channels_of(
         late = f"{name}.delay" in free
         channel = readings_of(sensor, data, deviation, shape, places[name], ts.shape[0], ts.dtype, late)
         if not late:
-            _check_delay(channel, np.asarray(ts), float(experiment.t0))
+            _check_delay(channel, np.asarray(ts), float(np.asarray(experiment.t0)))
         out.append(channel)
     if any(levels.values()) and not all(levels.values()):
         missing = next(name for name, there in levels.items() if not there)

@@ -161,7 +161,7 @@ def statuses(found: Returned) -> np.ndarray:
     ended = np.where(finite, OK, NOT_FINITE)
     if found.result is not None:
         names, code = list(messages_of(found.result)), codes_of(found.result)
-        # After an event the saved times that are left hold infinity, as in diffrax, and what is made of it is not looked at.
+        # After an event the saved times that are left hold infinity, as in diffrax, of which anything may come.
         by_event = code == (names.index("event_occurred") if "event_occurred" in names else -1)
         ended = np.where(code == 0, ended, np.where(by_event, OK, code + NOT_FINITE))
     return ended.astype(np.int16)
