@@ -29,7 +29,7 @@ BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 class Input(eqx.Module):
     """A number of stacked parts that is a function of time: the parameter's name, the keys that lead to it in the
-    part, the number of the part, and whether it `moves` what the part measures, so that its rate counts.
+    part, the number of the part, and whether it `moves` what the part measures, so that its rate counts as well.
     """
 
     signal: AbstractSignal
@@ -70,12 +70,15 @@ class Group(eqx.Module):
             where = lambda part, keys=own.keys: entry(part, keys)
             given = where(part)
             signal = lambda t, own=own, like=given: jnp.asarray(own.signal(t), like.dtype)
-            value, rate = jax.jvp(signal, (t,), (jnp.ones_like(t),)) if part.takes_drift else (signal(t), None)
-            part = eqx.tree_at(where, part, jnp.where(member == own.member, value, given))
-            if rate is not None:
+            if own.moves and part.takes_drift:
+                time = jnp.asarray(t, jnp.result_type(float))
+                value, rate = jax.jvp(signal, (time,), (jnp.ones_like(time),))
                 rate = jnp.where(member == own.member, rate, jnp.zeros_like(rate))
                 drift = eqx.tree_at(where, drift, rate, is_leaf=lambda x: x is None)
-        return part.with_fields(drift=drift) if self.inputs and part.takes_drift else part
+            else:
+                value = signal(t)
+            part = eqx.tree_at(where, part, jnp.where(member == own.member, value, given))
+        return part.with_fields(drift=drift) if jax.tree.leaves(drift) else part
 
     @property
     def body_index(self) -> np.ndarray:

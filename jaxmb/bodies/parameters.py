@@ -118,16 +118,17 @@ _BIND = (*_BIND_POSITIONS, "velocity_constraints", "servos")
 
 
 def signals_of(groups: Mapping[str, Sequence[Any]]) -> dict[str, tuple[AbstractSignal, bool]]:
-    """The inputs of some groups by name, and whether constraints, or velocities that forces depend on, do so on them.
+    """The inputs of some groups by name, and whether their rates count: in constraints, or in velocities that forces
+    depend on.
 
     **Arguments:** `groups`, by the name of the system's field that holds them.
     """
-    return {
-        own.name: (own.signal, kind in _BIND or own.moves)
-        for kind, of_kind in groups.items()
-        for g in of_kind
-        for own in g.group.inputs
-    }
+    out: dict[str, tuple[AbstractSignal, bool]] = {}
+    for kind, of_kind in groups.items():
+        for own in (own for g in of_kind for own in g.group.inputs):
+            _, counts = out.get(own.name, (own.signal, False))
+            out[own.name] = own.signal, counts or kind in _BIND or own.moves
+    return out
 
 
 def with_signals(
@@ -160,7 +161,7 @@ def with_signals(
             )
         varying.add(number.name)
         # All numbers of a joint place the coordinate that other parts measure.
-        moves = places or number.keys[0] == "joints"
+        moves = places or number.keys[0] == "joints" or number.keys[0] in part.moving
         own = Input(signal, number.name, number.keys, number.member, moves)
         new.setdefault((number.kind, number.group), []).append(own)
     for name in signals:

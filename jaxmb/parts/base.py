@@ -213,13 +213,15 @@ class AbstractActor(AbstractPart):
     """
 
     body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
-    # The rates of its numbers that are functions of time, in a part of None otherwise; None without any. See
-    # `with_drift`.
+    # The rates of its numbers that are functions of time and move what it measures, in a part of None otherwise; None
+    # without any. See `with_drift`.
     drift: Any = eqx.field(init=False, repr=False)
     # When a scene settles the part: 0 from its bodies, 1 after the joints between them, 2 after tendons as well.
     stage: ClassVar[int] = 0
-    # Whether its kernels are given the `drift`.
+    # Whether its kernels are given the `drift`; and its numbers, beside points, axes and those of joints, of which that
+    # has the rates.
     takes_drift: ClassVar[bool] = True
+    moving: ClassVar[tuple[str, ...]] = ()
     # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
     takes_bodies: ClassVar[bool] = False
 

@@ -17,6 +17,7 @@ penetration depth, so contact adds no constraint and no event.
 """
 
 import abc
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -183,6 +184,7 @@ class AbstractContact(AbstractPotentialForce):
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    moving: ClassVar[tuple[str, ...]] = ("terrain",)
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:

@@ -26,7 +26,7 @@ from .base import (
 from .forces import generalized_force
 from .names import unknown
 from .smooth import ramp
-from .space import rate_of
+from .space import rate_of, with_drift
 
 
 class AbstractOfJoints(AbstractLink):
@@ -296,6 +296,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
     damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
     smoothing: fields.Number = fields.parameter(unit="rad or m", sign="positive", default=1e-3)
+    moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
 
     def validate(self):
         if not self.lower < self.upper:
@@ -319,6 +320,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     def wrenches(self, space, poses, velocities, t):
         def law(x, v):
             depth, rate = jax.jvp(self._depths, (x,), (v,))
+            rate = with_drift(self, rate, lambda part: part._depths(x))
             (force,) = jax.vjp(self._depths, x)[1](self.stiffness * depth + self.damping * rate)
             return -force
 

@@ -5,6 +5,7 @@ transient models).
 """
 
 import abc
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +56,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     deflection: fields.Number = fields.internal_state(shape=None, unit="m")
+    moving: ClassVar[tuple[str, ...]] = ("terrain",)
 
     @abc.abstractmethod
     def axle(self, space: AbstractSpace) -> Float[Array, "3"]:

@@ -114,8 +114,8 @@ def simulate(
 
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
         of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where
-        a held series jumps and, if it moves a point, an axis or a joint, or constraints depend on it, at every time of
-        a linear one.
+        a held series jumps and, if it moves a point, an axis, a joint, a stop or the ground, or constraints depend on
+        it, at every time of a linear one.
 
     **Other arguments, rarely needed:**
 

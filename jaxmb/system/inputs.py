@@ -59,7 +59,7 @@ def with_inputs(system: System, inputs: Signals) -> System:
 
 
 def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndarray:
-    """Times [s] at which inputs jump, or their rates where constraints depend on them.
+    """Times [s] at which inputs jump, or their rates where these count.
 
     **Raises:** `ValueError` that names an input which is not known from `t0` to `t1`.
     """

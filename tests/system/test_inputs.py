@@ -259,6 +259,39 @@ def test_forces_take_the_rates_of_points_that_move():
     np.testing.assert_allclose(system.state_rates(time, state.q, state.u), [-512 * rate])
 
 
+def test_rates_of_numbers_that_move_nothing():
+    """A radius of friction and a free angle only scale and shift; a stop that moves pushes as fast as it comes."""
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, angle=0.5)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    forces = [
+        mb.DryFriction("rub", "pin", coefficient=0.3, radius=0.1),
+        planar.Bushing("bush", "ground", "bar", stiffness=(0.0,) * 3, damping=(4.0,) * 3, point=(0.0, 0.0)),
+        mb.JointStop("stop", "pin.angle", lower=0.6, upper=2.0, stiffness=0.0, damping=64.0, smoothing=1e-9),
+    ]
+    system = mb.Scene([bar], joints=[pin], forces=forces).compile()
+    inputs = {"rub.radius": lambda t: 0.1 + 0.05 * t, "bush.free_angle": lambda t: 0.5 * t}
+    still, moving = mb.with_inputs(system, inputs), mb.with_inputs(system, {"stop.lower": lambda t: 0.6 + 0.4 * t})
+    time, q = jnp.array(0.0), system.guess.q
+    u, seen = jnp.array([0.0, 0.0, 0.3, 0.0]), jnp.array([0.0, 0.0, -0.1, 0.0])
+    slip = lambda system: system.velocity_residual(time, q.at[-1].set(2.0), u)[-1]
+    np.testing.assert_allclose(slip(still), 0.1 * 0.3, rtol=1e-12)
+    force = lambda system, u: system.force(time, q, u)[2]
+    np.testing.assert_allclose(force(still, u), force(system, u), rtol=1e-12)
+    pin_only = lambda u: force(system, u) + 4.0 * u[2]
+    np.testing.assert_allclose(force(moving, u) + 4.0 * 0.3, pin_only(seen), rtol=1e-9)
+
+
+def test_the_rate_counts_where_any_part_takes_it():
+    """A tendon's points are its own, whose rate counts for nothing, and those of a spring that damps."""
+    cord = mb.Tendon("cord", [("ground", (0.0, 0.0)), ("block", (0.0, 0.0))])
+    winch = mb.JointSpring("winch", "cord.length", stiffness=0.0, damping=1.0)
+    points = mb.Series(TS, np.stack([np.stack([MOVING(t), [0.0, 0.0]]) for t in TS]))
+    (counts,) = (
+        of_rates for _, of_rates in mb.with_inputs(sliding([winch], [cord]), {"cord.points": points}).signals.values()
+    )
+    assert counts
+
+
 def test_the_rate_of_a_joint_with_a_point_that_moves():
     system = mb.with_inputs(sliding(), {"rail.point_a": MOVING})
     state = mb.assemble(system, t=2.0, fix={"rail.displacement": 0.3}, rates={"rail.displacement": 0.2})

@@ -137,6 +137,9 @@ class DiscRolling(AbstractDisc, AbstractVelocityConstraint):
     linear: ClassVar[bool] = True
     homogeneous: ClassVar[bool] = True
 
+    def may_vary(self, keys):
+        return keys[0] not in ("radius", "axis")
+
     def residual(self, space, poses, velocities, t):
         rho = space.body_direction(poses[0], _lowest_rim_point(space, self, poses[0]))
         slip = space.point_velocity(poses[0], velocities[0], self.centre + rho)

@@ -20,6 +20,8 @@ _RUNS = 10
 
 # The factor from run to run of the first barrier of trust-constr.
 _BARRIER = 1e-2
+# The least size of a side of a constraint for trust-constr, as a fraction of that of the other one.
+_LEAST_SIDE = 1e-6
 
 
 def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
@@ -29,7 +31,7 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
     def run(here, size, left, number):
         del number
         unit = _unit(trials, here, size, tol)
-        values, slopes, equal = _one_sided(trials, unit)
+        values, slopes, equal = _one_sided(trials, unit, trials.scales)
         constraints = [
             {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
             for kind, own in (("eq", equal), ("ineq", ~equal))
@@ -56,7 +58,9 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
 def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
     """SciPy's trust-region interior point method, with quasi-Newton Hessians."""
     optimize = _scipy()
-    values, slopes, equal = _one_sided(trials, 1.0)
+    # A side that is almost zero beside the other one would have slopes that SciPy's method cannot follow.
+    scales = np.maximum(trials.scales, _LEAST_SIDE * np.max(trials.scales, axis=0, initial=0.0))
+    values, slopes, equal = _one_sided(trials, 1.0, scales)
     constraints = []
     if equal.size:
         high = np.where(equal, 0.0, np.inf)
@@ -136,16 +140,16 @@ def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, n
     return sizes, below | above, gradient - inwards.T @ found
 
 
-def _one_sided(trials: Trials, unit: float):
-    """The constraints as SciPy wants them, relative to the sizes of their sides: functions of z in a unit, which are
-    not negative, or zero for equations; their derivatives; and which of them are equations.
+def _one_sided(trials: Trials, unit: float, sizes: np.ndarray):
+    """The constraints as SciPy wants them, relative to sizes of their sides: functions of z in a unit, which are not
+    negative, or zero for equations; their derivatives; and which of them are equations.
     """
     limits = trials.limits
     equal = limits.low == limits.high
     lower, upper = np.flatnonzero(np.isfinite(limits.low)), np.flatnonzero(np.isfinite(limits.high) & ~equal)
     which = 1 + np.concatenate([lower, upper])
     bounds = np.concatenate([limits.low[lower], limits.high[upper]])
-    scales = np.concatenate([trials.scales[0, lower], -trials.scales[1, upper]])
+    scales = np.concatenate([sizes[0, lower], -sizes[1, upper]])
     values = lambda y: (_good(trials, y * unit).rows[which] - bounds) / scales
     slopes = lambda y: _good(trials, y * unit).jacobian[which] / scales[:, None] * unit
     return values, slopes, np.concatenate([equal[lower], np.zeros(upper.size, bool)])
