@@ -54,7 +54,7 @@ def test_only_tests_that_ran_are_timed_anew(tmp_path):
     quick, slow, unknown, always, failing = (f"test_little.py::test_{name}" for name in names)
     recorded = tmp_path / "durations.json"
 
-    before = {quick: 60.0, slow: 0.1, unknown: None, always: 60.0, failing: 1.5}
+    before = {quick: 60.0, slow: 0.1, unknown: None, always: 60.0, failing: 1.1}
     recorded.write_text(json.dumps(before))
     collected = pytest_on(tmp_path, "--collect-only")
     assert [name for name in (quick, slow, unknown, always, failing) if name in collected] == [slow, always, failing]
@@ -63,4 +63,4 @@ def test_only_tests_that_ran_are_timed_anew(tmp_path):
     after = json.loads(recorded.read_text())
     assert 1.1 <= after.pop(slow) < 60.0
     # Quick ones are not kept; one that failed and one that did not run stay as they were.
-    assert after == {unknown: None, failing: 1.5}
+    assert after == {unknown: None, failing: 1.1}
