@@ -150,3 +150,30 @@ def check(title: str, case: Case, seed: int = 0) -> int:
     ]
     assert not told, "\n".join(told)
     return int(np.sum(np.abs(forward) > 1e-6))
+
+
+def in_both_modes(function: Callable, at, many=None):
+    """The value and the derivative of a function of a vector by forward mode, which is that by reverse mode.
+
+    With `many` vectors in the place of one, of which `at` is the first, forward mode is that of the batch.
+    """
+    own = lambda x: (function(x),) * 2
+    forward = jax.jacfwd(own, has_aux=True)
+    batched = many is not None
+    derivative, value = jit_quickly(jax.vmap(forward) if batched else forward)(many if batched else at)
+    reverse, _ = jit_quickly(jax.jacrev(own, has_aux=True))(at)
+    first = derivative[0] if batched else derivative
+    # Rows are of one output each.
+    size = np.abs(first).max(axis=1, keepdims=True)
+    np.testing.assert_array_less(np.abs(first - reverse) / np.where(size > 0, size, 1.0), 1e-9)
+    return value, derivative
+
+
+def central_differences(function: Callable, at, step: float = 1e-3):
+    """Of a function of NumPy's, of fourth order; the step is relative to each number."""
+    at = np.asarray(at, float)
+    columns = []
+    for along in np.diag(step * np.abs(at)):
+        near, far = (np.asarray(function(at + m * along)) - np.asarray(function(at - m * along)) for m in (1, 2))
+        columns.append((8 * near - far) / (12 * along.max()))
+    return np.stack(columns, axis=-1)

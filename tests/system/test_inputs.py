@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivative_checks import central_differences, in_both_modes
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
@@ -381,3 +382,165 @@ def test_dry_friction_of_a_rail_that_moves():
     drag, stuck = 0.3 * G, SPEED / (0.3 * G)
     np.testing.assert_allclose(motion.ys.q[0, 0], 0.7 + drag * 0.1**2 / 2, rtol=1e-9)
     np.testing.assert_allclose(motion.ys.q[1, 0], 0.7 + SPEED * (1.0 - stuck / 2), rtol=1e-9)
+
+
+def integrated(rates, y, t1):
+    """The end of a motion by SciPy."""
+    return solve_ivp(rates, (0.0, t1), y, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+def ramp(d, width):
+    """A smooth depth beyond a limit, and its derivative."""
+    root = np.sqrt(d * d + width * width)
+    return 0.5 * (d + root), 0.5 * (1 + d / root)
+
+
+def test_derivatives_of_a_ball_that_rolls_on_a_plate_that_shakes():
+    """It is taken along by the share `I / (I + m r²)` of the plate's motion, and rises with it."""
+    radius, inertia = 0.1, 0.003
+    ball = spatial.Body("ball", mass=0.5, inertia=(inertia,) * 3, position=(0.0, 0.0, radius))
+    system = mb.Scene([ball], joints=[spatial.RollingSphere("rolling", "ball", radius=radius)]).compile()
+    # The plate starts at rest.
+    start = mb.assemble(system, rates={"ball.velocity": (0.3, 0.0, 0.0), "ball.angular_velocity": (0.0, 3.0, 0.0)})
+
+    def end(x):
+        amplitude, frequency, mass = x
+        inputs = {"rolling.point": lambda t: amplitude * (1 - jnp.cos(frequency * t)) * jnp.array([1.0, 2.0, 0.5])}
+        changed = mb.with_parameters(system, {"ball.mass": mass})
+        motion = mb.simulate(changed, start, t1=1.0, inputs=inputs, rtol=1e-10, max_steps=400)["ball"]
+        # Of a turning ball the angular velocity in the world is simple.
+        return jnp.concatenate([motion.position[-1], motion.velocity[-1]])
+
+    def exact(x):
+        amplitude, frequency, mass = x
+        share = inertia / (inertia + mass * radius**2)
+        place = amplitude * (1 - jnp.cos(frequency)) * jnp.stack([share, 2 * share, 0.5 + 0 * share])
+        rate = amplitude * frequency * jnp.sin(frequency) * jnp.stack([share, 2 * share, 0.5 + 0 * share])
+        return jnp.concatenate([place + jnp.array([0.3, 0.0, radius]), rate + jnp.array([0.3, 0.0, 0.0])])
+
+    at = jnp.array([0.2, 4.0, 0.5])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["plane", "space"])
+def test_a_knife_edge_whose_point_moves(kind):
+    """A sled with a skate that moves along and across it, against the equations in velocities that turn with it."""
+    inertia = 0.2
+    if kind == "plane":
+        sled = planar.Body("sled", mass=1.5, inertia=inertia)
+        system = mb.Scene([sled], joints=[planar.KnifeEdge("blade", "sled", point=(0.3, 0.0))]).compile()
+        rates = {"sled.x": 1.0, "sled.y": -0.12, "sled.angle": 0.4}
+    else:
+        sled = spatial.Body("sled", mass=1.5, inertia=(inertia,) * 3)
+        ice = spatial.Planar("ice", "ground", "sled", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+        system = mb.Scene([sled], joints=[ice, spatial.KnifeEdge("blade", "sled", point=(0.3, 0.0, 0.0))]).compile()
+        rates = {"sled.velocity": (1.0, -0.12, 0.0), "sled.angular_velocity": (0.0, 0.0, 0.4)}
+    # At the start the skate moves along the sled only.
+    start = mb.assemble(system, rates=rates)
+
+    def end(x):
+        amplitude, frequency, mass = x
+
+        def point(t):
+            along, across = 0.3 + amplitude * jnp.sin(frequency * t), amplitude * (1 - jnp.cos(frequency * t))
+            return jnp.stack([along, across] if kind == "plane" else [along, across, 0.0 * t])
+
+        changed = mb.with_parameters(system, {"sled.mass": mass})
+        motion = mb.simulate(changed, start, t1=0.8, inputs={"blade.point": point}, rtol=1e-10, max_steps=400)["sled"]
+        turning = motion.angular_velocity[-1]
+        turning = turning[None] if kind == "plane" else turning[2:]
+        return jnp.concatenate([motion.position[-1, :2], motion.velocity[-1, :2], turning])
+
+    def exact(x):
+        amplitude, frequency, mass = x
+        wave = lambda t: (amplitude * np.sin(frequency * t), amplitude * np.cos(frequency * t))
+
+        def across(t, turning):
+            """The velocity of the mass centre across the sled."""
+            return -(0.3 + wave(t)[0]) * turning - frequency * wave(t)[0]
+
+        def rates(t, state):
+            _, _, angle, ahead, turning = state
+            s, c = wave(t)
+            arm = 0.3 + s
+            push = arm * (ahead * turning - frequency * c * turning - frequency**2 * c)
+            aside, (cos, sin) = across(t, turning), (np.cos(angle), np.sin(angle))
+            turns = mass * push / (inertia + mass * arm**2)
+            return [cos * ahead - sin * aside, sin * ahead + cos * aside, turning, turning * aside, turns]
+
+        x, y, angle, ahead, turning = integrated(rates, [0.0, 0.0, 0.0, 1.0, 0.4], 0.8)
+        aside, (cos, sin) = across(0.8, turning), (np.cos(angle), np.sin(angle))
+        return np.array([x, y, cos * ahead - sin * aside, sin * ahead + cos * aside, turning])
+
+    at = jnp.array([0.1, 5.0, 1.5])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=0, atol=1e-6)
+
+
+def test_derivatives_of_a_compliant_stop_whose_ends_move():
+    """A block bounces between both, by how they move and how stiff they are; members of a batch as one run."""
+    stop = mb.JointStop("stop", "rail.displacement", lower=0.0, upper=1.0, stiffness=400.0, damping=3.0, smoothing=0.02)
+    system = sliding([stop])
+    start = mb.assemble(system, rates={"block.x": 2.0})
+
+    def end(x):
+        amplitude, frequency, stiffness = x
+        wave = lambda t: amplitude * jnp.sin(frequency * t)
+        inputs = {"stop.lower": lambda t: 0.3 + wave(t), "stop.upper": lambda t: 1.0 - 2 * wave(t)}
+        changed = mb.with_parameters(system, {"stop.stiffness": stiffness})
+        y = mb.simulate(changed, start, t1=0.8, inputs=inputs, rtol=1e-10, max_steps=400).ys
+        return jnp.stack([y.q[-1, 0], y.u[-1, 0]])
+
+    def exact(x):
+        amplitude, frequency, stiffness = x
+
+        def rates(t, y):
+            wave, rate = amplitude * np.sin(frequency * t), amplitude * frequency * np.cos(frequency * t)
+            above, below = ramp(y[0] - 1.0 + 2 * wave, 0.02), ramp(0.3 + wave - y[0], 0.02)
+            down = (stiffness * above[0] + 3.0 * above[1] * (y[1] + 2 * rate)) * above[1]
+            up = (stiffness * below[0] + 3.0 * below[1] * (rate - y[1])) * below[1]
+            return [y[1], (up - down) / 2.0]
+
+        return integrated(rates, [0.7, 2.0], 0.8)
+
+    many = jnp.array([[0.05, 9.0, 400.0], [0.03, 14.0, 300.0]])
+    values, derivatives = in_both_modes(end, many[0], many)
+    for at, value, derivative in zip(many, values, derivatives, strict=True):
+        np.testing.assert_allclose(value, exact(at), rtol=1e-7)
+        np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
+
+
+def test_derivatives_of_the_rate_of_a_joint_that_moves():
+    """A rail that travels and turns: by how it does, by the prescribed coordinate and rate, and by the time."""
+    system = sliding()
+
+    def start(x):
+        amplitude, frequency, place, rate, time = x
+        turn = lambda t: amplitude * jnp.sin(frequency * t)
+        inputs = {
+            "rail.point_a": lambda t: jnp.stack([amplitude * t**2, frequency * t]),
+            "rail.axis_a": lambda t: jnp.stack([jnp.cos(turn(t)), jnp.sin(turn(t))]),
+            "rail.angle": turn,
+        }
+        given = {"fix": {"rail.displacement": place}, "rates": {"rail.displacement": rate}}
+        state = mb.assemble(mb.with_inputs(system, inputs), t=time, **given)
+        return jnp.concatenate([state.q, state.u])
+
+    def exact(x):
+        amplitude, frequency, place, rate, time = x
+
+        def pose(time, place):
+            turn = amplitude * jnp.sin(frequency * time)
+            along, across = amplitude * time**2 + place * jnp.cos(turn), frequency * time + place * jnp.sin(turn)
+            return jnp.stack([along, across, turn])
+
+        return jnp.concatenate(jax.jvp(pose, (time, place), (jnp.ones_like(time), rate)))
+
+    many = jnp.array([[0.3, 2.0, 0.4, 0.2, 0.6], [0.2, 3.0, -0.5, 0.7, 0.9]])
+    values, derivatives = in_both_modes(start, many[0], many)
+    for at, value, derivative in zip(many, values, derivatives, strict=True):
+        np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-11)
+        np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-9)
