@@ -424,6 +424,57 @@ def test_derivatives_of_a_ball_that_rolls_on_a_plate_that_shakes():
     np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
 
 
+def test_derivatives_of_a_disc_that_rolls_on_a_plate_that_shakes():
+    """A coin that leans, against the balance of its angular momentum about the point where it touches the plate."""
+    radius, lean, along, about = 0.2, 0.3, 0.005, 0.01
+    tilted = (np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0)
+    place = (0.0, 0.0, radius * np.cos(lean))
+    disc = spatial.Body("disc", mass=0.5, inertia=(along, about, along), position=place, orientation=tilted)
+    rolling = spatial.RollingDisc("rolling", "disc", radius=radius, axis=(0.0, 1.0, 0.0))
+    system = mb.Scene([disc], joints=[rolling], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
+    turning, way = np.array([0.5, 8.0, 0.3]), np.array([1.0, 0.7, 0.4])
+    start = mb.assemble(system, rates={"disc.angular_velocity": turning})
+
+    def end(x):
+        amplitude, frequency, mass = x
+        inputs = {"rolling.point": lambda t: amplitude * (1 - jnp.cos(frequency * t)) * way}
+        changed = mb.with_parameters(system, {"disc.mass": mass})
+        motion = mb.simulate(changed, start, t1=0.5, inputs=inputs, rtol=1e-10, max_steps=400)["disc"]
+        return jnp.concatenate([motion.position[-1], motion.velocity[-1]])
+
+    def exact(x):
+        amplitude, frequency, mass = x
+        up = np.array([0.0, 0.0, 1.0])
+
+        def to_lowest(axle, turning):
+            """From the centre to the lowest point, and its rate."""
+            moves = np.cross(turning, axle)
+            up_hill, change = up - axle[2] * axle, -moves[2] * axle - axle[2] * moves
+            size = np.linalg.norm(up_hill)
+            return -radius * up_hill / size, -radius * (change / size - up_hill * (up_hill @ change) / size**3)
+
+        def rates(t, y):
+            axle, turning = y[3:6], y[6:]
+            rho, rho_rate = to_lowest(axle, turning)
+            pushed = amplitude * frequency**2 * np.cos(frequency * t) * way + G * up - np.cross(turning, rho_rate)
+            spin, turns = turning @ axle, np.cross(turning, axle)
+            inertia = along * np.eye(3) + (about - along) * np.outer(axle, axle)
+            inertia += mass * (rho @ rho * np.eye(3) - np.outer(rho, rho))
+            moment = mass * np.cross(rho, pushed) - (about - along) * spin * turns
+            return np.concatenate([-np.cross(turning, rho), turns, np.linalg.solve(inertia, moment)])
+
+        # The given angular velocity is that along axes of the disc.
+        turned = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(lean), -np.sin(lean)], [0.0, np.sin(lean), np.cos(lean)]])
+        y = integrated(rates, np.concatenate([place, turned[:, 1], turned @ turning]), 0.5)
+        rate = amplitude * frequency * np.sin(0.5 * frequency) * way - np.cross(y[6:], to_lowest(y[3:6], y[6:])[0])
+        return np.concatenate([y[:3] + amplitude * (1 - np.cos(0.5 * frequency)) * way, rate])
+
+    at = jnp.array([0.05, 7.0, 0.5])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["plane", "space"])
 def test_a_knife_edge_whose_point_moves(kind):
     """A sled with a skate that moves along and across it, against the equations in velocities that turn with it."""
