@@ -10,6 +10,8 @@ import numpy as np
 import optimistix
 import pytest
 from compiling import jit_quickly
+from derivative_checks import central_differences, in_both_modes
+from scipy.optimize import brentq
 
 import jaxmb as mb
 from jaxmb import planar, spatial, terrain
@@ -210,6 +212,47 @@ def test_the_time_of_a_jump_beside_a_contact():
     found, slope = jit_quickly(jax.value_and_grad(height))(jnp.array(0.3))
     np.testing.assert_allclose(found, 0.18 - 5.0 * 0.18**2 + 2.0 * 0.08**2, rtol=1e-9)
     np.testing.assert_allclose(slope, -4.0 * 0.08, rtol=1e-8)
+
+
+def test_derivatives_of_a_block_between_stops_that_move():
+    """Each impact is with the stop as fast as it moves; members of a batch as one run."""
+    block = planar.Body("block", mass=2.0, inertia=0.1, velocity=(1.5, 0.0))
+    rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=(1.0, 0.0))
+    stops = mb.Stop("stops", "rail.displacement", lower=-0.2, upper=0.3, restitution=0.6)
+    system = mb.Scene([block], joints=[rail, stops]).compile()
+    start = mb.assemble(system)
+
+    def end(x):
+        amplitude, frequency, restitution = x
+        wave = lambda t: amplitude * jnp.sin(frequency * t)
+        inputs = {"stops.lower": lambda t: -0.2 + wave(t), "stops.upper": lambda t: 0.3 - 0.5 * wave(t)}
+        changed = mb.with_parameters(system, {"stops.restitution": restitution})
+        motion = mb.simulate(changed, start, t1=0.8, inputs=inputs, rtol=1e-10, max_steps=400, max_events=8)
+        events = motion.events
+        return jnp.concatenate([motion.ys.q[-1, :1], motion.ys.u[-1, :1], events.times[:2], events.impulses[:2, 0]])
+
+    def exact(x):
+        amplitude, frequency, restitution = x
+        wave = lambda t: (amplitude * np.sin(frequency * t), amplitude * frequency * np.cos(frequency * t))
+        gap = lambda t, start, speed, middle, share: middle + share * wave(t)[0] - start - speed * t
+        time, place, speed, found = 0.0, 0.0, 1.5, []
+        for middle, share in ((0.3, -0.5), (-0.2, 1.0)):
+            own = place - speed * time, speed, middle, share
+            fine = np.linspace(time + 1e-6, 0.8, 1000)
+            first = np.flatnonzero(np.diff(np.sign(gap(fine, *own))))[0]
+            hit = brentq(gap, fine[first], fine[first + 1], own, xtol=1e-15, rtol=1e-14)
+            rate = share * wave(hit)[1]
+            after = rate - restitution * (speed - rate)
+            found.append((hit, 2.0 * abs(after - speed)))
+            time, place, speed = hit, middle + share * wave(hit)[0], after
+        left = 0.8 - time
+        return np.array([place + speed * left, speed, found[0][0], found[1][0], found[0][1], found[1][1]])
+
+    many = jnp.array([[0.04, 6.0, 0.6], [0.02, 11.0, 0.8]])
+    values, derivatives = in_both_modes(end, many[0], many)
+    for at, value, derivative in zip(many, values, derivatives, strict=True):
+        np.testing.assert_allclose(value, exact(at), rtol=1e-8)
+        np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])

@@ -395,6 +395,58 @@ def ramp(d, width):
     return 0.5 * (d + root), 0.5 * (1 + d / root)
 
 
+def test_derivatives_on_compliant_ground_that_rises():
+    """A ball on a spring and damper of the ground, and a tyre that slips, by how the ground moves and its stiffness."""
+    springs, radius, smoothing, grip = 2000.0, 0.3, 1e-3, {"slip_stiffness": 5.0, "relaxation_length": 0.2}
+    common = {"terrain": mb.terrain.Flat(), "normal": mb.contact.Linear(springs), "radius": radius}
+    common |= {"damping": 30.0, "damping_depth": 0.02, "smoothing": smoothing}
+    bodies = [
+        planar.Body("ball", mass=2.0, inertia=0.1, position=(0.0, 0.29)),
+        planar.Body("wheel", mass=1.5, inertia=0.1, position=(2.0, 0.295), velocity=(1.0, 0.0), angular_velocity=-5.0),
+    ]
+    forces = [
+        planar.Contact("contact", "ball", **common),
+        planar.Tyre("tyre", "wheel", coefficient=0.8, transition_speed=0.1, **grip, **common),
+        mb.Gravity((0.0, -G)),
+    ]
+    system = mb.Scene(bodies, forces=forces).compile()
+    start = mb.assemble(system)
+
+    def end(x):
+        amplitude, frequency, stiffness = x
+        level = lambda t: amplitude * jnp.sin(frequency * t)
+        inputs = {f"{name}.terrain.level": level for name in ("contact", "tyre")}
+        changed = mb.with_parameters(system, {f"{name}.normal.stiffness": stiffness for name in ("contact", "tyre")})
+        motion = mb.simulate(changed, start, t1=0.5, inputs=inputs, rtol=1e-10, max_steps=400)
+        y = motion.ys
+        return jnp.stack([y.q[-1, 1], y.u[-1, 1], y.q[-1, 3], y.q[-1, 4], y.u[-1, 3], y.u[-1, 5], y.z[-1, 0]])
+
+    def exact(x):
+        amplitude, frequency, stiffness = x
+
+        def upwards(t, y, v):
+            level, rate = amplitude * np.sin(frequency * t), amplitude * frequency * np.cos(frequency * t)
+            depth, slope = ramp(level - y + radius, smoothing)
+            s = np.clip(depth / 0.02, 0.0, 1.0)
+            engaged = s**3 * (10 + s * (6 * s - 15))
+            return stiffness * depth, stiffness * depth * slope - 30.0 * engaged * (v - rate)
+
+        def rates(t, state):
+            y, v, _, height, vx, vy, spin, tread = state
+            load, push = upwards(t, height, vy)
+            friction = 0.8 * load * np.tanh(5.0 * tread / (0.2 * 0.8))
+            bends = -(vx + radius * spin) - np.sqrt(vx**2 + 0.1**2) / 0.2 * tread
+            own = upwards(t, y, v)[1] / 2.0 - G
+            return [v, own, vx, vy, friction / 1.5, push / 1.5 - G, radius * friction / 0.1, bends]
+
+        return integrated(rates, [0.29, 0.0, 2.0, 0.295, 1.0, 0.0, -5.0, 0.0], 0.5)[[0, 1, 2, 3, 4, 6, 7]]
+
+    at = jnp.array([0.02, 12.0, springs])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-5, atol=1e-9)
+
+
 def test_derivatives_of_a_ball_that_rolls_on_a_plate_that_shakes():
     """It is taken along by the share `I / (I + m r²)` of the plate's motion, and rises with it."""
     radius, inertia = 0.1, 0.003
