@@ -214,6 +214,104 @@ def test_the_time_of_a_jump_beside_a_contact():
     np.testing.assert_allclose(slope, -4.0 * 0.08, rtol=1e-8)
 
 
+def test_derivatives_by_known_jumps_beside_a_stop():
+    """A pull sets in while a ball falls onto a stop, and ends after the impact: by its size and both times."""
+    system = mb.Scene(
+        [planar.Body("ball", mass=2.0, inertia=0.1, position=(0.0, 0.2))],
+        joints=[
+            planar.Prismatic("slide", "ground", "ball", axis=(0.0, 1.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+            mb.Stop("floor", "slide.displacement", lower=0.0, restitution=0.5),
+        ],
+        forces=[mb.Gravity((0.0, -10.0)), mb.JointForce("pull", "slide.displacement", force=0.0)],
+    ).compile()
+    state = mb.assemble(system)
+
+    def end(x):
+        pull = {"pull.force": lambda t: jnp.where((t < x[1]) | (t >= x[2]), 0.0, x[0])}
+        changed = mb.with_parameters(system, {"floor.restitution": x[3]})
+        motion = mb.simulate(changed, state, t1=0.4, inputs=pull, jumps=x[1:3], rtol=1e-10, max_steps=400, max_events=8)
+        own = motion["ball"]
+        return jnp.concatenate([own.position[-1, 1:], own.velocity[-1, 1:], motion.events.times[:1]])
+
+    def exact(x):
+        less = 10.0 - x[0] / 2.0
+        y, v = 0.2 - 5.0 * x[1] ** 2, -10.0 * x[1]
+        falls = (v + jnp.sqrt(v**2 + 2 * less * y)) / less
+        v, back = x[3] * (less * falls - v), x[2] - x[1] - falls
+        y, v, left = v * back - less / 2 * back**2, v - less * back, 0.4 - x[2]
+        return jnp.stack([y + v * left - 5.0 * left**2, v - 10.0 * left, x[1] + falls])
+
+    at = jnp.array([8.0, 0.1, 0.3, 0.5])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
+
+
+def test_a_ball_on_a_floor_that_vibrates():
+    """It lands without a rebound, rides, and lifts off where the floor falls as gravity does."""
+    system = mb.Scene(
+        [planar.PointMass("ball", mass=1.3, position=(0.0, 0.25))],
+        joints=[mb.RigidContact("floor", "ball", terrain=terrain.Flat())],
+        forces=[mb.Gravity((0.0, -G))],
+    ).compile()
+    start = mb.assemble(system)
+
+    def end(x):
+        amplitude, frequency, gravity = x
+        wave = {"floor.terrain.level": lambda t: amplitude * jnp.sin(frequency * t)}
+        changed = mb.with_parameters(system, {"gravity.acceleration": jnp.stack([0.0 * gravity, -gravity])})
+        motion = mb.simulate(changed, start, t1=0.5, inputs=wave, rtol=1e-10, max_steps=400, max_events=8)
+        events = motion.events
+        return jnp.concatenate([motion.ys.q[-1, 1:2], motion.ys.u[-1, 1:2], events.times[:2], events.impulses[:1, 0]])
+
+    def exact(x):
+        amplitude, frequency, gravity = x
+        gap = lambda t: 0.25 - gravity / 2 * t**2 - amplitude * np.sin(frequency * t)
+        lands = brentq(gap, 0.2, 0.27, xtol=1e-15, rtol=1e-14)
+        leaves = (2 * np.pi + np.arcsin(gravity / (amplitude * frequency**2))) / frequency
+        impulse = 1.3 * (amplitude * frequency * np.cos(frequency * lands) + gravity * lands)
+        v, left = amplitude * frequency * np.cos(frequency * leaves), 0.5 - leaves
+        y = amplitude * np.sin(frequency * leaves) + v * left - gravity / 2 * left**2
+        return np.array([y, v - gravity * left, lands, leaves, impulse])
+
+    at = jnp.array([0.05, 18.0, G])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=1e-8)
+    np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
+
+
+def test_derivatives_of_a_particle_that_slides_on_a_slope_that_rises():
+    """Dry friction on it is that under a gravity which is larger by the acceleration of the ground."""
+    gradient = 0.6
+    system = mb.Scene(
+        [planar.PointMass("p", mass=1.3, position=(0.0, 0.0))],
+        joints=[mb.RigidContact("floor", "p", terrain=terrain.Slope(-gradient))],
+        forces=[mb.Gravity((0.0, -G)), mb.DryFriction("rub", "floor", coefficient=0.3)],
+    ).compile()
+    start = mb.assemble(system, fix={"floor.mode": 1})
+
+    def end(x):
+        amplitude, frequency, coefficient = x
+        wave = {"floor.terrain.level": lambda t: amplitude * (1 - jnp.cos(frequency * t))}
+        changed = mb.with_parameters(system, {"rub.coefficient": coefficient})
+        motion = mb.simulate(changed, start, t1=0.5, inputs=wave, rtol=1e-10, max_steps=400, max_events=8)
+        return jnp.concatenate([motion.ys.q[-1, :2], motion.ys.u[-1, :2]])
+
+    def exact(x):
+        amplitude, frequency, coefficient = x
+        level = lambda t: amplitude * (1 - jnp.cos(frequency * t))
+        height, rate = jax.jvp(level, (0.5,), (1.0,))
+        cos, sin = np.array([1.0, gradient]) / np.hypot(1.0, gradient)
+        share = sin - coefficient * cos
+        way, speed = share * (G * 0.5**2 / 2 + height), share * (G * 0.5 + rate)
+        return jnp.stack([way * cos, height - way * sin, speed * cos, rate - speed * sin])
+
+    at = jnp.array([0.02, 9.0, 0.3])
+    value, derivative = in_both_modes(end, at)
+    np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
+
+
 def test_derivatives_of_a_block_between_stops_that_move():
     """Each impact is with the stop as fast as it moves; members of a batch as one run."""
     block = planar.Body("block", mass=2.0, inertia=0.1, velocity=(1.5, 0.0))
