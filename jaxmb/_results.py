@@ -48,3 +48,4 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     # The last ones, in the order in which they came, since results are stored by their numbers.
     saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the one that it follows."
     input_ended = "An input is a `Series` that is not known for the whole motion, from `t0` to `t1`."
+    impacts_backward = "Impacts cannot be undone: with contacts `t1` must be after `t0`."

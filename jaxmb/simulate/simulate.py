@@ -279,7 +279,8 @@ def simulate(
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if solver == "auto":
         warn_of_stiffness(trajectory.stats)
-    again = functools.partial(simulate, t1=t1, formulation=formulation, manifold=manifold, jumps=jumps, throw=False)
+    given = {"formulation": formulation, "manifold": manifold, "jumps": jumps, "max_events": max_events}
+    again = functools.partial(simulate, t1=t1, **given, throw=False)
     if flags is not None:
         failed, inconsistent, stuck, whole = flags
         if inconsistent:

@@ -24,11 +24,12 @@ from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
-from ..system.gaps import are_open, contacts_of, gaps
+from ..system.gaps import are_open, contacts_of
 from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
 from .closest import tolerance
+from .held import about_contacts, contacts_against
 
 _ITERATIONS = 200
 
@@ -121,7 +122,8 @@ def equilibrium(
     if concrete and raises and not bool(ok):
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
     if concrete and raises and np.any(overlaps | pulls):
-        raise ValueError(_not_of_contacts(system, np.asarray(overlaps), np.asarray(pulls)))
+        against, fix = about_contacts("The forces balance", system, overlaps, pulls)
+        raise ValueError(f"{against}For example jaxmb.equilibrium(system, {fix}).")
     steady = True if z is None else _steady(system, time, q, u)
     if concrete and raises and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
@@ -312,23 +314,12 @@ def _balanced(
     known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
     solved = root(equations, known, lambda _, x: x)
     q = balance.moved(q, solved[:n])
-    overlaps, pulls = _contacts(*lax.stop_gradient((system, t, q, solved[n:], jnp.diag(local.implied))))
+    alone = jnp.zeros(0, bool)
+    if system.contacts is not None:
+        alone = jnp.diag(local.implied)[np.array(system.contacts.rows, int)] <= tolerance(q.dtype) ** 0.5
+    rest = jnp.zeros(system.nu, q.dtype)
+    overlaps, pulls = contacts_against(*lax.stop_gradient((system, t, q, rest, solved[n:], alone)))
     return q, local.force / system.velocity_scale(), falling, ok, overlaps, pulls
-
-
-def _contacts(system, t, q, multipliers, implied):
-    """Which open contacts are overlapped in a configuration, and which closed ones pull."""
-    is_open = are_open(system, q)
-    if not is_open.size:
-        return is_open, is_open
-    rows, tol = np.array(contacts_of(system).rows, int), tolerance(q.dtype) ** 0.5
-    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(
-        jnp.abs(system.force(t, q, jnp.zeros_like(multipliers, shape=system.nu)))
-    )
-    # Of contacts that imply each other only the sum of the forces is known.
-    alone = implied[rows] <= tol
-    overlaps = is_open & (gaps(system, t, q) < -tol * system.length)
-    return overlaps, ~is_open & alone & (multipliers[rows] < -tol * largest)
 
 
 def _nearest(balance: _Balance, start: Coordinates):
@@ -436,21 +427,6 @@ def _not_found(system, q, unbalanced):
     return (
         f"No static equilibrium was found: residual forces along {listed or 'nothing'}, in N and N m. Hold such a "
         f"coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium{closing}."
-    )
-
-
-def _not_of_contacts(system, overlaps, pulls):
-    names = np.array(_contact_names(system))
-    texts = []
-    if np.any(overlaps):
-        own = names[overlaps]
-        texts.append(f"{', '.join(own)} {'is' if own.size == 1 else 'are'} open and overlapped: close with mode 1")
-    if np.any(pulls):
-        texts.append(f"{', '.join(names[pulls])} would have to pull: open with mode 0")
-    first = f"{names[overlaps | pulls][0]}.mode"
-    return (
-        f"The forces balance only where contacts do not hold: {'; '.join(texts)}. For example "
-        f"jaxmb.equilibrium(system, fix={{{first!r}: {int(overlaps[overlaps | pulls][0])}}})."
     )
 
 

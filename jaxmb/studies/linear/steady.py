@@ -19,6 +19,7 @@ from ...linalg.newton import newton, root
 from ...linalg.rotations import unrotate
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
+from ...states.held import about_contacts, contacts_against
 from ...system import AbstractSystem
 from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
 from .linear_equations import fastest, vector_field
@@ -71,26 +72,40 @@ def steady_motion(
 
     **Returns:** a `State` on the constraints, differentiable with respect to parameters and prescribed values.
 
-    **Raises:** `ValueError` for unknown names, and if there is no such motion, with the accelerations that remain.
-    Under `jit` the result is NaN instead.
+    Contacts stay as they are in the guess, open or closed, as in `equilibrium`.
+
+    **Raises:** `ValueError` for unknown names, and if there is no such motion, with the accelerations that remain, or
+    only one in which an open contact is overlapped or a closed one would have to pull. Under `jit` the result is NaN
+    instead. Also for a system with dry friction that may stick.
     """
     check_system("steady_motion", system)
     check_no_states("steady_motion", system)
+    if system.contacts is not None and system.contacts.frictions is not None:
+        names = ", ".join(dict.fromkeys(system.contacts.frictions.names))
+        raise ValueError(
+            f"steady_motion: {names} may stick or slip, and the search knows neither. Remove it, or use smooth "
+            "`Friction`."
+        )
     guess = checked_guess("steady_motion", system, guess)
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
     chosen, values = _conditions(system, t, guess, {} if fix is None else fix, {} if rates is None else rates)
     advancing = _indices(system, ignorable)
     found = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
+    holds = True if found.against is None else ~jnp.any(found.against[0] | found.against[1])
     if is_traced(found) or not throw:
-        return nan_where(~found.ok, found.state, (system, guess, values, t))
+        return nan_where(~(found.ok & holds), found.state, (system, guess, values, t))
     if not found.ok:
         raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
+    if found.against is not None and not holds:
+        against, fix = about_contacts("The motion is steady", system, *found.against)
+        raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, {fix})).")
     return found.state
 
 
 class _Found(NamedTuple):
     """A state, the rates that remain at it (n,), the residuals of all equations, with those of the conditions last, and
-    whether all vanish there and a little later.
+    whether all vanish there and a little later; which contacts are overlapped and which ones pull there, None without
+    any.
     """
 
     state: State
@@ -98,6 +113,7 @@ class _Found(NamedTuple):
     left: Float[Array, "e"]
     met: Bool[Array, ""]
     ok: Bool[Array, ""]
+    against: tuple[Bool[Array, "contacts"], Bool[Array, "contacts"]] | None
 
 
 class _Unknowns(eqx.Module):
@@ -179,10 +195,14 @@ def _search(
     check = _residual(system, t, values, chosen, advancing, solution, (*units, rate), 0.7 * later)
     same = jnp.max(jnp.abs(check)) <= 1e3 * tol
     carrier = _carrier(system, solution, system.rates(t, state.q, state.u), advancing)
-    field, carried = vector_field(system, t, state)[0], carrier.field(state)
+    (field, multipliers), carried = vector_field(system, t, state), carrier.field(state)
+    against = None
+    if system.contacts is not None:
+        own = lax.stop_gradient((system, t, state.q, state.u, multipliers))
+        against = contacts_against(*own, alone=jnp.ones(len(system.contacts.names), bool))
     remaining = jnp.concatenate([field.q - carried.q, field.u - carried.u])
     # An array without entries that a program returns makes XLA lose the types of its LAPACK calls (jaxlib 0.10.2).
-    return _Found(state, remaining, left, solved, solved & same)
+    return _Found(state, remaining, left, solved, solved & same, against)
 
 
 def _start(system, t, guess, advancing):

@@ -206,3 +206,30 @@ def test_wheels_that_a_cord_keeps_together():
     once = jax.tree.map(lambda x: x[None], state)
     length = system.quantities()["cord.length"].value(jnp.zeros(1), once, None)
     np.testing.assert_allclose(length, 1.5 / (stiffness * r), rtol=1e-9)
+
+
+def test_a_motion_against_a_contact_is_not_steady():
+    bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    stop = mb.Stop("stop", "pin.angle", lower=-0.6, upper=0.6)
+    system = mb.Scene([bar], joints=[pin, stop], forces=[mb.Gravity((0.0, -G))]).compile()
+    above = mb.assemble(system, fix={"pin.angle": -0.5})
+    with pytest.raises(ValueError, match=r"stop is open and overlapped: .*fix=\{'stop.mode': 1\}"):
+        mb.steady_motion(system, above)
+    held = mb.steady_motion(system, mb.assemble(system, above, fix={"stop.mode": 1}))
+    assert held.q[2] == pytest.approx(-0.6)
+    closed = mb.assemble(system, above, fix={"stop.mode": 1})
+    upwards = mb.with_parameters(system, {"gravity.acceleration": (0.0, G)})
+    with pytest.raises(ValueError, match=r"stop would have to pull: .*fix=\{'stop.mode': 0\}"):
+        mb.steady_motion(upwards, closed)
+    found = jax.jit(lambda down: mb.steady_motion(mb.with_parameters(system, {"gravity.acceleration": down}), closed).q)
+    assert np.all(np.isfinite(found(jnp.array([0.0, -G])))) and np.all(np.isnan(found(jnp.array([0.0, G]))))
+
+
+def test_friction_that_may_stick_has_no_steady_motion():
+    block = planar.Body("block", mass=1.0, inertia=0.1)
+    slide = planar.Prismatic("slide", "ground", "block", point=(0.0, 0.0), axis=(1.0, 0.0))
+    belt = mb.DryFriction("belt", "slide", coefficient=0.3, speed=1.0)
+    system = mb.Scene([block], joints=[slide], forces=[belt, mb.Gravity((0.0, -G))]).compile()
+    with pytest.raises(ValueError, match="belt may stick or slip"):
+        mb.steady_motion(system)

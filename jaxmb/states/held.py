@@ -1,0 +1,47 @@
+"""Contacts that do not hold at a state: open ones that are overlapped, and closed ones that would have to pull."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._types import Coordinates, Scalar, Velocities
+from ..system import AbstractSystem
+from ..system.gaps import are_open, contacts_of, gaps
+from .closest import tolerance
+
+
+def contacts_against(
+    system: AbstractSystem,
+    t: Scalar,
+    q: Coordinates,
+    u: Velocities,
+    multipliers: Float[Array, "rows"],
+    alone: Bool[Array, "contacts"],
+) -> tuple[Bool[Array, "contacts"], Bool[Array, "contacts"]]:
+    """Which open contacts are overlapped, and which closed ones pull; of a system without contacts, none is asked.
+
+    **Arguments:** the `multipliers` of all rows; which contacts are `alone`: of those that imply each other only the
+    sum of the forces is known.
+    """
+    is_open = are_open(system, q)
+    if not is_open.size:
+        return is_open, is_open
+    tol = tolerance(q.dtype) ** 0.5
+    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, q, u)))
+    overlaps = is_open & (gaps(system, t, q) < -tol * system.length)
+    pulls = ~is_open & alone & (multipliers[np.array(contacts_of(system).rows, int)] < -tol * largest)
+    return overlaps, pulls
+
+
+def about_contacts(what: str, system: AbstractSystem, overlaps: Array, pulls: Array) -> tuple[str, str]:
+    """That `what` is found only where contacts do not hold, and what to fix instead, as an argument of a call."""
+    names, overlaps, pulls = np.array(contacts_of(system).names), np.asarray(overlaps), np.asarray(pulls)
+    texts = []
+    if np.any(overlaps):
+        own = names[overlaps]
+        texts.append(f"{', '.join(own)} {'is' if own.size == 1 else 'are'} open and overlapped: close with mode 1")
+    if np.any(pulls):
+        texts.append(f"{', '.join(names[pulls])} would have to pull: open with mode 0")
+    against = overlaps | pulls
+    fix = f"fix={{'{names[against][0]}.mode': {int(overlaps[against][0])}}}"
+    return f"{what} only where contacts do not hold: {'; '.join(texts)}. ", fix
