@@ -14,7 +14,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from diffrax._integrate import SaveState, loop
+from diffrax._integrate import SaveState
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax._src import xla_bridge
@@ -316,10 +316,6 @@ def with_loops(solver: Any, kind: Any) -> Any:
     if kind is None or not hasattr(solver, "scan_kind"):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
-
-
-# The loop of `diffeqsolve`, with everything before and after its steps. (diffrax._integrate.loop, 0.7.)
-loop_of_diffrax = loop
 
 
 def save_states(state: Any) -> list[Any]:

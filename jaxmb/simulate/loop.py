@@ -1,6 +1,5 @@
 """The loop of a run, with what diffrax's own would check in the compiled program, or compile anew for each number."""
 
-import functools
 from typing import Any
 
 import diffrax
@@ -8,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._compat import direction_of, loop_of_diffrax, while_loop, with_loops
+from .._compat import direction_of, while_loop, with_loops
 from ..solvers import MeshAdjoint
+from ..solvers.stepping import loop
 
 
 class Loop(diffrax.AbstractAdjoint):
@@ -51,13 +51,7 @@ class Loop(diffrax.AbstractAdjoint):
             proceed = lambda state: cond_fun(state) & (state.num_steps < self.limit)
             return while_loop(proceed, body_fun, init, max_steps=None, buffers=buffers, kind="lax")
 
-        return loop_of_diffrax(
-            solver=with_loops(solver, "lax"),
-            max_steps=max_steps,
-            inner_while_loop=functools.partial(while_loop, kind="lax"),
-            outer_while_loop=outer,
-            **given,
-        )
+        return loop(solver=with_loops(solver, "lax"), max_steps=max_steps, outer_while_loop=outer, **given)
 
     def _with_times(self, saveat, init_state, direction):
         first, *rest = saveat.subs

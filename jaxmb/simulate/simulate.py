@@ -145,8 +145,8 @@ def simulate(
         tolerances; both together take two to two and a half times as long as one, and nothing more to compile.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
-        then exert, without restitution where contacts are closed. A function that is evaluated at a jump should return
-        its value after it, as a state saved there does. Needs `Partition()` or `Projection()`, and a mass matrix that
+        then exert, without restitution where contacts are closed, but for those whose own terrain or ends jump. A
+        function that is evaluated at a jump should return its value after it, as a state saved there does. Needs `Partition()` or `Projection()`, and a mass matrix that
         has an inverse, if there are constraints. A warning tells of jumps and kinks of drivers at other times, except
         under `jit`, `vmap` or a derivative.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the

@@ -8,7 +8,6 @@ the rows comes with its transpose, modes can be combined and batched.
 """
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import diffrax
@@ -17,13 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import buffer_set, loop_of_diffrax, save_states, while_loop
+from .._compat import buffer_set, save_states, while_loop
 from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, row_of, start_of
+from .stepping import loop
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
@@ -357,14 +357,13 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 def _run(outer, terms, args, init_state, fixed, max_steps):
     solver, saveat, options, *_ = fixed
-    return loop_of_diffrax(
+    return loop(
         args=args,
         terms=terms,
         solver=solver,
         saveat=saveat,
         init_state=init_state,
         max_steps=max_steps,
-        inner_while_loop=functools.partial(while_loop, kind="lax"),
         outer_while_loop=outer,
         **options,
     )

@@ -122,8 +122,8 @@ def equilibrium(
     if concrete and raises and not bool(ok):
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
     if concrete and raises and np.any(overlaps | pulls):
-        against, fix = about_contacts("The forces balance", system, overlaps, pulls)
-        raise ValueError(f"{against}For example jaxmb.equilibrium(system, {fix}).")
+        against, change = about_contacts("The forces balance", system, overlaps, pulls)
+        raise ValueError(f"{against}For example jaxmb.equilibrium(system, {change}).")
     steady = True if z is None else _steady(system, time, q, u)
     if concrete and raises and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))

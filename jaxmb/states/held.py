@@ -33,9 +33,9 @@ def contacts_against(
     return overlaps, pulls
 
 
-def about_contacts(what: str, system: AbstractSystem, overlaps: Array, pulls: Array) -> tuple[str, str]:
+def about_contacts(what: str, system: AbstractSystem, overlapped: Array, pulled: Array) -> tuple[str, str]:
     """That `what` is found only where contacts do not hold, and what to fix instead, as an argument of a call."""
-    names, overlaps, pulls = np.array(contacts_of(system).names), np.asarray(overlaps), np.asarray(pulls)
+    names, overlaps, pulls = np.array(contacts_of(system).names), np.asarray(overlapped), np.asarray(pulled)
     texts = []
     if np.any(overlaps):
         own = names[overlaps]

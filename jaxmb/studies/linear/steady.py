@@ -97,8 +97,8 @@ def steady_motion(
     if not found.ok:
         raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
     if found.against is not None and not holds:
-        against, fix = about_contacts("The motion is steady", system, *found.against)
-        raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, {fix})).")
+        against, change = about_contacts("The motion is steady", system, *found.against)
+        raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, {change})).")
     return found.state
 
 

@@ -1,0 +1,332 @@
+"""The loop over the steps of a solve, in the place of diffrax's own.
+
+It does the same with the same state, for `diffrax.diffeqsolve` and the adjoints of this package. The time from which on
+a step ends with the run, a hundred rounding errors before its end, is found in one operation: diffrax takes a hundred
+times fifteen for it, a fifth of what it takes to trace a small mechanism and an eighth of compiling it. An event whose
+function is not a number does not happen, so that a member of a batch that fails does not stop the others.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jaxtyping import PyTree
+
+from .._compat import any_of_batch, buffer_set, save_states, while_loop
+
+_RESULTS = diffrax.RESULTS
+# A step that would end so many rounding errors before the end ends there.
+_LAST = 100
+
+
+class _Solve(NamedTuple):
+    """What `diffrax.diffeqsolve` gives to the loop and does not change in it."""
+
+    terms: PyTree
+    args: PyTree
+    solver: Any
+    stepsize_controller: Any
+    event: diffrax.Event | None
+    saveat: diffrax.SaveAt
+    t0: Any
+    t1: Any
+    dt0: Any
+    max_steps: int | None
+    progress_meter: Any
+
+    def each(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
+        """A function of each series of saved states, and of what is saved of it."""
+        return jax.tree.map(function, self.saveat.subs, saved, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
+
+    def guards(self, t: Any, y: PyTree) -> PyTree:
+        """The values of the functions of the event."""
+        names = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller", "max_steps")
+        given = {name: getattr(self, name) for name in names}
+        return jax.tree.map(lambda guard: guard(t, y, self.args, **given), self.event.cond_fn, is_leaf=callable)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
+    """The last state of the loop, and statistics, of which there are none.
+
+    **Arguments:** those of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: the loop
+    over steps.
+    """
+    solve = _Solve(**given)
+    state = init_state
+    if solve.saveat.dense:
+        state = dataclasses.replace(state, dense_ts=state.dense_ts.at[0].set(solve.t0))
+    at_start = lambda sub, saved: _saved(solve, sub, saved, solve.t0, state.y) if sub.t0 else saved
+    state = dataclasses.replace(state, save_state=solve.each(at_start, state.save_state))
+
+    # What is the same in all steps stays known to the compiler: that there are no jumps, and that nothing fails.
+    known = {"made_jump": state.made_jump, "result": state.result}
+
+    def with_known(state):
+        return dataclasses.replace(state, **known)
+
+    # What is found of one may change the other.
+    for _ in range(2):
+        traced = eqx.filter_eval_shape(lambda state: _are_traced(_advanced(solve, with_known(state))), state)
+        known = {name: value for name, value in known.items() if not traced[name]}
+
+    def proceed(state):
+        state = with_known(state)
+        if isinstance(solve.stepsize_controller, diffrax.StepTo):
+            more = state.num_steps < len(solve.stepsize_controller.ts) - 1
+        else:
+            more = state.tprev < solve.t1
+        return more & diffrax.is_successful(state.result)
+
+    advance = lambda state: _advanced(solve, with_known(state))
+    last = outer_while_loop(proceed, advance, state, max_steps=solve.max_steps, buffers=_buffers)
+    t, y, result, saved = last.tprev, last.y, last.result, last.save_state
+    finds = solve.event is not None and solve.event.root_finder is not None
+    if finds:
+        happened = jnp.any(jnp.stack(jax.tree.leaves(last.event_mask)))
+        find = lambda: _time_of_event(solve, last, happened)
+        t, y, result = lax.cond(any_of_batch(happened), find, lambda: (t, y, result))
+        saved = solve.each(lambda _, saved: _until(saved, t), saved)
+    saved = solve.each(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
+    saved = solve.each(lambda sub, saved: _with_end(solve, sub, saved, last.num_accepted_steps, (t, y), finds), saved)
+    last = with_known(dataclasses.replace(last, save_state=saved))
+    result = _RESULTS.where(proceed(last), _RESULTS.max_steps_reached, result)
+    return dataclasses.replace(last, result=result), {}
+
+
+def _are_traced(state):
+    """What of a state is not known before the program runs."""
+    return {"made_jump": type(state.made_jump) is not bool, "result": state.result.is_traced()}
+
+
+def _buffers(state):
+    """The tables in a state, which the loop may write in place."""
+    series = save_states(state)
+    return [saved.ts for saved in series] + [saved.ys for saved in series] + [state.dense_ts, state.dense_infos]
+
+
+def _advanced(solve: _Solve, state: Any) -> Any:
+    """The state after one step that is tried."""
+    start, end = state.tprev, state.tnext
+    y, error, dense, solver_state, of_solver = solve.solver.step(
+        solve.terms, start, end, state.y, solve.args, state.solver_state, state.made_jump
+    )
+    # A step that leads to no number is too long.
+    error = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
+    order = solve.solver.error_order(solve.terms)
+    keep, tprev, tnext, made_jump, controller_state, of_controller = solve.stepsize_controller.adapt_step_size(
+        start, end, state.y, y, solve.args, error, order, state.controller_state
+    )
+    t1 = solve.t1
+    tprev = jnp.minimum(tprev, t1)
+    almost = t1 - _LAST * jnp.finfo(t1.dtype).eps * jnp.abs(t1) - jnp.finfo(t1.dtype).tiny
+    ended = jnp.where(keep, t1, tprev + 0.5 * (t1 - tprev))
+    tnext = jnp.where(tnext > lax.stop_gradient(almost), ended, tnext)
+
+    kept = lambda new, old: jnp.where(keep, new, old)
+    y = jax.tree.map(kept, y, state.y)
+    of_solver = _RESULTS.where(keep, of_solver, _RESULTS.successful)
+    result = _RESULTS.where(diffrax.is_okay(state.result), of_solver, state.result)
+    result = _RESULTS.where(diffrax.is_okay(result), of_controller, result)
+    accepted = state.num_accepted_steps + jnp.where(keep, 1, 0)
+    meter = solve.progress_meter
+    new = dataclasses.replace(
+        state,
+        y=y,
+        tprev=tprev,
+        tnext=tnext,
+        made_jump=_chosen(keep, made_jump, state.made_jump),
+        solver_state=jax.tree.map(kept, solver_state, state.solver_state),
+        controller_state=controller_state,
+        progress_meter_state=meter.step(state.progress_meter_state, _share(solve.t0, tprev, t1)),
+        num_steps=state.num_steps + 1,
+        num_accepted_steps=accepted,
+        num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
+    )
+    within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
+    saved = solve.each(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
+    saved = solve.each(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
+    new = dataclasses.replace(new, save_state=saved)
+    if solve.saveat.dense:
+        place = state.dense_save_index
+        new = dataclasses.replace(
+            new,
+            dense_ts=buffer_set(state.dense_ts, place + 1, tprev, pred=keep),
+            dense_infos=jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=keep), dense, state.dense_infos),
+            dense_save_index=place + jnp.where(keep, 1, 0),
+        )
+    if solve.event is not None:
+        values = solve.guards(tprev, y)
+        mask, happened = _first_of(_changes(solve.event, state.event_values, values))
+        result = _RESULTS.where(happened, _RESULTS.event_occurred, result)
+        new = dataclasses.replace(
+            new,
+            event_tprev=start,
+            event_tnext=end,
+            event_dense_info=dense,
+            event_values=values,
+            event_mask=mask,
+        )
+    return dataclasses.replace(new, result=result)
+
+
+def _chosen(keep, new, old):
+    """One of two truth values, known before the program runs where `keep` is, or both are the same."""
+    if isinstance(keep, bool | np.bool_):
+        return new if keep else old
+    return new if new is old else lax.select(keep, new, old)
+
+
+def _share(t0, t, t1):
+    """How far a time is from the start to the end, 0 to 1; 0 where they are the same."""
+    same = t0 == t1
+    return jnp.where(same, 0.0, t - t0) / jnp.where(same, 1.0, t1 - t0)
+
+
+def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, t: Any, y: PyTree, times: int = 1) -> Any:
+    """A series with a further state, written so many `times`."""
+    write = lambda table, x: lax.dynamic_update_slice_in_dim(
+        table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.save_index, axis=0
+    )
+    ys = jax.tree.map(write, saved.ys, sub.fn(t, y, solve.args))
+    return dataclasses.replace(saved, ts=write(saved.ts, t), ys=ys, save_index=saved.save_index + times)
+
+
+def _with_times(solve, sub, saved, within, end, keep):
+    """A series with the states at those of its times that a step passes, if it is kept."""
+    if sub.ts is None:
+        return saved
+    count = len(sub.ts)
+
+    def more(saved):
+        return keep & (sub.ts[saved.saveat_ts_index] <= end) & (saved.saveat_ts_index < count)
+
+    def save(saved):
+        t = sub.ts[saved.saveat_ts_index]
+        place = saved.save_index
+        y = sub.fn(t, within.evaluate(t), solve.args)
+        ys = jax.tree.map(lambda x, table: table.at[place].set(x), y, saved.ys)
+        ts = saved.ts.at[place].set(t)
+        return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + 1, saveat_ts_index=saved.saveat_ts_index + 1)
+
+    tables = lambda saved: (saved.ts, saved.ys)
+    return while_loop(more, save, saved, max_steps=count, buffers=tables, kind="lax")
+
+
+def _with_step(solve, sub, saved, accepted, at, keep):
+    """A series with the state at the end of a step, if it is saved."""
+    if sub.steps == 0:
+        return saved
+    here = keep & (accepted % sub.steps == 0)
+    find = lambda: sub.fn(*at, solve.args)
+    if sub.steps == 1:
+        y = find()
+    else:
+        none = lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(find))
+        y = lax.cond(any_of_batch(here), find, none)
+    place = saved.save_index
+    ys = jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=here), y, saved.ys)
+    ts = buffer_set(saved.ts, place, at[0], pred=here)
+    return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + jnp.where(here, 1, 0))
+
+
+def _without_steps(solve, sub, saved, y):
+    """A series of a run without a step, since it ends where it starts: its times are all that."""
+    if sub.ts is None:
+        return saved
+    none = solve.t0 == solve.t1
+
+    def fill():
+        filled = _saved(solve, sub, saved, solve.t0, y, len(sub.ts))
+        return jax.tree.map(lambda new, old: jnp.where(none, new, old), filled, saved)
+
+    return lax.cond(any_of_batch(none), fill, lambda: saved)
+
+
+def _with_end(solve, sub, saved, accepted, at, finds):
+    """A series with the end of the run, unless it was saved as that of a step; where an event is looked for, what was
+    saved behind it is gone.
+    """
+    by_step = sub.steps == 1 if sub.steps < 2 else accepted % sub.steps == 0
+    if finds:
+        here = sub.t1 | by_step
+    else:
+        here = sub.t1 and (not by_step if sub.steps < 2 else ~by_step)
+    if here is False:
+        return saved
+    with_end = _saved(solve, sub, saved, *at)
+    if here is True:
+        return with_end
+    ts, ys = jax.tree.map(lambda new, old: jnp.where(here, new, old), (with_end.ts, with_end.ys), (saved.ts, saved.ys))
+    return dataclasses.replace(with_end, ts=ts, ys=ys)
+
+
+def _until(saved, t):
+    """A series without what was saved after a time."""
+    after = saved.ts > t
+    count = jnp.sum(after & (saved.ts < jnp.inf))
+    drop = lambda x: jnp.where(after.reshape(-1, *[1] * (x.ndim - 1)), jnp.inf, x)
+    return dataclasses.replace(
+        saved,
+        ts=drop(saved.ts),
+        ys=jax.tree.map(drop, saved.ys),
+        save_index=saved.save_index - count,
+        saveat_ts_index=saved.saveat_ts_index - count,
+    )
+
+
+def _changes(event: diffrax.Event, before: PyTree, values: PyTree) -> PyTree:
+    """Which functions of an event say that it happened in a step: a truth value, or a change of sign."""
+
+    def changes(_, old, new, upwards):
+        if jnp.issubdtype(jnp.result_type(new), jnp.bool_):
+            return new
+        old, new = jnp.sign(old), jnp.sign(new)
+        if upwards is None:
+            change = old != new
+        else:
+            change = (old <= 0) & (new > 0) if upwards else (old > 0) & (new <= 0)
+        return change & ~jnp.isnan(new)
+
+    return jax.tree.map(changes, event.cond_fn, before, values, event.direction, is_leaf=callable)
+
+
+def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
+    """The first of several that happened, and whether one did."""
+    leaves, structure = jax.tree.flatten(mask)
+    happened, first = False, []
+    for leaf in leaves:
+        first.append(leaf & jnp.logical_not(happened))
+        happened = leaf | happened
+    return jax.tree.unflatten(structure, first), happened
+
+
+def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
+    """The time of the event in the last step, the state there and the result; the end of the step without one."""
+    event: Any = solve.event
+    finite = jnp.isfinite(last.event_tnext)
+    end = jnp.where(finite, last.event_tnext, solve.t1)
+    within = solve.solver.interpolation_cls(t0=last.event_tprev, t1=last.event_tnext, **last.event_dense_info)
+
+    def left(t, _):
+        """Zero at the event."""
+
+        def of(value, mask):
+            is_sign = jnp.issubdtype(jnp.result_type(value), jnp.floating)
+            value = jnp.where(mask, value if is_sign else end - t, 0.0)
+            return jnp.where(happened & finite, value, end - t)
+
+        return jax.tree.map(of, solve.guards(t, within.evaluate(t)), last.event_mask)
+
+    limits = {"lower": jnp.where(finite, last.event_tprev, solve.t0), "upper": end}
+    found = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
+    y = lax.cond(last.num_steps == 0, lambda: last.y, lambda: within.evaluate(found.value))
+    of_search = _RESULTS.promote(found.result)
+    result = _RESULTS.where(found.result == optx.RESULTS.successful, last.result, of_search)
+    return found.value, y, result

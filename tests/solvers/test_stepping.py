@@ -1,0 +1,81 @@
+"""The loop over steps does what diffrax's own does."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jaxmb.solvers import MeshAdjoint
+
+
+def falling(t, y, args, **_):
+    del t, args
+    return y[0] + 0.4
+
+
+EVENT = {"root_finder": optx.Newton(1e-10, 1e-10)}
+CASES = {
+    "end": {},
+    "start, times and end": {"saveat": diffrax.SaveAt(t0=True, ts=jnp.linspace(0.0, 3.0, 7), t1=True)},
+    "steps": {"saveat": diffrax.SaveAt(steps=True)},
+    "each third step": {"saveat": diffrax.SaveAt(t0=True, steps=3, t1=True)},
+    "two series": {
+        "saveat": diffrax.SaveAt(
+            subs=[diffrax.SubSaveAt(ts=jnp.array([0.5, 2.5])), diffrax.SubSaveAt(t1=True, fn=lambda t, y, _: y[0] + t)]
+        )
+    },
+    "dense": {"saveat": diffrax.SaveAt(dense=True, t1=True)},
+    "event": {"event": diffrax.Event(falling, **EVENT)},
+    "event upwards": {"event": diffrax.Event(falling, **EVENT, direction=True)},
+    "event among times": {
+        "event": diffrax.Event(falling, **EVENT),
+        "saveat": diffrax.SaveAt(ts=jnp.linspace(0.0, 3.0, 7), t1=True),
+    },
+    "event among steps": {"event": diffrax.Event(falling, **EVENT), "saveat": diffrax.SaveAt(steps=2, t1=True)},
+    "truth": {"event": diffrax.Event(lambda t, y, args, **_: t > 1.0)},
+    "two events": {"event": diffrax.Event([lambda t, *_, **__: t > 1.5, falling], **EVENT)},
+    "too few steps": {"max_steps": 4, "throw": False},
+    "no time": {"t1": 0.0, "saveat": diffrax.SaveAt(t0=True, ts=jnp.zeros(2), t1=True)},
+    "backwards": {"t1": -3.0, "saveat": diffrax.SaveAt(ts=jnp.linspace(0.0, -3.0, 7))},
+    "fixed steps": {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.1},
+    "given steps": {"stepsize_controller": diffrax.StepTo(jnp.linspace(0.0, 3.0, 31)), "dt0": None},
+    "jump": {
+        "stepsize_controller": diffrax.ClipStepSizeController(
+            diffrax.PIDController(rtol=1e-6, atol=1e-8), jump_ts=jnp.array([1.0])
+        )
+    },
+}
+
+
+def solve(adjoint=None, **given):
+    options = {"t0": 0.0, "t1": 3.0, "dt0": None, "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-8)}
+    options |= {} if adjoint is None else {"adjoint": adjoint}
+    term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0] + jnp.where(t > 1.0, 1.0, 0.0)]))
+    return diffrax.diffeqsolve(term, diffrax.Tsit5(), y0=jnp.array([1.0, 0.0]), **options | given)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_solve_is_that_of_diffrax(name):
+    own, other = solve(MeshAdjoint(64), **CASES[name]), solve(**CASES[name])
+    assert own.result == other.result and own.stats == other.stats
+    for a, b in zip(*(jax.tree.leaves((x.ts, x.ys, x.event_mask)) for x in (own, other)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    if name == "dense":
+        np.testing.assert_allclose(own.evaluate(1.3), other.evaluate(1.3), rtol=1e-12)
+
+
+def test_a_member_that_fails_at_an_event_does_not_stop_the_others():
+    def at_event(start):
+        term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0]]))
+        controller = diffrax.PIDController(rtol=1e-6, atol=1e-8)
+        given = {"stepsize_controller": controller, "event": diffrax.Event(falling, **EVENT), "throw": False}
+        found = diffrax.diffeqsolve(
+            term, diffrax.Tsit5(), 0.0, 3.0, None, jnp.stack([start, 0.0 * start]), adjoint=MeshAdjoint(64), **given
+        )
+        return found.ts[0]
+
+    times = jax.vmap(at_event)(jnp.array([1.0, jnp.nan, 0.5]))
+    exact = lambda start: np.arccos(-0.4 / start) / 2
+    np.testing.assert_allclose(times[::2], [exact(1.0), exact(0.5)], rtol=1e-5)
