@@ -146,9 +146,9 @@ def simulate(
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
         then exert, without restitution where contacts are closed, but for those whose own terrain or ends jump. A
-        function that is evaluated at a jump should return its value after it, as a state saved there does. Needs `Partition()` or `Projection()`, and a mass matrix that
-        has an inverse, if there are constraints. A warning tells of jumps and kinks of drivers at other times, except
-        under `jit`, `vmap` or a derivative.
+        function that is evaluated at a jump should return its value after it, as a state saved there does. Needs
+        `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints. A warning
+        tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead, with a `result` that says why; with `True` it is an error there as well, by a call of
         Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`). Under

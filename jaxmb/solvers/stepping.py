@@ -326,7 +326,9 @@ def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree
 
     limits = {"lower": jnp.where(finite, last.event_tprev, solve.t0), "upper": end}
     found = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
-    y = lax.cond(last.num_steps == 0, lambda: last.y, lambda: within.evaluate(found.value))
+    # A derivative that is not a number, as in a failed member of a batch, does not come to the search.
+    t = jnp.where(happened, found.value, end)
+    y = lax.cond(last.num_steps == 0, lambda: last.y, lambda: within.evaluate(t))
     of_search = _RESULTS.promote(found.result)
     result = _RESULTS.where(found.result == optx.RESULTS.successful, last.result, of_search)
-    return found.value, y, result
+    return t, y, result

@@ -76,6 +76,8 @@ def test_a_member_that_fails_at_an_event_does_not_stop_the_others():
         )
         return found.ts[0]
 
-    times = jax.vmap(at_event)(jnp.array([1.0, jnp.nan, 0.5]))
+    times, rates = jax.vmap(jax.value_and_grad(at_event))(jnp.array([1.0, jnp.nan, 0.5]))
     exact = lambda start: np.arccos(-0.4 / start) / 2
+    slope = lambda start: -0.2 / start**2 / np.sqrt(1 - (0.4 / start) ** 2)
     np.testing.assert_allclose(times[::2], [exact(1.0), exact(0.5)], rtol=1e-5)
+    np.testing.assert_allclose(rates[::2], [slope(1.0), slope(0.5)], rtol=1e-4)
