@@ -28,6 +28,8 @@ from ..system.parameters import parameters
 DEFAULT_RTOL = 1e-8
 # What is kept of steps takes this memory at first [bytes], or that of so many steps.
 _ROOM, _FEWEST_STEPS = 2**24, 1024
+# Derivatives keep the numbers of this many steps, where they fit in memory.
+MOST_ROWS = 2048
 # A program saves at this number of times, or at a power of 2 of them.
 _FEWEST_TIMES = 4
 
@@ -214,14 +216,16 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
 def room_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool) -> int:
     """How many steps a program has room for.
 
-    If it keeps nothing of each, the next power of 4 from `max_steps`, so that one program serves several numbers.
-    Otherwise `max_steps` in a program that is traced, and else as many as take little memory, or less: a motion that
-    takes more steps is computed again with more room.
+    If it keeps nothing of each, the next power of 4 from `max_steps`, so that one program serves several numbers, or
+    the number of steps that derivatives keep: those of more need a program that finds steps again. Otherwise
+    `max_steps` in a program that is traced, and else as many as take little memory, or less: a motion that takes more
+    steps is computed again with more room.
     """
     # Of dense output as many numbers for each of the state as a multistep method has in its history.
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)
     if not kept:
-        return 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9)
+        room = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9)
+        return MOST_ROWS if max_steps <= MOST_ROWS < room else room
     row = kept * (state.q.nbytes + state.u.nbytes)
     return max_steps if traced else min(max_steps, max(2 ** int(math.log2(_ROOM / row)), _FEWEST_STEPS))
 

@@ -157,7 +157,8 @@ def simulate(
         and states are kept: a motion that has more of them fails.
     - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
-        some more steps are simulated; not under `jit`, `vmap` or a derivative.
+        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative of at most 2048 steps has
+        nothing that finds steps again, a fifth of its program: with `max_steps=2000` it compiles so much faster.
 
     **Returns:** a `Trajectory`.
 

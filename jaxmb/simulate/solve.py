@@ -44,14 +44,14 @@ from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
-from .arguments import default_controller, with_restarts
+from .arguments import MOST_ROWS, default_controller, with_restarts
 from .compiling import tracing_begins
 from .loop import Loop
 from .moving_times import at_frozen_start, at_moving_times, saved_times
 from .outcome import Outcome, has_failed
 
-# Derivatives keep the numbers of this many steps, fewer where they do not fit in this many bytes.
-_MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
+# Derivatives keep the numbers of fewer steps where those of `MOST_ROWS` do not fit in this many bytes.
+_FEWEST_ROWS, _ROW_BYTES = 64, 2**27
 # What saves states as they are.
 _STATES = diffrax.SubSaveAt(t1=True).fn
 # The least change of a parameter whose effect is watched, of one that is next to zero, in its unit.
@@ -378,7 +378,7 @@ def _of_states(function, ts, ys, start):
 def _rows(options) -> int:
     """The number of steps that are kept for derivatives."""
     size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(options["y0"]))
-    return max(min(_MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
+    return max(min(MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
 
 
 def _tangent_control(system, options, direction) -> TangentControl:

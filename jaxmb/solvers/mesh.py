@@ -23,7 +23,7 @@ from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, row_of, start_of
-from .stepping import loop
+from .stepping import ended, known_in_steps, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
@@ -345,39 +345,27 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         """diffrax's loop with room for `max_steps` steps, of which `limit` are taken at most."""
         del throw, passed_solver_state, passed_controller_state
         steps, own = steps_of(solver, options["stepsize_controller"])
-        fixed = freeze((solver, saveat, options, steps, limit))
         jumps = jump_times(options["stepsize_controller"])
-        found = _recorded(freeze(terms), freeze(args), freeze(init_state), fixed, max_steps, self.most)
-        final, *_ = _with_derivatives(found, (terms, args, own), jumps, init_state, fixed, max_steps)
-        given = lambda *_, **__: final
+        given = {"solver": solver, "saveat": saveat, "max_steps": max_steps, **options}
+        fixed = given, steps = freeze((given, steps))
+        still = freeze({"terms": terms, "args": args})
+        first = freeze(init_state)
+        known = known_in_steps(first, **still, **given)
+        found = _recorded(still, first, fixed, known, freeze(limit), self.most)
+        final, *_ = _with_derivatives(found, (terms, args, own), jumps, init_state, fixed)
         # The time of an event depends on its function, after the steps are taken.
-        ended = *freeze((solver, saveat)), freeze(options) | {"event": options["event"]}
-        return _run(given, terms, args, init_state, ended, max_steps)
+        given = given | {"event": options["event"]}
+        return ended(final, known, terms=terms, args=args, **given), {}
 
 
-def _run(outer, terms, args, init_state, fixed, max_steps):
-    solver, saveat, options, *_ = fixed
-    return loop(
-        args=args,
-        terms=terms,
-        solver=solver,
-        saveat=saveat,
-        init_state=init_state,
-        max_steps=max_steps,
-        outer_while_loop=outer,
-        **options,
-    )
-
-
-def _recorded(terms, args, init_state, fixed, max_steps, most):
+def _recorded(equations, init_state, fixed, known, limit, most):
     """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
     each has `most`; the starts of all segments and the choices of all steps, None where there is one segment only. All
     but the first are packed.
     """
-    size = min(most, max_steps)
-    segments = -(-max_steps // size)
-    *_, steps, limit = fixed
-    found = []
+    (given, steps), terms = fixed, equations["terms"]
+    size = min(most, given["max_steps"])
+    segments = -(-given["max_steps"] // size)
 
     def outer(cond_fun, body_fun, init, *, max_steps, buffers):
         del max_steps
@@ -410,11 +398,9 @@ def _recorded(terms, args, init_state, fixed, max_steps, most):
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
         )
-        found.append((last, first, rows, None if starts is None else (starts, choices)))
-        return last
+        return last, first, rows, None if starts is None else (starts, choices)
 
-    _run(outer, terms, args, init_state, fixed, max_steps)
-    return found[0]
+    return stepped(init_state, outer, known, **equations, **given)
 
 
 def _written(tables, index, row, kept):
@@ -435,29 +421,30 @@ def _layouts_again(steps, old, new):
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives(found, equations, jumps, init_state, fixed, max_steps):
+def _with_derivatives(found, equations, jumps, init_state, fixed):
     """What was `_recorded` without derivatives, with those by the rest.
 
     **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
     step size controller knows as well, and the solver stand here for their tangents.
     """
-    del equations, jumps, init_state, fixed, max_steps
+    del equations, jumps, init_state, fixed
     return found
 
 
 @_with_derivatives.def_jvp
 def _with_derivatives_jvp(primals, tangents):
-    _, equations, jumps, init_state, fixed, max_steps = primals
+    _, equations, jumps, init_state, fixed = primals
     _, dequations, djumps, dinit, *_ = tangents
     # Second derivatives see those of the rows.
     out = _with_derivatives(*primals)
     final, first, rows, again = out
-    _, saveat, options, steps, _ = fixed
+    given, steps = fixed
+    saveat = given["saveat"]
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
-    w, given = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    w, inner = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
     at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
-    x = Moving(dequations, djumps), (w, given)
+    x = Moving(dequations, djumps), (w, inner)
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
@@ -481,8 +468,8 @@ def _with_derivatives_jvp(primals, tangents):
         saved=saved,
         like=y0,
         memory=memory,
-        dense=max_steps if saveat.dense else 0,
-        event=options["event"] is not None,
+        dense=given["max_steps"] if saveat.dense else 0,
+        event=given["event"] is not None,
         segments=_segments(again, layout, steps, init_state, final),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
